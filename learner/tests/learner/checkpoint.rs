@@ -323,11 +323,25 @@ fn averaged_weights_follow_and_are_saved_and_played() {
             .map(f64::from)
             .collect()
     };
+    let load = |settings: &_| {
+        let model = model(ALL_DIM);
+        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, SPEC);
+        restored.unwrap().unwrap().agent
+    };
+    save(&run, folder.path(), 1);
+    // Before the first update nothing is averaged.
+    assert!(!load(&settings).take_average().unwrap());
     let mut expected = values(run.agent.online());
-    for _ in 0..5 {
+    for t in 1..=6 {
         learn(&mut run, 1);
+        // A plain mean at first, without the weights that the run began with.
+        let rate = TAU.max(1.0 / f64::from(t));
         for (average, online) in expected.iter_mut().zip(values(run.agent.online())) {
-            *average += TAU * (online - *average);
+            *average += rate * (online - *average);
+        }
+        if t == 2 {
+            save(&run, folder.path(), 1);
+            run.agent = load(&settings);
         }
     }
     let average = values(run.agent.average().unwrap());
@@ -336,11 +350,6 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     assert_ne!(average, values(run.agent.online()));
 
     save(&run, folder.path(), 1);
-    let load = |settings: &_| {
-        let model = model(ALL_DIM);
-        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, SPEC);
-        restored.unwrap().unwrap().agent
-    };
     let restored = load(&settings);
     assert_eq!(values(restored.average().unwrap()), average);
     assert_eq!(values(restored.online()), values(run.agent.online()));
