@@ -201,11 +201,19 @@ class Network(nn.Module):
         return self.dim[head](x)
 
 
-def load(run, checkpoint=None):
-    """The network of a run's newest checkpoint (or of the one named), in evaluation mode, and the tables that describe it."""
+def load(run, checkpoint=None, weights=None):
+    """The network of a run's newest checkpoint (or of the one named), in evaluation mode, and the tables that describe it.
+
+    `weights`: "average", which has no DIM heads, or "online" [default: "average" if the checkpoint has it, as `driml evaluate`].
+    """
     folder = Path(checkpoint) if checkpoint else newest_checkpoint(run)
-    tensors, metadata = read_safetensors(folder / "online.safetensors")
+    if weights is None:
+        weights = "average" if (folder / "average.safetensors").exists() else "online"
+    tensors, metadata = read_safetensors(folder / f"{weights}.safetensors")
     described = description(run, metadata)
+    if weights != "online":
+        # Earlier versions described the online network in every file.
+        described["model"] |= {"dim": dict.fromkeys(described["model"]["dim"], False), "loss_layers": []}
     network = Network(described["model"])
     network.load_state_dict(tensors)
     return network.eval(), described
@@ -241,9 +249,10 @@ def main():
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("run", type=Path, help="folder of the run")
     arguments.add_argument("--checkpoint", type=Path, help="folder of one of its checkpoints [default: the newest]")
+    arguments.add_argument("--weights", choices=["average", "online"], help="which weights [default: average, if it has some]")
     arguments.add_argument("--onnx", type=Path, metavar="FILE", help="write the acting network there")
     given = arguments.parse_args()
-    network, described = load(given.run, given.checkpoint)
+    network, described = load(given.run, given.checkpoint, given.weights)
     model = described["model"]
     shape = (1, model["height"], model["width"], model["input_channels"])
     with torch.no_grad():

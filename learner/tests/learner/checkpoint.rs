@@ -61,6 +61,7 @@ pub(crate) fn try_save(
     let label = Label {
         run_spec_hash: SPEC,
         description,
+        without_heads: WITHOUT_HEADS,
         companion: None,
     };
     checkpoint::save(folder, run, label, keep)
@@ -96,6 +97,7 @@ pub(crate) fn progress() -> Progress {
 
 /// What the metadata says is for others: here it is any text.
 pub(crate) const DESCRIPTION: &str = r#"{"format":1}"#;
+const WITHOUT_HEADS: &str = r#"{"format":1,"model":{"dim":{}}}"#;
 
 pub(crate) fn load(folder: &Path) -> Result<Option<LearnerState>, CheckpointError> {
     let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
@@ -291,12 +293,15 @@ fn the_networks_say_what_they_are_and_need_not() {
     let folder = tempdir().unwrap();
     let run = start();
     let path = save(&run, folder.path(), 1);
-    for name in ["online.safetensors", "target.safetensors"] {
+    for (name, description) in [
+        ("online.safetensors", DESCRIPTION),
+        ("target.safetensors", WITHOUT_HEADS),
+    ] {
         let file = fs::read(path.join(name)).unwrap();
         let (_, header) = safetensors::SafeTensors::read_metadata(&file).unwrap();
         let entries = header.metadata().as_ref().unwrap();
         assert_eq!(entries.len(), 1);
-        assert_eq!(entries["driml"], DESCRIPTION);
+        assert_eq!(entries["driml"], description);
     }
     let bare = run.agent.online().to_safetensors(|_| true).unwrap();
     fs::write(path.join("online.safetensors"), &bare).unwrap();
