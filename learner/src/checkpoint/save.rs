@@ -15,7 +15,7 @@ use super::{
     },
     description,
     error::{CheckpointError, io_error},
-    folder::{PREFIX, list, put_in_place, remove_or_warn, sync, tidy, write_durably},
+    folder::{PREFIX, list, prune, put_in_place, remove_or_warn, sync, tidy, write_durably},
 };
 use crate::{agent::Agent, error::UpdateError};
 
@@ -61,7 +61,7 @@ pub fn save(
     }
     let all = list(folder)?;
     for (_, old) in &all[..all.len().saturating_sub(keep)] {
-        remove_or_warn(old);
+        prune(old);
     }
     Ok(path)
 }
