@@ -27,7 +27,7 @@ use crate::{
 
 /// How long a replay server may take to say what it has stored in the end.
 const LAST_COUNT_MAX: Duration = Duration::from_secs(1);
-/// How long a learner that was told to stop stays to be asked for its last status.
+/// How long a learner stays in the end to send its last weights and to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
 /// How long a batch may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
@@ -168,7 +168,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         activity.begin("has finished and stays to be asked");
         shutdown.wait();
     }
-    publisher.wait_until_heard(LAST_WORD_MAX);
+    publisher.wait_until_heard(LAST_WORD_MAX, shutdown);
     if sampling.is_prioritised() {
         let arrived = publisher.priorities.arrived.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
