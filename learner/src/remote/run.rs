@@ -284,13 +284,34 @@ impl Checkpointer {
     }
 }
 
-/// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.
+/// Leaves the run's settings beside the checkpoints, for `driml evaluate`, in place of those of an earlier start; a file that begins with
+/// a comment is the launcher's.
 fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
     let path = run_dir.join("config.toml");
-    if path.exists() {
+    let there = std::fs::read_to_string(&path).unwrap_or_default();
+    if there.starts_with('#') || there == config_toml {
         return Ok(());
     }
     std::fs::create_dir_all(run_dir)
         .and_then(|()| atomic_write::write(&path, config_toml.as_bytes()))
         .with_context(|| format!("writing {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_settings_that_are_kept_are_the_newest_unless_they_are_the_launcher_s() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("run");
+        let path = folder.join("config.toml");
+        for (there, kept) in [(None, "b"), (Some("a"), "b"), (Some("# a"), "# a")] {
+            if let Some(there) = there {
+                std::fs::write(&path, there).unwrap();
+            }
+            keep_settings(&folder, "b").unwrap();
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), kept);
+        }
+    }
 }
