@@ -323,10 +323,11 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
         (CURL, ALL_DIM, false, "lambda.4t4 alone"),
         (CURL, GLOBAL, true, "condition_on_action"),
         (DIM, GLOBAL, true, "has no use for the table curl"),
+        (AuxiliaryKind::NONE, NO_DIM, true, "condition_on_action"),
         (
             AuxiliaryKind::NONE,
             NO_DIM,
-            true,
+            false,
             "has no use for the table curl",
         ),
     ] {

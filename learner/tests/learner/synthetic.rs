@@ -65,7 +65,7 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
         } else {
             DIM
         },
-        condition_on_action: true,
+        condition_on_action: lambda != NO_DIM,
         lambda,
         tanh_clip: 20.0,
         max_grad_norm: 10.0,
