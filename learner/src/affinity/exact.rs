@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities},
+    arrays::{AffinityError, check_array, check_probabilities, check_ranges},
 };
 
 /// Decay and smoothing of the pair counts.
@@ -38,21 +38,11 @@ pub struct ExactAffinity {
 }
 
 impl ExactSettings {
-    fn check_valid(&self) -> Result<(), AffinityError> {
-        let Self { decay, smoothing } = *self;
-        if !(decay > 0.0 && decay <= 1.0) {
-            return Err(AffinityError(format!(
-                "a decay of {decay:e}, which is not above 0 and at most 1"
-            )));
-        }
-        if !SMOOTHING.contains(&smoothing) {
-            return Err(AffinityError(format!(
-                "a smoothing of {smoothing:e}, which is not within {:e} and {:e}",
-                SMOOTHING.start(),
-                SMOOTHING.end()
-            )));
-        }
-        Ok(())
+    pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
+        check_ranges(&[
+            ("decay", self.decay, f64::MIN_POSITIVE..=1.0),
+            ("smoothing", self.smoothing, SMOOTHING),
+        ])
     }
 }
 

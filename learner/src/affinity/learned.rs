@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities, row_softmax},
+    arrays::{AffinityError, check_array, check_probabilities, check_ranges, row_softmax},
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -43,10 +43,10 @@ pub struct LearnedAffinity {
 }
 
 /// Most hidden units; settings beyond it are refused.
-const HIDDEN_MAX: usize = 4096;
+const HIDDEN_MAX: f64 = 4096.0;
 
 impl LearnedSettings {
-    fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
         let Self {
             hidden,
             lr,
@@ -55,28 +55,15 @@ impl LearnedSettings {
             eps,
             keep,
         } = *self;
-        let rate = |x: f64| ((1e-30..=1e38).contains(&x), "within 1e-30 and 1e38");
-        let addend = |x: f64| ((1e-30..=1e30).contains(&x), "within 1e-30 and 1e30");
-        let share = |x: f64| ((0.0..1.0).contains(&x), "at least 0 and below 1");
-        if !(1..=HIDDEN_MAX).contains(&hidden) {
-            return Err(AffinityError(format!(
-                "hidden = {hidden}, which is not within 1 and {HIDDEN_MAX}"
-            )));
-        }
-        for (name, value, (is_fine, range)) in [
-            ("lr", lr, rate(lr)),
-            ("eps", eps, addend(eps)),
-            ("beta1", beta1, share(beta1)),
-            ("beta2", beta2, share(beta2)),
-            ("keep", keep, share(keep)),
-        ] {
-            if !is_fine {
-                return Err(AffinityError(format!(
-                    "{name} = {value:?}, which is not {range}"
-                )));
-            }
-        }
-        Ok(())
+        let share = 0.0..=1f64.next_down();
+        check_ranges(&[
+            ("hidden", hidden as f64, 1.0..=HIDDEN_MAX),
+            ("lr", lr, 1e-30..=1e38),
+            ("eps", eps, 1e-30..=1e30),
+            ("beta1", beta1, share.clone()),
+            ("beta2", beta2, share.clone()),
+            ("keep", keep, share),
+        ])
     }
 }
 

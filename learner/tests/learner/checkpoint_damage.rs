@@ -156,7 +156,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
         }
     }
     let huge = |state: &mut serde_json::Value| state["affinity"]["settings"]["decay"] = 2.into();
-    refused(&run, &huge, "a decay of 2");
+    refused(&run, &huge, "decay = 2");
     run.affinity = start().affinity;
     for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
         let change =
