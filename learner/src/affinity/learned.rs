@@ -83,10 +83,9 @@ impl LearnedAffinity {
         let mut parameters = vec![0.0; parameter_count(m, hidden)];
         // The first layer as PyTorch draws it, U(+-1/sqrt(inputs)); the last one stays 0, so that q starts at 0.
         let bound = 1.0 / ((2 * m) as f64).sqrt();
-        let first_layer = (2 * m + 1) * hidden;
-        parameters[..first_layer]
-            .iter_mut()
-            .for_each(|p| *p = rng.random_range(-bound..bound));
+        for p in &mut parameters[..(2 * m + 1) * hidden] {
+            *p = rng.random_range(-bound..bound);
+        }
         let zeros = vec![0.0; parameters.len()];
         let smoothed = vec![1.0 / m as f64; m * m];
         Ok(Self {
@@ -178,10 +177,8 @@ impl LearnedAffinity {
         let (m, [_, _, out, c]) = (self.alphabet.len(), self.offsets());
         let weights = &self.parameters[out..c];
         let q = |i: usize, j: usize| {
-            let units = weights
-                .iter()
-                .enumerate()
-                .map(|(h, w)| w * self.unit(i, j, h).max(0.0));
+            let units = weights.iter().enumerate();
+            let units = units.map(|(h, w)| w * self.unit(i, j, h).max(0.0));
             units.sum::<f64>() + self.parameters[c]
         };
         (0..m * m).map(|at| q(at / m, at % m)).collect()
@@ -243,14 +240,11 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
+    use crate::affinity::tests::PRESET;
 
     const SETTINGS: LearnedSettings = LearnedSettings {
         hidden: 5,
-        lr: 1e-3,
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-8,
-        keep: 0.9,
+        ..PRESET
     };
 
     fn of_three_actions() -> (LearnedAffinity, ChaCha8Rng) {

@@ -145,11 +145,7 @@ fn the_generator_alone_decides_and_rows_differ() {
     };
     let first = applied();
     for threads in [1, 2, 5] {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .unwrap();
-        assert!(pool.install(applied) == first);
+        assert!(pool(threads).install(applied) == first);
     }
     let mut different: Vec<_> = first.chunks_exact(state.len()).collect();
     different.sort_unstable();

@@ -48,16 +48,23 @@ fn what_float32_does_not_hold_is_refused_by_name() {
     }
 }
 
+/// Numbers of an affinity that cannot work, whatever estimates it, and what is said of them.
+const AFFINITY: &str = "
+exact = { decay = 0.0, smoothing = 1.0 }    : decay = 0.0
+exact = { decay = 1.1, smoothing = 1.0 }    : decay = 1.1
+exact = { decay = nan, smoothing = 1.0 }    : decay = NaN
+exact = { decay = 0.9, smoothing = 0.0 }    : smoothing = 0.0
+exact = { decay = 0.9, smoothing = 1e-320 } : smoothing = 1e-320
+exact = { decay = 0.9, smoothing = 1e306 }  : smoothing = 1e306
+visible = [0, 2]                            : action 1 amounts to 2
+learned = { hidden = 8, lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8, keep = 1.0 } : keep = 1.0
+";
+
 #[test]
-fn numbers_of_an_affinity_that_is_not_estimated_are_refused_by_name() {
-    let learned =
-        "learned = { hidden = 8, lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8, keep = 1.0 }";
-    for (numbers, said) in [
-        (learned, "keep = 1.0 is not within"),
-        ("exact = { decay = 0.0, smoothing = 1.0 }", "decay = 0.0"),
-        ("visible = [0, 2]", "action 1 amounts to 2"),
-    ] {
-        let table = format!("estimator = \"none\"\n{numbers}");
+fn numbers_of_an_affinity_are_refused_by_name() {
+    for line in AFFINITY.trim().lines() {
+        let (numbers, said) = line.split_once(" : ").unwrap();
+        let table = format!("estimator = 'none'\n{numbers}");
         let table: AffinityConfig = toml::from_str(&table).unwrap();
         let estimator = table.estimator(2, &mut ChaCha8Rng::seed_from_u64(1));
         check_says(estimator.unwrap_err(), &["learner.affinity", said]);
