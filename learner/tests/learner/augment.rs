@@ -5,6 +5,8 @@ use driml_learner::{Augment, AugmentSettings, augment::View};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::synthetic::pool;
+
 pub(crate) const NOTHING: AugmentSettings = AugmentSettings {
     crop_side: 1.0,
     brightness: 0.0,

@@ -6,7 +6,7 @@ use driml_model::Kernels;
 
 use crate::agents::{GLOBAL, curl_table};
 use crate::synthetic::{
-    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, made, model, random_batch, settings,
+    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, made, model, pool, random_batch, settings,
 };
 
 const ROWS: usize = 40;
