@@ -1,10 +1,10 @@
 """A run's network in PyTorch: loads the newest checkpoint of a run folder, and exports what acts as ONNX.
 
     python driml_net.py RUN                    # what the network is, and its values for a blank state
-    python driml_net.py RUN --onnx net.onnx    # the acting network: states in, expected returns out
+    python driml_net.py RUN --onnx net.onnx    # the network: states in, expected returns out
 
     from driml_net import load
-    network, run = load("runs/pacman")
+    network, run = load("runs/coin")
     q = network(states)                        # states u8 [B, H, W, C] as deploy/docs/src/reference/weights.md says; q [B, A]
 
 PyTorch is needed, and `onnx` and `onnxscript` for --onnx. Everything it must know is in the checkpoint's own metadata or, for
@@ -201,11 +201,19 @@ class Network(nn.Module):
         return self.dim[head](x)
 
 
-def load(run, checkpoint=None):
-    """The network of a run's newest checkpoint (or of the one named), in evaluation mode, and the tables that describe it."""
+def load(run, checkpoint=None, weights=None):
+    """The network of a run's newest checkpoint (or of the one named), in evaluation mode, and the tables that describe it.
+
+    `weights`: "average", which has no DIM heads, or "online" [default: "average" if the checkpoint has it, as `driml evaluate`].
+    """
     folder = Path(checkpoint) if checkpoint else newest_checkpoint(run)
-    tensors, metadata = read_safetensors(folder / "online.safetensors")
+    if weights is None:
+        weights = "average" if (folder / "average.safetensors").exists() else "online"
+    tensors, metadata = read_safetensors(folder / f"{weights}.safetensors")
     described = description(run, metadata)
+    if weights != "online":
+        # Earlier versions described the online network in every file.
+        described["model"] |= {"dim": dict.fromkeys(described["model"]["dim"], False), "loss_layers": []}
     network = Network(described["model"])
     network.load_state_dict(tensors)
     return network.eval(), described
@@ -222,7 +230,7 @@ def enlarge(frames, described):
 
 
 def export(network, described, path):
-    """Writes the acting network as ONNX: `states` u8 [B, H, W, C] to `q_values` f32 [B, A], for any B."""
+    """Writes the network as ONNX: `states` u8 [B, H, W, C] to `q_values` f32 [B, A], for any B."""
     model = described["model"]
     blank = torch.zeros(2, model["height"], model["width"], model["input_channels"], dtype=torch.uint8)
     torch.onnx.export(
@@ -241,9 +249,10 @@ def main():
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("run", type=Path, help="folder of the run")
     arguments.add_argument("--checkpoint", type=Path, help="folder of one of its checkpoints [default: the newest]")
-    arguments.add_argument("--onnx", type=Path, metavar="FILE", help="write the acting network there")
+    arguments.add_argument("--weights", choices=["average", "online"], help="which weights [default: average, if it has some]")
+    arguments.add_argument("--onnx", type=Path, metavar="FILE", help="write the network there")
     given = arguments.parse_args()
-    network, described = load(given.run, given.checkpoint)
+    network, described = load(given.run, given.checkpoint, given.weights)
     model = described["model"]
     shape = (1, model["height"], model["width"], model["input_channels"])
     with torch.no_grad():

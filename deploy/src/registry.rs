@@ -5,7 +5,8 @@ use driml_learner::auxiliary::{self, loss::MenuItem};
 use driml_settings::presets::{self, Agent};
 use serde::de::DeserializeOwned;
 
-/// Worlds, losses and agents beside driml's own, for [`main_with`](crate::main_with). A name that driml has stays driml's.
+/// Worlds, losses and agents beside driml's own, for [`main_with`](crate::main_with). The name of a world or an agent that
+/// driml has stays driml's.
 #[derive(Debug, Default)]
 pub struct Registry {
     worlds: Vec<CustomKind>,
@@ -24,7 +25,7 @@ impl Registry {
         self
     }
 
-    /// Adds an auxiliary loss, for `learner.update.auxiliary_loss`.
+    /// Adds an auxiliary loss, for `learner.update.auxiliary_loss`, under a name that driml's have not.
     #[must_use]
     pub fn loss(mut self, item: &'static MenuItem) -> Self {
         self.losses.push(item);

@@ -41,7 +41,7 @@ pub struct Agent {
     networks: Networks,
     target: Parameters,
     key: Option<Parameters>,
-    /// Torso and head of the averaged network, if the settings ask for one.
+    /// Torso and head of the averaged network; there after the first update, if the settings ask for one.
     average: Option<Parameters>,
     noise_seed: [u8; 32],
     pub(crate) adam: Adam,
@@ -115,9 +115,8 @@ impl Agent {
                 )));
             }
         };
-        let average = settings.average_tau.map(|_| online.without_dim());
         Ok(Self {
-            average: average.transpose()?,
+            average: None,
             noise_seed: [0; 32],
             adam: Adam::new(settings.adam, &online, kernels)?,
             updates: 0,
@@ -183,8 +182,8 @@ impl Agent {
         self.key.as_ref()
     }
 
-    /// The averaged network's parameters, torso and head, if the settings ask for one: after each update they move
-    /// `average_tau` of the way to the online network's. They start as a copy of it.
+    /// The averaged network's parameters, torso and head, if the settings ask for one and an update was taken. They begin as a copy of
+    /// the online network's; after each later update, number t of the run, they move `max(average_tau, 1 / t)` of the way to those.
     pub const fn average(&self) -> Option<&Parameters> {
         self.average.as_ref()
     }
@@ -299,8 +298,13 @@ impl Agent {
         if let (Some(key), Some(tau)) = (&self.key, auxiliary.key_tau()) {
             target::follow(key, online, tau, kernels)?;
         }
-        if let (Some(average), Some(tau)) = (&self.average, settings.average_tau) {
-            target::follow(average, online, tau, kernels)?;
+        match (&self.average, settings.average_tau) {
+            (Some(average), Some(tau)) => {
+                let rate = tau.max(1.0 / self.updates as f64);
+                target::follow(average, online, rate, kernels)?;
+            }
+            (None, Some(_)) => self.average = Some(online.without_dim()?),
+            (_, None) => {}
         }
         if self.updates.is_multiple_of(settings.target_period_updates) {
             target::follow(&self.target, online, settings.target_tau, kernels)?;

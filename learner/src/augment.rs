@@ -41,25 +41,20 @@ impl AugmentSettings {
     /// # Errors
     /// The first setting out of its range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let side = self.crop_side;
-        let why = || "it must lie above 0 and be at most 1, which crops nothing";
-        check(
-            side > 0.0 && side <= 1.0,
-            "learner.augment.crop_side",
-            side,
-            why,
-        )?;
-        for (key, strength) in [
-            ("learner.augment.brightness", self.brightness),
-            ("learner.augment.contrast", self.contrast),
-            ("learner.augment.saturation", self.saturation),
+        let share = "it must lie above 0 and be at most 1, which crops nothing";
+        let strength = "it must lie between 0 and 1";
+        let turn = "it must lie between 0 and 0.5, half a turn either way";
+        for (key, value, range, why) in [
+            ("crop_side", self.crop_side, f64::MIN_POSITIVE..=1.0, share),
+            ("brightness", self.brightness, 0.0..=1.0, strength),
+            ("contrast", self.contrast, 0.0..=1.0, strength),
+            ("saturation", self.saturation, 0.0..=1.0, strength),
+            ("hue", self.hue, 0.0..=0.5, turn),
         ] {
-            let is_fine = (0.0..=1.0).contains(&strength);
-            check(is_fine, key, strength, || "it must lie between 0 and 1")?;
+            let key = format!("learner.augment.{key}");
+            check(range.contains(&value), &key, value, || why)?;
         }
-        let is_fine = (0.0..=0.5).contains(&self.hue);
-        let why = || "it must lie between 0 and 0.5, half a turn either way";
-        check(is_fine, "learner.augment.hue", self.hue, why)
+        Ok(())
     }
 }
 

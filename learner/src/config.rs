@@ -104,16 +104,19 @@ impl AffinityConfig {
         };
         let name = format!("{:?}", self.estimator);
         let bad = |e: AffinityError| ConfigError::of("learner.affinity", &name, e);
+        // What the chosen estimator does not use is checked all the same.
+        let learned = self.learned.map_or(Ok(()), |it| it.check_valid());
+        let exact = self.exact.map_or(Ok(()), |it| it.check_valid());
+        learned.and(exact).map_err(bad)?;
+        let visible = self.visible.as_deref().map(Alphabet::new);
+        let visible = visible.transpose().map_err(bad)?;
         if self.estimator == EstimatorKind::None {
             return Ok(None);
         }
         let alphabet = match self.alphabet.ok_or_else(|| missing("alphabet"))? {
-            AlphabetKind::Raw => Alphabet::raw(num_actions),
-            AlphabetKind::Visible => {
-                Alphabet::new(self.visible.as_ref().ok_or_else(|| missing("visible"))?)
-            }
-        }
-        .map_err(bad)?;
+            AlphabetKind::Raw => Alphabet::raw(num_actions).map_err(bad)?,
+            AlphabetKind::Visible => visible.ok_or_else(|| missing("visible"))?,
+        };
         let found = alphabet.num_actions();
         check(
             found == num_actions,

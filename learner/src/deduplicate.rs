@@ -65,11 +65,9 @@ struct Distinct {
 impl Distinct {
     /// That of `states`, if it pays to compute the distinct ones alone.
     fn of(states: &[State<'_>]) -> Option<Self> {
-        let sums: Vec<u32> = states
-            .par_iter()
-            .with_min_len(TASK_STATES)
-            .map(|state| state.map_or(0, crc32fast::hash))
-            .collect();
+        let sums = states.par_iter().with_min_len(TASK_STATES);
+        let sums = sums.map(|state| state.map_or(0, crc32fast::hash));
+        let sums: Vec<u32> = sums.collect();
         let mut distinct = Self {
             firsts: Vec::with_capacity(states.len()),
             places: Vec::with_capacity(states.len()),

@@ -177,11 +177,8 @@ impl Networks {
         let bootstraps: Vec<usize> = batch.bootstraps().collect();
         if !bootstraps.is_empty() {
             let (actions, logits) = self.next_greedy(batch, noise)?;
-            for ((&row, action), logits) in bootstraps
-                .iter()
-                .zip(actions)
-                .zip(logits.chunks_exact(atoms))
-            {
+            let rows = bootstraps.iter().zip(actions);
+            for ((&row, action), logits) in rows.zip(logits.chunks_exact(atoms)) {
                 next_greedy_action[row] = action;
                 softmax(logits, &mut probs[row * atoms..][..atoms]);
             }

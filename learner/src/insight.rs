@@ -6,7 +6,7 @@ use driml_model::{Compute, Features, ModelConfig, Network, Parameters};
 
 use crate::{
     agent::Agent,
-    auxiliary::dim::{DIM, Vectors, dots_of},
+    auxiliary::dim::{DIM, Vectors},
     error::UpdateError,
     losses::{c51::softmax, scores::Scores},
     settings::LearnerSettings,
@@ -106,10 +106,9 @@ impl Insight {
         let only_local = [true, false, false, false];
         let (now, later) = (&now.features, &later.features);
         let vectors = Vectors::new(&self.network, now, later, &actions, only_local)?;
-        let (Some(psi), Some(phi)) = (&vectors.psi[0], &vectors.phi[0]) else {
+        let [Some(dots), ..] = vectors.dots(only_local)? else {
             return Ok(None);
         };
-        let dots = dots_of(vectors.kernels, psi, phi)?;
         let scores = Scores::new(dots.width, tanh_clip);
         let (locations, rows, _) = dots.dots.dims3()?;
         let dots = flat(&dots.dots)?;

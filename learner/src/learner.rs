@@ -236,6 +236,7 @@ impl Learner {
         let label = Label {
             run_spec_hash: self.spec_hash,
             description: &checkpoint::describe(spec, model, input),
+            without_heads: &checkpoint::describe(spec, &model.without_dim(), input),
             companion,
         };
         let keep = self.config.learner.checkpoints_kept as usize;

@@ -14,11 +14,12 @@ pub(crate) fn check_range(
     value: f64,
     range: RangeInclusive<f64>,
 ) -> Result<(), UpdateError> {
-    if range.contains(&value) {
-        return Ok(());
-    }
-    let (least, most) = range.into_inner();
-    Err(UpdateError::Settings(format!(
-        "{name} = {value:?} is not within {least:?} and {most:?}"
-    )))
+    outside(name, value, &range).map_or(Ok(()), |why| Err(UpdateError::Settings(why)))
+}
+
+/// What is wrong with a setting, if it is not in its range.
+pub(crate) fn outside(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
+    let (least, most) = (range.start(), range.end());
+    let is_inside = range.contains(&value);
+    (!is_inside).then(|| format!("{name} = {value:?} is not within {least:?} and {most:?}"))
 }

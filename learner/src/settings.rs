@@ -45,8 +45,9 @@ pub struct LearnerSettings {
     /// Share of the online network in a move of the target network, from 1e-5 to 1. Parameters are f32, and a target stands
     /// still within a relative 6e-8 / tau of the online network: 6e-4 at 1e-4, and 6e-3 at the least.
     pub target_tau: f64,
-    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; without it there is none. The
-    /// averaged network is saved in checkpoints and is what `evaluate` plays; training does not use it.
+    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; without it there is none. In the first
+    /// 1 / average_tau updates the share of update t is 1 / t, which makes a plain mean. The averaged network is saved in checkpoints
+    /// and is what `evaluate` plays; training does not use it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub average_tau: Option<f64>,
     /// The auxiliary loss's own numbers, a table of its name such as `[learner.update.curl]`; none for an auxiliary loss that has none.

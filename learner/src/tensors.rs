@@ -1,9 +1,9 @@
 //! Between bytes, slices and candle's tensors: states as the network takes them, and the values behind a tensor on the CPU.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, cell::RefCell};
 
-use candle_core::{CpuStorage, DType, Device, Layout, Tensor, bail};
-use driml_model::ModelConfig;
+use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
+use driml_model::{ModelConfig, floats};
 
 use crate::error::UpdateError;
 
@@ -32,17 +32,40 @@ pub(crate) fn flat_f64(tensor: &Tensor) -> candle_core::Result<Vec<f64>> {
     tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()
 }
 
-/// As [`floats`](driml_model::floats), to write.
-pub(crate) fn floats_mut<'a>(
-    storage: &'a mut CpuStorage,
-    layout: &Layout,
-) -> candle_core::Result<&'a mut [f32]> {
-    match (storage, layout.contiguous_offsets()) {
-        (CpuStorage::F32(values), Some((start, end))) => Ok(&mut values[start..end]),
-        _ => bail!(
-            "a tensor of shape {:?} is not contiguous f32",
-            layout.shape()
-        ),
+/// Changes `var` in place, given the values of `other`, as many; both are on the CPU.
+pub(crate) fn change(
+    var: &Var,
+    other: &Tensor,
+    change: impl FnMut(&mut [f32], &[f32]),
+) -> candle_core::Result<()> {
+    // candle hands operations out by shared reference only.
+    var.inplace_op2(other, &Change(RefCell::new(change)))
+}
+
+struct Change<F>(RefCell<F>);
+
+impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for Change<F> {
+    fn name(&self) -> &'static str {
+        "change"
+    }
+
+    fn cpu_fwd(
+        &self,
+        storage: &mut CpuStorage,
+        l1: &Layout,
+        other: &CpuStorage,
+        l2: &Layout,
+    ) -> candle_core::Result<()> {
+        let (CpuStorage::F32(values), Some((start, end))) = (storage, l1.contiguous_offsets())
+        else {
+            bail!("a tensor of shape {:?} is not contiguous f32", l1.shape());
+        };
+        let (values, other) = (&mut values[start..end], floats(other, l2)?);
+        if values.len() != other.len() {
+            bail!("{} values meet {}", values.len(), other.len());
+        }
+        (self.0.borrow_mut())(values, other);
+        Ok(())
     }
 }
 

@@ -56,11 +56,11 @@ states = numpy.fromfile(sys.argv[2], dtype=numpy.uint8).reshape(shape)
 print(json.dumps(session.run(['q_values'], {'states': states})[0].flatten().tolist()))
 ";
 
-/// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, C51 alone, and with Rainbow's streams
-/// of noisy layers; the residual torsos.
+/// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, C51 alone, with averaged weights, and with
+/// Rainbow's streams of noisy layers; the residual torsos.
 const RUNS: [&str; 5] = [
     "--env mspacman --agent driml-ada --preset smoke --frames 320",
-    "--env chain --agent c51 --preset smoke --frames 320",
+    "--env chain --agent c51 --preset smoke --frames 320 --set learner.update.average_tau=0.01",
     "--env chain --agent rainbow --preset smoke --frames 320",
     "--env mspacman --agent driml-ada --preset smoke --frames 320 --set model.torso=impala --set model.channels=[4,6]",
     "--env chain --agent c51 --preset smoke --frames 320 --set model.torso=impoola --set model.channels=[4,6]",
@@ -78,7 +78,8 @@ fn trained(system: &TestSystem, flags: &str) -> (Agent, Seen) {
     let mut states = vec![0; STATES * model.frame_len()];
     ChaCha8Rng::seed_from_u64(1).fill_bytes(&mut states);
     fs::write(system.path("states"), &states).unwrap();
-    let agent = restored.unwrap().unwrap().agent;
+    let mut agent = restored.unwrap().unwrap().agent;
+    agent.take_average().unwrap();
     let insight = Insight::of(&agent, Compute::CPU).unwrap();
     let seen = insight.look(&states).unwrap();
     (agent, seen)

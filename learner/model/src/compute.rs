@@ -270,10 +270,8 @@ mod tests {
     #[cfg(not(feature = "cuda"))]
     #[test]
     fn a_program_without_cuda_says_so() {
-        let error = DeviceName::Cuda(0)
-            .open(Precision::F32)
-            .unwrap_err()
-            .to_string();
+        let error = DeviceName::Cuda(0).open(Precision::F32).unwrap_err();
+        let error = error.to_string();
         assert!(
             error.contains("cuda:0 cannot be used") && error.contains("driml doctor"),
             "{error}"

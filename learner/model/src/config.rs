@@ -104,13 +104,19 @@ pub struct DimHeads {
 
 impl DimHeads {
     /// No DIM head at all: the C51 agent, target networks and actors.
-    pub const NONE: Self = Self {
-        psi3: false,
-        phi3: false,
-        psi4: false,
-        phi4: false,
-        action: false,
-    };
+    pub const NONE: Self = Self::all(false);
+    /// Every head, and Psi sees the action.
+    pub const EVERY: Self = Self::all(true);
+
+    const fn all(is_there: bool) -> Self {
+        Self {
+            psi3: is_there,
+            phi3: is_there,
+            psi4: is_there,
+            phi4: is_there,
+            action: is_there,
+        }
+    }
 
     /// Whether the action embedding exists: Psi is conditioned on the action, and there is a Psi.
     pub fn embeds_action(&self) -> bool {
@@ -334,13 +340,7 @@ impl ModelConfig {
             hidden: 7,
             embedding_dim: 8,
             action_embed: 2,
-            dim: DimHeads {
-                psi3: true,
-                phi3: true,
-                psi4: true,
-                phi4: true,
-                action: true,
-            },
+            dim: DimHeads::EVERY,
             loss_layers: vec![],
             head: HeadConfig::PLAIN,
         }

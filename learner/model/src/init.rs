@@ -141,11 +141,8 @@ mod tests {
                 assert!(largest <= 0.1 && largest > 0.0995, "{largest}");
                 let len = values.len() as f64;
                 let moment = |power| {
-                    values
-                        .iter()
-                        .map(|&v| f64::from(v).powi(power))
-                        .sum::<f64>()
-                        / len
+                    let powers = values.iter().map(|&v| f64::from(v).powi(power));
+                    powers.sum::<f64>() / len
                 };
                 // The variance of U(-0.1, 0.1) is 0.01 / 3; five standard errors.
                 let error = (0.01f64 / 3.0 / len).sqrt();

@@ -83,15 +83,11 @@ impl Network {
     ) -> Result<Self> {
         config.validate()?;
         let head = |exists: bool, name: &str| {
-            exists
-                .then(|| Head::new(name, parameters, kernels))
-                .transpose()
+            let head = exists.then(|| Head::new(name, parameters, kernels));
+            head.transpose()
         };
-        let action = config
-            .dim
-            .embeds_action()
-            .then(|| ActionEmbedding::new(config, parameters, kernels))
-            .transpose()?;
+        let embeds = config.dim.embeds_action();
+        let action = embeds.then(|| ActionEmbedding::new(config, parameters, kernels));
         let own = config.loss_layers.iter().map(|own| {
             let tensor = |part| parameters.tensor(&own.layer(), part);
             Ok((own.name.clone(), (tensor("weight")?, tensor("bias")?)))
@@ -101,7 +97,7 @@ impl Network {
             loss_layers: own.collect::<Result<_>>()?,
             torso: FeatureLayers::new(config, parameters, kernels)?,
             head: C51Head::new(config, parameters, kernels)?,
-            action,
+            action: action.transpose()?,
             psi3: head(config.dim.psi3, "dim.psi3")?,
             phi3: head(config.dim.phi3, "dim.phi3")?,
             psi4: head(config.dim.psi4, "dim.psi4")?,
@@ -176,10 +172,8 @@ impl Network {
     }
 
     fn embedded(&self, actions: &Tensor) -> Result<Option<Tensor>> {
-        self.action
-            .as_ref()
-            .map(|action| action.forward(actions))
-            .transpose()
+        let action = self.action.as_ref();
+        action.map(|it| it.forward(actions)).transpose()
     }
 }
 

@@ -129,7 +129,10 @@ impl Parameters {
             let values = var.flatten_all()?.to_vec1::<f32>()?;
             check_finite(name, &values)?;
             let bytes = stored.encode(&values).map_err(|at| {
-                let why = format!("is {} at index {at}, too large for {stored:?}", values[at]);
+                let why = format!(
+                    "is {} at index {at}, too large for {stored}: set learner.publish_dtype to f32 or bf16",
+                    values[at]
+                );
                 ModelError::parameter(name, why)
             })?;
             tensors.push((name, var.dims().to_vec(), bytes));

@@ -85,10 +85,10 @@ impl StoredAs {
             return Err(at);
         }
         Ok(match self {
-            Self::F32 => values
-                .iter()
-                .flat_map(|value| value.to_le_bytes())
-                .collect(),
+            Self::F32 => {
+                let scalars = values.iter();
+                scalars.flat_map(|value| value.to_le_bytes()).collect()
+            }
             Self::F16 => {
                 let halves = values.iter().map(|&value| f16::from_f32(value));
                 halves.flat_map(f16::to_le_bytes).collect()
@@ -110,12 +110,8 @@ pub(crate) fn decode(dtype: Dtype, bytes: &[u8]) -> Option<Vec<f32>> {
     match dtype {
         Dtype::F32 => {
             let (scalars, _) = bytes.as_chunks::<4>();
-            Some(
-                scalars
-                    .iter()
-                    .map(|&bytes| f32::from_le_bytes(bytes))
-                    .collect(),
-            )
+            let scalars = scalars.iter().map(|&bytes| f32::from_le_bytes(bytes));
+            Some(scalars.collect())
         }
         Dtype::F16 => Some(halves(|bytes| f16::from_le_bytes(bytes).to_f32())),
         Dtype::BF16 => Some(halves(|bytes| bf16::from_le_bytes(bytes).to_f32())),

@@ -34,12 +34,9 @@ impl Alphabet {
         visible.sort_unstable();
         visible.dedup();
         // At most 255 of them, so an index fits a byte.
-        let index = map
-            .iter()
-            .map(|v| visible.partition_point(|known| known < v) as u8)
-            .collect();
+        let index = |v: &u8| visible.partition_point(|known| known < v) as u8;
         Ok(Self {
-            index,
+            index: map.iter().map(index).collect(),
             len: visible.len(),
         })
     }
@@ -49,10 +46,8 @@ impl Alphabet {
     /// # Errors
     /// None or more than 255 actions.
     pub fn raw(num_actions: usize) -> Result<Self, AffinityError> {
-        let map: Vec<u8> = (0..num_actions.min(256))
-            .map(|action| action as u8)
-            .collect();
-        Self::new(&map)
+        let map = (0..num_actions.min(256)).map(|action| action as u8);
+        Self::new(&map.collect::<Vec<_>>())
     }
 
     /// Number of visible actions, m.
@@ -84,26 +79,19 @@ impl Alphabet {
     /// Pairs of raw actions as pairs of dense indices.
     pub(super) fn map_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
         let index = |action: u8| {
-            let unknown =
-                || AffinityError(format!("action {action}; there are {}", self.index.len()));
-            self.index
-                .get(usize::from(action))
-                .copied()
-                .ok_or_else(unknown)
+            let index = self.index.get(usize::from(action)).copied();
+            let count = self.index.len();
+            index.ok_or_else(|| AffinityError(format!("action {action}; there are {count}")))
         };
-        pairs
-            .iter()
-            .map(|&(i, j)| Ok((index(i)?, index(j)?)))
-            .collect()
+        let pairs = pairs.iter();
+        pairs.map(|&(i, j)| Ok((index(i)?, index(j)?))).collect()
     }
 
     /// A matrix [m, m] by dense indices as one [n, n] by raw actions.
     pub(super) fn expand(&self, matrix: &[f64]) -> Vec<f32> {
         let entry = |&i: &u8, &j: &u8| matrix[usize::from(i) * self.len + usize::from(j)] as f32;
-        self.index
-            .iter()
-            .flat_map(|i| self.index.iter().map(move |j| entry(i, j)))
-            .collect()
+        let row = |i| self.index.iter().map(move |j| entry(i, j));
+        self.index.iter().flat_map(row).collect()
     }
 }
 

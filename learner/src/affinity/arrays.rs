@@ -1,9 +1,20 @@
 //! Arrays of numbers that both estimates have: checks of a saved one, and the softmax of each row of a matrix.
 
+use std::ops::RangeInclusive;
+
+use crate::ranges::outside;
+
 /// What is wrong with the settings, the pairs of actions or the saved state of an affinity estimate.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("action affinity: {0}")]
 pub struct AffinityError(pub(super) String);
+
+/// Checks that each setting is in its range.
+pub(super) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(), AffinityError> {
+    let mut all = all.iter();
+    let why = all.find_map(|(name, value, range)| outside(name, *value, range));
+    why.map_or(Ok(()), |why| Err(AffinityError(why)))
+}
 
 /// Checks the length of an array by name, and that its numbers are finite.
 pub(super) fn check_array<T: Copy + Into<f64>>(

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities},
+    arrays::{AffinityError, check_array, check_probabilities, check_ranges},
 };
 
 /// Decay and smoothing of the pair counts.
@@ -38,21 +38,11 @@ pub struct ExactAffinity {
 }
 
 impl ExactSettings {
-    fn check_valid(&self) -> Result<(), AffinityError> {
-        let Self { decay, smoothing } = *self;
-        if !(decay > 0.0 && decay <= 1.0) {
-            return Err(AffinityError(format!(
-                "a decay of {decay:e}, which is not above 0 and at most 1"
-            )));
-        }
-        if !SMOOTHING.contains(&smoothing) {
-            return Err(AffinityError(format!(
-                "a smoothing of {smoothing:e}, which is not within {:e} and {:e}",
-                SMOOTHING.start(),
-                SMOOTHING.end()
-            )));
-        }
-        Ok(())
+    pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
+        check_ranges(&[
+            ("decay", self.decay, f64::MIN_POSITIVE..=1.0),
+            ("smoothing", self.smoothing, SMOOTHING),
+        ])
     }
 }
 
@@ -92,9 +82,9 @@ impl ExactAffinity {
         if pairs.is_empty() {
             return Ok(());
         }
-        self.counts
-            .iter_mut()
-            .for_each(|count| *count *= self.settings.decay);
+        for count in &mut self.counts {
+            *count *= self.settings.decay;
+        }
         for (i, j) in pairs {
             self.counts[usize::from(i) * self.alphabet.len() + usize::from(j)] += 1.0;
         }
@@ -136,13 +126,10 @@ impl ExactAffinity {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::affinity::tests::EXACT;
 
     fn of_15() -> ExactAffinity {
-        let settings = ExactSettings {
-            decay: 0.999,
-            smoothing: 1.0,
-        };
-        ExactAffinity::new(Alphabet::raw(15).unwrap(), settings).unwrap()
+        ExactAffinity::new(Alphabet::raw(15).unwrap(), EXACT).unwrap()
     }
 
     /// What the learned estimate comes to as well: pairs that were never seen say nothing about how one action follows another.
@@ -161,24 +148,6 @@ mod tests {
             for (action, row) in exact.matrix().chunks_exact(15).enumerate() {
                 assert!(uniform(row), "action {action}: {row:?}");
             }
-        }
-    }
-
-    #[test]
-    fn settings_are_checked() {
-        for (decay, smoothing) in [
-            (0.0, 1.0),
-            (1.1, 1.0),
-            (f64::NAN, 1.0),
-            (0.9, 0.0),
-            (0.9, 1e-320),
-            (0.9, 1e306),
-            (0.9, f64::NAN),
-        ] {
-            let settings = ExactSettings { decay, smoothing };
-            let refused = ExactAffinity::new(Alphabet::raw(2).unwrap(), settings).unwrap_err();
-            let named = if decay == 0.9 { "smoothing" } else { "decay" };
-            assert!(refused.to_string().contains(named), "{refused}");
         }
     }
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities, row_softmax},
+    arrays::{AffinityError, check_array, check_probabilities, check_ranges, row_softmax},
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -43,10 +43,10 @@ pub struct LearnedAffinity {
 }
 
 /// Most hidden units; settings beyond it are refused.
-const HIDDEN_MAX: usize = 4096;
+const HIDDEN_MAX: f64 = 4096.0;
 
 impl LearnedSettings {
-    fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
         let Self {
             hidden,
             lr,
@@ -55,28 +55,15 @@ impl LearnedSettings {
             eps,
             keep,
         } = *self;
-        let rate = |x: f64| ((1e-30..=1e38).contains(&x), "within 1e-30 and 1e38");
-        let addend = |x: f64| ((1e-30..=1e30).contains(&x), "within 1e-30 and 1e30");
-        let share = |x: f64| ((0.0..1.0).contains(&x), "at least 0 and below 1");
-        if !(1..=HIDDEN_MAX).contains(&hidden) {
-            return Err(AffinityError(format!(
-                "hidden = {hidden}, which is not within 1 and {HIDDEN_MAX}"
-            )));
-        }
-        for (name, value, (is_fine, range)) in [
-            ("lr", lr, rate(lr)),
-            ("eps", eps, addend(eps)),
-            ("beta1", beta1, share(beta1)),
-            ("beta2", beta2, share(beta2)),
-            ("keep", keep, share(keep)),
-        ] {
-            if !is_fine {
-                return Err(AffinityError(format!(
-                    "{name} = {value:?}, which is not {range}"
-                )));
-            }
-        }
-        Ok(())
+        let share = 0.0..=1f64.next_down();
+        check_ranges(&[
+            ("hidden", hidden as f64, 1.0..=HIDDEN_MAX),
+            ("lr", lr, 1e-30..=1e38),
+            ("eps", eps, 1e-30..=1e30),
+            ("beta1", beta1, share.clone()),
+            ("beta2", beta2, share.clone()),
+            ("keep", keep, share),
+        ])
     }
 }
 
@@ -96,10 +83,9 @@ impl LearnedAffinity {
         let mut parameters = vec![0.0; parameter_count(m, hidden)];
         // The first layer as PyTorch draws it, U(+-1/sqrt(inputs)); the last one stays 0, so that q starts at 0.
         let bound = 1.0 / ((2 * m) as f64).sqrt();
-        let first_layer = (2 * m + 1) * hidden;
-        parameters[..first_layer]
-            .iter_mut()
-            .for_each(|p| *p = rng.random_range(-bound..bound));
+        for p in &mut parameters[..(2 * m + 1) * hidden] {
+            *p = rng.random_range(-bound..bound);
+        }
         let zeros = vec![0.0; parameters.len()];
         let smoothed = vec![1.0 / m as f64; m * m];
         Ok(Self {
@@ -191,10 +177,8 @@ impl LearnedAffinity {
         let (m, [_, _, out, c]) = (self.alphabet.len(), self.offsets());
         let weights = &self.parameters[out..c];
         let q = |i: usize, j: usize| {
-            let units = weights
-                .iter()
-                .enumerate()
-                .map(|(h, w)| w * self.unit(i, j, h).max(0.0));
+            let units = weights.iter().enumerate();
+            let units = units.map(|(h, w)| w * self.unit(i, j, h).max(0.0));
             units.sum::<f64>() + self.parameters[c]
         };
         (0..m * m).map(|at| q(at / m, at % m)).collect()
@@ -256,14 +240,11 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
+    use crate::affinity::tests::PRESET;
 
     const SETTINGS: LearnedSettings = LearnedSettings {
         hidden: 5,
-        lr: 1e-3,
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-8,
-        keep: 0.9,
+        ..PRESET
     };
 
     fn of_three_actions() -> (LearnedAffinity, ChaCha8Rng) {

@@ -84,13 +84,17 @@ mod tests {
     use super::*;
 
     /// The preset's numbers (`deploy/settings/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
-    const PRESET: LearnedSettings = LearnedSettings {
+    pub(super) const PRESET: LearnedSettings = LearnedSettings {
         hidden: 32,
         lr: 2e-3,
         beta1: 0.9,
         beta2: 0.999,
         eps: 1e-8,
         keep: 0.9,
+    };
+    pub(super) const EXACT: ExactSettings = ExactSettings {
+        decay: 0.999,
+        smoothing: 1.0,
     };
     const ACTIONS: usize = 15;
     const K_MAX: usize = 5;
@@ -186,11 +190,7 @@ mod tests {
         for (batch, seed) in [(256, 4), (256, 5), (64, 4), (64, 5)] {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let alphabet = Alphabet::raw(ACTIONS).unwrap();
-            let exact = ExactSettings {
-                decay: 0.999,
-                smoothing: 1.0,
-            };
-            let exact = ExactAffinity::new(alphabet.clone(), exact).unwrap();
+            let exact = ExactAffinity::new(alphabet.clone(), EXACT).unwrap();
             let learned = LearnedAffinity::new(alphabet, PRESET, &mut rng).unwrap();
             let mut exact = AffinityEstimator::Exact(exact);
             let mut learned = AffinityEstimator::Learned(learned);
@@ -226,11 +226,7 @@ mod tests {
     #[test]
     fn an_unknown_action_is_an_error_and_no_pairs_change_nothing() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let settings = ExactSettings {
-            decay: 0.999,
-            smoothing: 1.0,
-        };
-        let exact = ExactAffinity::new(Alphabet::raw(3).unwrap(), settings).unwrap();
+        let exact = ExactAffinity::new(Alphabet::raw(3).unwrap(), EXACT).unwrap();
         let mut exact = AffinityEstimator::Exact(exact);
         let before = exact.clone();
         assert!(exact.observe(&[(0, 1), (1, 3)], &mut rng).is_err());

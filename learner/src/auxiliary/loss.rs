@@ -174,14 +174,17 @@ pub struct LossInputs<'a> {
 }
 
 impl LossInputs<'_> {
-    /// The key encoder's vectors [B, embedding_dim] of the batch's positives, without a gradient.
+    /// The key encoder's vectors [P * B, embedding_dim] of the batch's positives, without a gradient; of a blank state where a row has
+    /// none.
     ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
     pub fn keys(&self) -> Result<Tensor, UpdateError> {
         let key = self.key.expect("a loss with key_tau is given its encoder");
-        let positives = states(self.model, self.batch.states_k, self.device)?;
-        Ok(key.encode(&positives)?)
+        let (batch, len) = (self.batch, self.model.frame_len());
+        let positives = batch.positive_states(len);
+        let PassInput { bytes, .. } = PassInput::of(&positives, batch.states_k, len, false);
+        Ok(key.encode(&states(self.model, bytes, self.device)?)?)
     }
 
     /// a_t [B], on the CPU, where the network looks at them.

@@ -27,12 +27,18 @@ pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL]
 /// Those that the program added.
 static CUSTOM: OnceLock<Vec<&'static MenuItem>> = OnceLock::new();
 
-/// Adds losses to the menu, before anything else is done: `learner.update.auxiliary_loss` takes their names from then on. A name
-/// that is in the menu already keeps its loss.
+/// Adds losses to the menu, before anything else is done: `learner.update.auxiliary_loss` takes their names from then on.
 ///
 /// # Panics
-/// If it was called before.
+/// If it was called before, or a name is in the menu already.
 pub fn register(items: Vec<&'static MenuItem>) {
+    for MenuItem { name, .. } in &items {
+        let is_known = MENU.iter().any(|known| known.name == *name);
+        assert!(
+            !is_known,
+            "the auxiliary loss {name} is driml's: choose another name"
+        );
+    }
     let first = CUSTOM.set(items);
     first.expect("a program registers its losses once");
 }
@@ -121,5 +127,14 @@ impl TryFrom<String> for AuxiliaryKind {
 impl From<AuxiliaryKind> for &'static str {
     fn from(auxiliary_loss: AuxiliaryKind) -> Self {
         auxiliary_loss.name()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    #[should_panic(expected = "the auxiliary loss dim is driml's: choose another name")]
+    fn a_name_of_the_menu_cannot_be_registered() {
+        super::register(vec![&super::dim::DIM]);
     }
 }

@@ -17,6 +17,11 @@ pub const NONE: MenuItem = MenuItem {
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     settings.check_no_own()?;
+    if settings.condition_on_action {
+        return Err(UpdateError::AuxiliaryLoss(
+            "auxiliary_loss = none has no Psi that could be given the action: set condition_on_action to false, or take another agent".into(),
+        ));
+    }
     let wanted = settings.lambda.wanted();
     match PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted) {
         Some((pair, _)) => Err(UpdateError::AuxiliaryLoss(format!(

@@ -1,11 +1,12 @@
 //! The files of one checkpoint, and what `state.json` holds.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, path::Path};
 
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::error::{CheckpointError, damaged};
 use crate::{
     affinity::AffinityEstimator,
     agent::Agent,
@@ -57,20 +58,30 @@ pub(super) struct StateFile {
     pub(super) sha256: BTreeMap<String, String>,
 }
 
+/// What every version of `state.json` has.
+#[derive(Deserialize)]
+struct Version {
+    format: u32,
+}
+
 /// Reads a `state.json` and drops it, for fuzzing.
-pub fn check_state(text: &[u8]) -> Result<(), String> {
-    StateFile::read(text).map(drop)
+pub fn check_state(text: &[u8]) -> Result<(), CheckpointError> {
+    StateFile::read(Path::new(""), text).map(drop)
 }
 
 impl StateFile {
-    /// Reads the file's text and checks what it holds.
-    pub(super) fn read(text: &[u8]) -> Result<Self, String> {
-        let state: Self = serde_json::from_slice(text).map_err(|e| e.to_string())?;
-        if state.format != FORMAT {
-            return Err(format!("its format is {}, not {FORMAT}", state.format));
+    /// Reads the text of the file in `folder` and checks what it holds.
+    pub(super) fn read(folder: &Path, text: &[u8]) -> Result<Self, CheckpointError> {
+        // Before its other fields, of which another version has others.
+        if let Ok(Version { format }) = serde_json::from_slice(text)
+            && format != FORMAT
+        {
+            let folder = folder.to_owned();
+            return Err(CheckpointError::OtherFormat { folder, format });
         }
-        state.check_valid()?;
-        Ok(state)
+        let read = serde_json::from_slice(text).map_err(|e| e.to_string());
+        let checked = read.and_then(|state: Self| state.check_valid().map(|()| state));
+        checked.map_err(|why| damaged(folder, STATE, why))
     }
 
     /// Checks what its types do not hold: a file may be right by its sum and still not be one that a learner wrote.

@@ -16,20 +16,18 @@ const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [mod
     Atoms: v_min to v_max, evenly. Value of an action: sum of softmax(logits) * atoms.";
 
 /// What the torso does, in [`CONVENTIONS`].
-const fn torso(model: &ModelConfig) -> &'static str {
-    match model.torso {
+fn torso(model: &ModelConfig) -> String {
+    let read = match model.torso {
         TorsoName::Nature => {
-            " without padding, each followed by ReLU; torso.fc takes their output as channel, row, column"
+            return " without padding, each followed by ReLU; torso.fc takes their output as channel, row, column".into();
         }
-        TorsoName::Impala => {
-            " with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
-             and block2; torso.fc takes ReLU of the last stage's output as channel, row, column"
-        }
-        TorsoName::Impoola => {
-            " with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
-             and block2; torso.fc takes the mean over the locations of ReLU of the last stage's output"
-        }
-    }
+        TorsoName::Impala => "ReLU of the last stage's output as channel, row, column",
+        TorsoName::Impoola => "the mean over the locations of ReLU of the last stage's output",
+    };
+    format!(
+        " with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
+         and block2; torso.fc takes {read}"
+    )
 }
 
 /// What the C51 head does, in [`CONVENTIONS`].
@@ -63,7 +61,7 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
     let description = Description {
         format: FORMAT,
         conventions: CONVENTIONS
-            .replace("TORSO", torso(model))
+            .replace("TORSO", &torso(model))
             .replace("HEAD", head(model)),
         model,
         input,

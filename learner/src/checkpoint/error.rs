@@ -5,6 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use super::contents::FORMAT;
 use crate::error::UpdateError;
 
 /// Why a checkpoint was not written or not read.
@@ -22,6 +23,12 @@ pub enum CheckpointError {
          to begin anew, remove all checkpoint-* folders beside it"
     )]
     Damaged { file: PathBuf, why: String },
+    #[error(
+        "the checkpoint {} was written by another version of this program (format {format}, this one reads {}): use that version",
+        folder.display(),
+        FORMAT
+    )]
+    OtherFormat { folder: PathBuf, format: u32 },
     #[error(
         "{folder} belongs to a run with specification {found}, this run's is {expected}: \
          resume with the settings it was made with, or choose another folder"

@@ -66,9 +66,7 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
 /// the two renames it is known by its other name.
 pub(super) fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointError> {
     let folder = path.parent().unwrap_or(Path::new("."));
-    let mut older = path.as_os_str().to_owned();
-    older.push(REPLACED);
-    let older = PathBuf::from(older);
+    let older = with_end(path, REPLACED);
     if path.exists() {
         fs::rename(path, &older).map_err(io_error("move", path))?;
     }
@@ -92,7 +90,7 @@ pub(super) fn tidy(folder: &Path) -> Result<(), CheckpointError> {
             }
             _ => {
                 tracing::warn!(path = %path.display(), "removing what an unfinished save left");
-                remove_if_there(&path)?;
+                remove_or_warn(&path);
             }
         }
     }
@@ -123,16 +121,28 @@ pub(super) fn sync(folder: &Path) -> Result<(), CheckpointError> {
         .map_err(io_error("flush", folder))
 }
 
-fn remove_if_there(folder: &Path) -> Result<(), CheckpointError> {
-    match fs::remove_dir_all(folder) {
-        Err(why) if why.kind() != io::ErrorKind::NotFound => Err(io_error("remove", folder)(why)),
-        _ => Ok(()),
+/// Removes a whole checkpoint, under another name: what is left if that is cut off must not pass for one.
+pub(super) fn prune(path: &Path) {
+    let aside = with_end(path, ".tmp");
+    match fs::rename(path, &aside) {
+        Ok(()) => remove_or_warn(&aside),
+        Err(e) => tracing::warn!("an old checkpoint stays: {}", io_error("move", path)(e)),
     }
 }
 
-/// Removes a folder whose removal decides nothing: what is saved, or is not, stays so.
+fn with_end(path: &Path, end: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(end);
+    name.into()
+}
+
+/// Removes a folder, if it is there, whose removal decides nothing: what is saved, or is not, stays so.
 pub(super) fn remove_or_warn(folder: &Path) {
-    if let Err(e) = remove_if_there(folder) {
-        tracing::warn!("a checkpoint that is not needed stays: {e}");
+    match fs::remove_dir_all(folder) {
+        Err(why) if why.kind() != io::ErrorKind::NotFound => {
+            let why = io_error("remove", folder)(why);
+            tracing::warn!("a checkpoint that is not needed stays: {why}");
+        }
+        _ => {}
     }
 }

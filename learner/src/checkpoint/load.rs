@@ -156,7 +156,7 @@ fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {
             format!("its SHA-256 is not the one in {STATE_SUM}"),
         ));
     }
-    StateFile::read(&text).map_err(|why| damaged(path, STATE, why))
+    StateFile::read(path, &text)
 }
 
 /// The bytes of one of its other files.

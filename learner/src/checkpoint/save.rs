@@ -15,7 +15,7 @@ use super::{
     },
     description,
     error::{CheckpointError, io_error},
-    folder::{PREFIX, list, put_in_place, remove_or_warn, sync, tidy, write_durably},
+    folder::{PREFIX, list, prune, put_in_place, remove_or_warn, sync, tidy, write_durably},
 };
 use crate::{agent::Agent, error::UpdateError};
 
@@ -24,8 +24,10 @@ use crate::{agent::Agent, error::UpdateError};
 pub struct Label<'a> {
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
-    /// What [`describe`](super::describe) says, for the networks' metadata.
+    /// What [`describe`](super::describe) says of the online network, for its metadata.
     pub description: &'a str,
+    /// The same of a network without the auxiliary loss's heads, for the target's and the average's.
+    pub without_heads: &'a str,
     /// The caller's companion of the checkpoint.
     pub companion: Option<&'a [u8]>,
 }
@@ -59,7 +61,7 @@ pub fn save(
     }
     let all = list(folder)?;
     for (_, old) in &all[..all.len().saturating_sub(keep)] {
-        remove_or_warn(old);
+        prune(old);
     }
     Ok(path)
 }
@@ -67,7 +69,7 @@ pub fn save(
 /// Writes a checkpoint's files into the folder `aside`, which is made.
 fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), CheckpointError> {
     let agent = &state.agent;
-    let mut files = tensor_files(agent, label.description).map_err(CheckpointError::Unsound)?;
+    let mut files = tensor_files(agent, label).map_err(CheckpointError::Unsound)?;
     files.extend(label.companion.map(|bytes| (COMPANION, bytes.to_vec())));
     fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
@@ -103,23 +105,23 @@ fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), Che
 /// The files of tensors and their names, all finite.
 fn tensor_files(
     agent: &Agent,
-    description: &str,
+    label: Label<'_>,
 ) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
-    let everything = |parameters: &Parameters| {
+    let described = |parameters: &Parameters, description: &str| {
         parameters.to_described_safetensors(StoredAs::F32, description::KEY, description)
     };
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
     let mut files = vec![
-        (ONLINE, everything(agent.online())?),
-        (TARGET, everything(agent.target())?),
+        (ONLINE, described(agent.online(), label.description)?),
+        (TARGET, described(agent.target(), label.without_heads)?),
         (OPTIMIZER, moments),
     ];
     if let Some(key) = agent.key() {
-        files.push((KEY, everything(key)?));
+        files.push((KEY, described(key, label.description)?));
     }
     if let Some(average) = agent.average() {
-        files.push((AVERAGE, everything(average)?));
+        files.push((AVERAGE, described(average, label.without_heads)?));
     }
     Ok(files)
 }

@@ -27,10 +27,9 @@ pub(super) fn kl_loss(
 /// As [`super::info_nce::info_nce_loss`]. Beyond about 8 times the clip the slope of a score is 0 here: `1 - tanh^2` in f32.
 pub(super) fn info_nce_loss(dots: &Tensor, valid: &[u8], scores: Scores) -> Result<Tensor> {
     let device = dots.device();
-    let rows: Vec<u32> = (0..)
-        .zip(valid)
-        .filter_map(|(row, &valid)| (valid != 0).then_some(row))
-        .collect();
+    let rows = (0..).zip(valid);
+    let rows = rows.filter_map(|(row, &valid)| (valid != 0).then_some(row));
+    let rows: Vec<u32> = rows.collect();
     let count = rows.len();
     let locations = dots.dim(0)?;
     if count == 0 || locations == 0 {

@@ -4,20 +4,15 @@
 use std::{
     collections::{BTreeMap, HashMap},
     ops::RangeInclusive,
-    sync::{
-        Mutex,
-        atomic::{AtomicBool, Ordering},
-    },
 };
 
-use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
-use driml_model::{Kernels, Parameters, floats};
-use driml_protocol::lock;
+use candle_core::{DType, Device, Tensor, Var};
+use driml_model::{Kernels, Parameters};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::gradients::Gradients;
-use crate::{error::UpdateError, ranges::check_range, tensors::floats_mut};
+use crate::{error::UpdateError, ranges::check_range, tensors::change};
 
 /// Elements a thread takes at a time.
 const CHUNK: usize = 1 << 14;
@@ -187,13 +182,16 @@ impl Adam {
             };
             match moments {
                 Moments::Fused { m, v } => {
-                    let step = Step {
-                        rule,
-                        moments: Mutex::new((m.as_mut_slice(), v.as_mut_slice())),
-                        all_finite: AtomicBool::new(true),
-                    };
-                    var.inplace_op2(gradient, &step)?;
-                    if !step.all_finite.into_inner() {
+                    let mut all_finite = true;
+                    change(var, gradient, |p, g| {
+                        let chunks = p.par_chunks_mut(CHUNK).zip(g.par_chunks(CHUNK));
+                        let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
+                        let finite = chunks
+                            .zip(moments)
+                            .map(|((p, g), (m, v))| rule.apply(p, g, m, v));
+                        all_finite = finite.reduce(|| true, |one, other| one & other);
+                    })?;
+                    if !all_finite {
                         let name = name.clone();
                         let update = self.step;
                         return Err(UpdateError::Diverged { name, update, lr });
@@ -364,51 +362,6 @@ fn flush(values: &mut [f32]) {
         } else {
             *value
         };
-    }
-}
-
-struct Step<'a> {
-    rule: Rule,
-    /// Uncontended: candle hands operations out by shared reference only.
-    moments: Mutex<(&'a mut [f32], &'a mut [f32])>,
-    /// Whether all parameters and moments are finite after the step.
-    all_finite: AtomicBool,
-}
-
-impl InplaceOp2 for Step<'_> {
-    fn name(&self) -> &'static str {
-        "adam"
-    }
-
-    fn cpu_fwd(
-        &self,
-        parameter: &mut CpuStorage,
-        l1: &Layout,
-        gradient: &CpuStorage,
-        l2: &Layout,
-    ) -> candle_core::Result<()> {
-        let parameter = floats_mut(parameter, l1)?;
-        let gradient = floats(gradient, l2)?;
-        let mut moments = lock(&self.moments);
-        let (m, v) = &mut *moments;
-        if parameter.len() != m.len() || gradient.len() != m.len() {
-            bail!(
-                "{} parameters, {} gradients, {} moments",
-                parameter.len(),
-                gradient.len(),
-                m.len()
-            );
-        }
-        parameter
-            .par_chunks_mut(CHUNK)
-            .zip(gradient.par_chunks(CHUNK))
-            .zip(m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK)))
-            .for_each(|((p, g), (m, v))| {
-                if !self.rule.apply(p, g, m, v) {
-                    self.all_finite.store(false, Ordering::Relaxed);
-                }
-            });
-        Ok(())
     }
 }
 

@@ -78,11 +78,8 @@ fn squares_on_cpu(tensor: &Tensor) -> candle_core::Result<f64> {
 fn sum_of_squares(values: &[f32]) -> f64 {
     let mut parts = [0f64; 8];
     let chunks = values.chunks_exact(8);
-    let rest: f64 = chunks
-        .remainder()
-        .iter()
-        .map(|&x| f64::from(x) * f64::from(x))
-        .sum();
+    let rest = chunks.remainder().iter();
+    let rest: f64 = rest.map(|&x| f64::from(x) * f64::from(x)).sum();
     for chunk in chunks {
         for (part, &x) in parts.iter_mut().zip(chunk) {
             *part += f64::from(x) * f64::from(x);

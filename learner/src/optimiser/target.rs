@@ -1,10 +1,9 @@
 //! Slow copies of the online network, such as the target network: how they follow it.
 //! When they do is for `agent` to say.
 
-use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
-use driml_model::{Kernels, Parameters, floats};
+use driml_model::{Kernels, Parameters};
 
-use crate::{error::UpdateError, tensors::floats_mut};
+use crate::{error::UpdateError, tensors::change};
 
 /// Parameters up to this size can be followed: the difference of two is then finite.
 pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
@@ -39,7 +38,15 @@ pub fn follow(
             )));
         };
         match kernels {
-            Kernels::Fused(_) => var.inplace_op2(source, &Follow { tau: tau as f32 })?,
+            Kernels::Fused(_) => change(var, source, |target, online| {
+                let tau = tau as f32;
+                if tau >= 1.0 {
+                    return target.copy_from_slice(online);
+                }
+                for (target, &online) in target.iter_mut().zip(online) {
+                    *target += tau * (online - *target);
+                }
+            })?,
             Kernels::Candle if tau >= 1.0 => var.set(source)?,
             Kernels::Candle => {
                 let way = (source.as_tensor() - var.as_tensor())?.affine(tau, 0.0)?;
@@ -48,36 +55,4 @@ pub fn follow(
         }
     }
     Ok(())
-}
-
-struct Follow {
-    tau: f32,
-}
-
-impl InplaceOp2 for Follow {
-    fn name(&self) -> &'static str {
-        "follow"
-    }
-
-    fn cpu_fwd(
-        &self,
-        target: &mut CpuStorage,
-        l1: &Layout,
-        online: &CpuStorage,
-        l2: &Layout,
-    ) -> candle_core::Result<()> {
-        let (target, online) = (floats_mut(target, l1)?, floats(online, l2)?);
-        let (len, followed) = (target.len(), online.len());
-        if len != followed {
-            bail!("a target of {len} values follows {followed}");
-        }
-        if self.tau >= 1.0 {
-            target.copy_from_slice(online);
-            return Ok(());
-        }
-        for (target, &online) in target.iter_mut().zip(online) {
-            *target += self.tau * (online - *target);
-        }
-        Ok(())
-    }
 }

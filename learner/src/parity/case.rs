@@ -235,7 +235,9 @@ impl Config {
         LearnerSettings {
             double_dqn: self.double_dqn,
             auxiliary_loss,
-            condition_on_action: self.condition_on_action.unwrap_or(true),
+            condition_on_action: self
+                .condition_on_action
+                .unwrap_or(auxiliary_loss != AuxiliaryKind::NONE),
             lambda: self.lambda,
             tanh_clip: self.tanh_clip,
             max_grad_norm: self.max_grad_norm,

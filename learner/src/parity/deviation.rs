@@ -51,10 +51,8 @@ impl ErrorOfUpdate {
         }
         let [own_next, next] = [&own, &expected].map(|it| &it.next_greedy_action);
         let next = own_next.iter().zip(next);
-        let next: Vec<bool> = next
-            .filter(|(own, _)| **own != NO_ACTION)
-            .map(|(own, expected)| own == expected)
-            .collect();
+        let next = next.filter(|(own, _)| **own != NO_ACTION);
+        let next: Vec<bool> = next.map(|(own, expected)| own == expected).collect();
         let same_next = next.iter().filter(|same| **same).count() as f64;
         let [own_loss, reference_loss] = [own.total, expected.total].map(f64::from);
         Ok(Self {

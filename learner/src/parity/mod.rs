@@ -296,7 +296,9 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     };
     // A loss that does not take every pair is used unchanged.
     let loss = kind.loss(&every).or_else(|_| settings.auxiliary())?;
-    let model = case.model(loss.heads(settings.condition_on_action));
+    // The update of C51 alone gives it to nothing.
+    let gives_action = |(name, _): (&str, _)| name.starts_with("dim.action.");
+    let model = case.model(loss.heads(case.online().any(gives_action)));
     let (device, kernels) = (&compute.device, compute.kernels);
     let named = case.parameters("online.", &model);
     let parameters = Parameters::from_tensors(&model, named, device)?;

@@ -31,7 +31,7 @@ const RETRY_PAUSE: Duration = Duration::from_millis(200);
 
 /// Pause before shards that hold nothing are asked again.
 const LOOK_AGAIN: Duration = Duration::from_millis(50);
-/// How long the last batch is waited for once all transitions are in.
+/// How long the last batch is waited for once all transitions are in and no shard fills its memory again.
 const LAST_BATCH_MAX: Duration = Duration::from_secs(30);
 /// What is asked for, by whom, and how.
 #[derive(Clone, Copy, Debug)]
@@ -282,7 +282,7 @@ impl Fetcher {
                     partial.from.push(self.received(shard, &part));
                     partial.parts.push(part);
                 }
-                Err(NotReady::Wait(_)) => {}
+                Err(NotReady::Wait(waiting)) => partial.note_waiting(waiting),
                 Err(NotReady::Finished) => finished = true,
                 Err(NotReady::Refused { why }) => {
                     return Ok(Some(Fetched::Failed(BatchError::Refused(why))));
@@ -328,7 +328,7 @@ impl Fetcher {
         partial: &mut PartialBatch,
         is_due: impl Fn(&Portion, Instant) -> bool,
     ) -> Result<(), BatchError> {
-        let now = Instant::now();
+        let (now, mut all_in) = (Instant::now(), false);
         for (client, portion) in self.shared.clients.iter().zip(&mut partial.portions) {
             if !is_due(portion, now) {
                 continue;
@@ -339,8 +339,9 @@ impl Fetcher {
                 rows_sampled: status.rows_sampled,
             };
             portion.note(counts, status.transitions_held);
-            partial.all_in |= status.finished;
+            all_in |= status.finished;
         }
+        partial.note_all_in(all_in);
         Ok(())
     }
 

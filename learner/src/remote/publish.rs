@@ -49,6 +49,8 @@ pub(crate) struct Newest<T> {
     waiting: Mutex<VecDeque<T>>,
     most: usize,
     filled: Condvar,
+    /// None waits, and none is being sent.
+    idle: AtomicBool,
     /// How many all replay servers have.
     pub(crate) arrived: AtomicU64,
 }
@@ -59,6 +61,7 @@ impl<T> Newest<T> {
             waiting: Mutex::default(),
             most,
             filled: Condvar::new(),
+            idle: true.into(),
             arrived: AtomicU64::default(),
         })
     }
@@ -70,13 +73,15 @@ impl<T> Newest<T> {
             waiting.pop_front();
         }
         waiting.push_back(value);
+        self.idle.store(false, Ordering::Relaxed);
         drop(waiting);
         self.filled.notify_one();
     }
 
-    /// Takes the oldest that is there, waiting for one for a while.
+    /// Takes the oldest that is there, waiting for one for a while; what was taken before has then been sent.
     fn take(&self) -> Option<T> {
         let waiting = lock(&self.waiting);
+        self.idle.store(waiting.is_empty(), Ordering::Relaxed);
         let (mut waiting, _) = self
             .filled
             .wait_timeout_while(waiting, TICK, |waiting| waiting.is_empty())
@@ -167,10 +172,12 @@ impl Publisher {
         self.weights.put(weights);
     }
 
-    /// Waits until the status was fetched once after the learner finished, or for `wait_max`.
-    pub(crate) fn wait_until_heard(&self, wait_max: Duration) {
+    /// Waits until the status was fetched once after the learner finished and its last weights were sent, or for `wait_max`. After
+    /// `shutdown` nothing more is sent.
+    pub(crate) fn wait_until_heard(&self, wait_max: Duration, shutdown: &Shutdown) {
         let started = Instant::now();
-        while !self.fetched.load(Ordering::Relaxed) && started.elapsed() < wait_max {
+        let idle = || shutdown.is_set() || self.weights.idle.load(Ordering::Relaxed);
+        while !(self.fetched.load(Ordering::Relaxed) && idle()) && started.elapsed() < wait_max {
             std::thread::sleep(Duration::from_millis(20));
         }
     }
@@ -239,5 +246,24 @@ impl Sender {
             }
         }
         arrived
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_waits_or_is_being_sent_is_not_sent() {
+        let newest = Newest::of(1);
+        let idle = || newest.idle.load(Ordering::Relaxed);
+        assert!(idle());
+        newest.put(1);
+        newest.put(2);
+        assert!(!idle());
+        assert_eq!(newest.take(), Some(2));
+        assert!(!idle(), "it is being sent");
+        assert_eq!(newest.take(), None);
+        assert!(idle());
     }
 }

@@ -27,7 +27,7 @@ use crate::{
 
 /// How long a replay server may take to say what it has stored in the end.
 const LAST_COUNT_MAX: Duration = Duration::from_secs(1);
-/// How long a learner that was told to stop stays to be asked for its last status.
+/// How long a learner stays in the end to send its last weights and to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
 /// How long a batch may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
@@ -168,7 +168,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         activity.begin("has finished and stays to be asked");
         shutdown.wait();
     }
-    publisher.wait_until_heard(LAST_WORD_MAX);
+    publisher.wait_until_heard(LAST_WORD_MAX, shutdown);
     if sampling.is_prioritised() {
         let arrived = publisher.priorities.arrived.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
@@ -284,13 +284,31 @@ impl Checkpointer {
     }
 }
 
-/// Leaves the run's settings beside the checkpoints, for `driml evaluate`; a file that is there is the launcher's.
+/// Leaves the run's settings beside the checkpoints, for `driml evaluate`, in place of those of an earlier start; a file that begins with
+/// a comment is the launcher's.
 fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
     let path = run_dir.join("config.toml");
-    if path.exists() {
+    let there = std::fs::read_to_string(&path).unwrap_or_default();
+    if there.starts_with('#') || there == config_toml {
         return Ok(());
     }
     std::fs::create_dir_all(run_dir)
         .and_then(|()| atomic_write::write(&path, config_toml.as_bytes()))
         .with_context(|| format!("writing {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_settings_that_are_kept_are_the_newest_unless_they_are_the_launcher_s() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("config.toml");
+        for (there, kept) in [("a", "b"), ("# a", "# a")] {
+            std::fs::write(&path, there).unwrap();
+            keep_settings(folder.path(), "b").unwrap();
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), kept);
+        }
+    }
 }

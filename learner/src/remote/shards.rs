@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context, ensure};
 use driml_protocol::{
     Alive, Batch, Keys, LearnerJoin, RequestId, RunClient, RunInfo, ShardCounts, Shutdown, Silence,
-    join,
+    Waiting, join,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -193,6 +193,7 @@ pub(super) struct PartialBatch {
     pub(super) from: Vec<ServedPart>,
     /// All transitions of the run are in.
     pub(super) all_in: bool,
+    /// Since the last whole batch, or since the transitions that this one may wait for are in.
     pub(super) since_whole: Silence,
 }
 
@@ -208,6 +209,21 @@ impl PartialBatch {
             from: Vec::new(),
             all_in: false,
             since_whole: Silence::default(),
+        }
+    }
+
+    /// Takes what shards said: whether all transitions of the run are in.
+    pub(super) fn note_all_in(&mut self, all_in: bool) {
+        if all_in && !self.all_in {
+            self.all_in = true;
+            self.since_whole.answered();
+        }
+    }
+
+    /// Takes why a shard does not give its part yet. It knows what the others have: one that warms up lost its replay and fills it again.
+    pub(super) fn note_waiting(&mut self, waiting: Waiting) {
+        if matches!(waiting, Waiting::WarmUp { .. }) {
+            self.since_whole.answered();
         }
     }
 
@@ -324,6 +340,25 @@ mod tests {
         assert!(portion(9, 0, 0, 0).is_old(now), "it was never asked");
         assert!(!is_old(9, 400) && is_old(9, 600));
         assert!(!is_old(0, 40) && is_old(0, 60));
+    }
+
+    #[test]
+    fn the_last_batch_is_waited_for_from_when_it_can_come() {
+        let mut batch = batch_of(&[]);
+        let mut restarts = |note: fn(&mut PartialBatch)| {
+            while batch.since_whole.unanswered().is_zero() {}
+            note(&mut batch);
+            batch.since_whole.length().is_zero()
+        };
+        assert!(!restarts(|batch| batch.note_all_in(false)));
+        assert!(restarts(|batch| batch.note_all_in(true)));
+        assert!(!restarts(|batch| batch.note_all_in(true)), "they were in");
+        assert!(!restarts(
+            |batch| batch.note_waiting(Waiting::LearnerWaitsForActors)
+        ));
+        assert!(restarts(
+            |batch| batch.note_waiting(Waiting::WarmUp { have: 1, need: 2 })
+        ));
     }
 
     #[test]

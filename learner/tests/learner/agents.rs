@@ -2,7 +2,8 @@
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
 use driml_learner::{
-    Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, OwnedBatch, UpdateError,
+    Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, OwnedBatch, Positives, UpdateError,
+    auxiliary::{curl::CURL as CURL_ITEM, loss::MenuItem},
 };
 use driml_model::{Compute, ModelConfig};
 
@@ -16,6 +17,11 @@ pub(crate) const GLOBAL: Lambda = Lambda {
     ..NO_DIM
 };
 const POSITIVES: usize = 3;
+/// A loss of a program that has keys of later states.
+const KEYS_OF_LATER: AuxiliaryKind = AuxiliaryKind::of(&MenuItem {
+    positives: Positives::One,
+    ..CURL_ITEM
+});
 const KEY_TAU: f64 = 0.25;
 
 /// The table `curl` with this pace, or nothing.
@@ -87,10 +93,16 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         (AuxiliaryKind::NONE, NO_DIM),
         (DIM, ALL_DIM),
         (CPC, ALL_DIM),
+        (KEYS_OF_LATER, GLOBAL),
     ] {
         let mut rows = random_batch(6, 4);
         rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
         rows.positive_valid = vec![0, 1, 0, 1, 1, 1];
+        // What a loss that masks nothing sees of the states that are not there.
+        let len = rows.states_k.len() / 6;
+        for row in [0, 2] {
+            rows.states_k[row * len..][..len].fill(0);
+        }
         let several = later(&rows);
         let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
         let whole = if kind == CPC {
@@ -311,10 +323,11 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
         (CURL, ALL_DIM, false, "lambda.4t4 alone"),
         (CURL, GLOBAL, true, "condition_on_action"),
         (DIM, GLOBAL, true, "has no use for the table curl"),
+        (AuxiliaryKind::NONE, NO_DIM, true, "condition_on_action"),
         (
             AuxiliaryKind::NONE,
             NO_DIM,
-            true,
+            false,
             "has no use for the table curl",
         ),
     ] {

@@ -5,6 +5,8 @@ use driml_learner::{Augment, AugmentSettings, augment::View};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::synthetic::pool;
+
 pub(crate) const NOTHING: AugmentSettings = AugmentSettings {
     crop_side: 1.0,
     brightness: 0.0,
@@ -145,11 +147,7 @@ fn the_generator_alone_decides_and_rows_differ() {
     };
     let first = applied();
     for threads in [1, 2, 5] {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .unwrap();
-        assert!(pool.install(applied) == first);
+        assert!(pool(threads).install(applied) == first);
     }
     let mut different: Vec<_> = first.chunks_exact(state.len()).collect();
     different.sort_unstable();

@@ -61,6 +61,7 @@ pub(crate) fn try_save(
     let label = Label {
         run_spec_hash: SPEC,
         description,
+        without_heads: WITHOUT_HEADS,
         companion: None,
     };
     checkpoint::save(folder, run, label, keep)
@@ -96,6 +97,7 @@ pub(crate) fn progress() -> Progress {
 
 /// What the metadata says is for others: here it is any text.
 pub(crate) const DESCRIPTION: &str = r#"{"format":1}"#;
+const WITHOUT_HEADS: &str = r#"{"format":1,"model":{"dim":{}}}"#;
 
 pub(crate) fn load(folder: &Path) -> Result<Option<LearnerState>, CheckpointError> {
     let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
@@ -214,7 +216,7 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
 #[test]
 fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
     let folder = tempdir().unwrap();
-    // What removes a folder does not remove this.
+    // What removes a folder does not remove this, but gives it the name of an unfinished save.
     let stuck = folder.path().join("checkpoint-000000000000");
     fs::write(&stuck, "").unwrap();
     let mut run = start();
@@ -222,7 +224,7 @@ fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
         learn(&mut run, 1);
         save(&run, folder.path(), 1);
         let left = listed(folder.path());
-        assert_eq!(left, [0, updates], "the others are removed all the same");
+        assert_eq!(left, [updates], "no half of it passes for a checkpoint");
     }
 }
 
@@ -291,12 +293,15 @@ fn the_networks_say_what_they_are_and_need_not() {
     let folder = tempdir().unwrap();
     let run = start();
     let path = save(&run, folder.path(), 1);
-    for name in ["online.safetensors", "target.safetensors"] {
+    for (name, description) in [
+        ("online.safetensors", DESCRIPTION),
+        ("target.safetensors", WITHOUT_HEADS),
+    ] {
         let file = fs::read(path.join(name)).unwrap();
         let (_, header) = safetensors::SafeTensors::read_metadata(&file).unwrap();
         let entries = header.metadata().as_ref().unwrap();
         assert_eq!(entries.len(), 1);
-        assert_eq!(entries["driml"], DESCRIPTION);
+        assert_eq!(entries["driml"], description);
     }
     let bare = run.agent.online().to_safetensors(|_| true).unwrap();
     fs::write(path.join("online.safetensors"), &bare).unwrap();
@@ -323,11 +328,25 @@ fn averaged_weights_follow_and_are_saved_and_played() {
             .map(f64::from)
             .collect()
     };
+    let load = |settings: &_| {
+        let model = model(ALL_DIM);
+        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, SPEC);
+        restored.unwrap().unwrap().agent
+    };
+    save(&run, folder.path(), 1);
+    // Before the first update nothing is averaged.
+    assert!(!load(&settings).take_average().unwrap());
     let mut expected = values(run.agent.online());
-    for _ in 0..5 {
+    for t in 1..=6 {
         learn(&mut run, 1);
+        // A plain mean at first, without the weights that the run began with.
+        let rate = TAU.max(1.0 / f64::from(t));
         for (average, online) in expected.iter_mut().zip(values(run.agent.online())) {
-            *average += TAU * (online - *average);
+            *average += rate * (online - *average);
+        }
+        if t == 2 {
+            save(&run, folder.path(), 1);
+            run.agent = load(&settings);
         }
     }
     let average = values(run.agent.average().unwrap());
@@ -336,11 +355,6 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     assert_ne!(average, values(run.agent.online()));
 
     save(&run, folder.path(), 1);
-    let load = |settings: &_| {
-        let model = model(ALL_DIM);
-        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, SPEC);
-        restored.unwrap().unwrap().agent
-    };
     let restored = load(&settings);
     assert_eq!(values(restored.average().unwrap()), average);
     assert_eq!(values(restored.online()), values(run.agent.online()));

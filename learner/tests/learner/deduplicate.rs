@@ -6,7 +6,7 @@ use driml_model::Kernels;
 
 use crate::agents::{GLOBAL, curl_table};
 use crate::synthetic::{
-    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, made, model, random_batch, settings,
+    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, made, model, pool, random_batch, settings,
 };
 
 const ROWS: usize = 40;
@@ -142,8 +142,7 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
 fn gradients_have_the_same_bits_for_any_number_of_threads() {
     let rows = rows(Repeat::Everywhere);
     let with_threads = |threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
-        pool.build().unwrap().install(|| {
+        pool(threads).install(|| {
             let found = found(&Compute::CPU, (DIM, ALL_DIM), false, true, &rows.batch());
             found.gradients
         })

@@ -1,9 +1,11 @@
 //! Settings that float64 holds and float32 does not are refused by name, before anything is learned with them.
 //! What is computed within the ranges is tested beside each routine.
 
-use driml_learner::LearnerSettings;
+use driml_learner::{AffinityConfig, LearnerSettings};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
-use crate::synthetic::{ALL_DIM, settings};
+use crate::synthetic::{ALL_DIM, check_says, settings};
 
 /// A setting's name, values that are refused, and values that are not.
 const RANGES: &str = "
@@ -43,5 +45,28 @@ fn what_float32_does_not_hold_is_refused_by_name() {
         for value in taken.split_whitespace() {
             with(name, value.parse().unwrap()).validate().unwrap();
         }
+    }
+}
+
+/// Numbers of an affinity that cannot work, whatever estimates it, and what is said of them.
+const AFFINITY: &str = "
+exact = { decay = 0.0, smoothing = 1.0 }    : decay = 0.0
+exact = { decay = 1.1, smoothing = 1.0 }    : decay = 1.1
+exact = { decay = nan, smoothing = 1.0 }    : decay = NaN
+exact = { decay = 0.9, smoothing = 0.0 }    : smoothing = 0.0
+exact = { decay = 0.9, smoothing = 1e-320 } : smoothing = 1e-320
+exact = { decay = 0.9, smoothing = 1e306 }  : smoothing = 1e306
+visible = [0, 2]                            : action 1 amounts to 2
+learned = { hidden = 8, lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8, keep = 1.0 } : keep = 1.0
+";
+
+#[test]
+fn numbers_of_an_affinity_are_refused_by_name() {
+    for line in AFFINITY.trim().lines() {
+        let (numbers, said) = line.split_once(" : ").unwrap();
+        let table = format!("estimator = 'none'\n{numbers}");
+        let table: AffinityConfig = toml::from_str(&table).unwrap();
+        let estimator = table.estimator(2, &mut ChaCha8Rng::seed_from_u64(1));
+        check_says(estimator.unwrap_err(), &["learner.affinity", said]);
     }
 }

@@ -65,13 +65,7 @@ pub(crate) fn config(
             unreachable_max_ms: 60_000,
             update,
             augment,
-            affinity: AffinityConfig {
-                estimator: EstimatorKind::None,
-                alphabet: None,
-                visible: None,
-                learned: None,
-                exact: None,
-            },
+            affinity: toml::from_str("estimator = 'none'").unwrap(),
         },
         sampling: Sampling::Uniform {},
         transport: TransportConfig {

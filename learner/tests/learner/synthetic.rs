@@ -65,7 +65,7 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
         } else {
             DIM
         },
-        condition_on_action: true,
+        condition_on_action: lambda != NO_DIM,
         lambda,
         tanh_clip: 20.0,
         max_grad_norm: 10.0,
@@ -109,11 +109,6 @@ pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64)
     made(model, settings, &Compute::CPU, seed)
 }
 
-pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
-    dueling: true,
-    noisy_sigma: Some(0.5),
-};
-
 /// The operations of a GPU, on the CPU.
 pub(crate) const CANDLE: Compute = REFERENCE;
 
@@ -146,13 +141,17 @@ pub(crate) fn batch_of(rows: usize, frame_len: usize, seed: u64) -> OwnedBatch {
     }
 }
 
+pub(crate) fn pool(threads: usize) -> rayon::ThreadPool {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+    pool.build().unwrap()
+}
+
 pub(crate) type Values = HashMap<String, Vec<f32>>;
 
 pub(crate) fn values(parameters: &Parameters) -> Values {
     let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    parameters
-        .iter()
-        .map(|(name, var)| (name.to_owned(), flat(var)))
+    let all = parameters.iter();
+    all.map(|(name, var)| (name.to_owned(), flat(var)))
         .collect()
 }
 

@@ -7,24 +7,17 @@ use driml_model::{Compute, HeadConfig, Parameters};
 use driml_protocol::NO_ACTION;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, agent, agent_on, agent_with, changed, check_says, made,
-    model, random_batch, settings, values,
+    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, agent_with, changed, check_says, made, model,
+    random_batch, settings, values,
 };
 
 #[test]
 fn repeated_updates_on_one_batch_bring_the_losses_down() {
     let (mut agent, rows) = (agent(ALL_DIM, 3), random_batch(16, 4));
     let first = agent.update(&rows.batch()).unwrap();
-    let last = (0..60)
-        .map(|_| agent.update(&rows.batch()).unwrap())
-        .last()
-        .unwrap();
-    assert!(
-        last.total < 0.7 * first.total,
-        "{} to {}",
-        first.total,
-        last.total
-    );
+    let later = (0..60).map(|_| agent.update(&rows.batch()).unwrap().total);
+    let (first, last) = (first.total, later.last().unwrap());
+    assert!(last < 0.7 * first, "{first} to {last}");
     assert_eq!(agent.updates(), 61);
 }
 
@@ -167,7 +160,7 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
     };
     let rows = random_batch(6, 2);
     let agent =
-        |seed: u8| agent_with(NOISY_DUELING, settings.clone(), 1).with_noise_seed([seed; 32]);
+        |seed: u8| agent_with(HeadConfig::RAINBOW, settings.clone(), 1).with_noise_seed([seed; 32]);
     let (mut one, mut same, other) = (agent(1), agent(1), agent(2));
     let first = one.noise();
     assert!(first.online.is_some() && first.online != first.choice);

@@ -15,8 +15,6 @@ pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at on
      a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
 /// Positives of a row if everything is on: those of the agent that has most, cpc.
 const EVERY_POSITIVES: usize = 5;
-/// Rainbow's; no size depends on it.
-const NOISY_SIGMA: f64 = 0.5;
 pub(super) const BATCH: &str = "a batch";
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -56,17 +54,8 @@ impl<'a> Counted<'a> {
             height: input.height as usize,
             width: input.width as usize,
             num_actions: config.world.num_actions(),
-            dim: DimHeads {
-                psi3: true,
-                phi3: true,
-                psi4: true,
-                phi4: true,
-                action: true,
-            },
-            head: HeadConfig {
-                dueling: true,
-                noisy_sigma: Some(NOISY_SIGMA),
-            },
+            dim: DimHeads::EVERY,
+            head: HeadConfig::RAINBOW,
             ..config.model.clone()
         };
         // A stack's frames as one, of the size that the network takes.

@@ -33,6 +33,11 @@ impl HeadConfig {
         dueling: false,
         noisy_sigma: None,
     };
+    /// Two streams of noisy layers. Source: Hessel et al. 2018.
+    pub const RAINBOW: Self = Self {
+        dueling: true,
+        noisy_sigma: Some(0.5),
+    };
 
     pub(crate) fn validate(&self) -> Result<()> {
         match self.noisy_sigma {

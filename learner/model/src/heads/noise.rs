@@ -89,10 +89,7 @@ mod tests {
         let config = ModelConfig {
             atoms: 7,
             hidden: 11,
-            head: HeadConfig {
-                dueling: true,
-                noisy_sigma: Some(0.5),
-            },
+            head: HeadConfig::RAINBOW,
             ..ModelConfig::small()
         };
         let rng = &mut ChaCha8Rng::seed_from_u64(2);

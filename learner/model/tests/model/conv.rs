@@ -102,15 +102,10 @@ fn a_stack_matches_its_layers_one_by_one() -> Result<()> {
         }
         let wanted_grads = (&wanted * &grad_maps)?.sum_all()?.backward()?;
         assert_eq!(values(&maps), values(&wanted));
-        for var in layers
-            .iter()
-            .flat_map(|(weight, bias, _)| [weight, bias])
-            .chain([&images])
-        {
-            assert_eq!(
-                values(grads.get(var).unwrap()),
-                values(wanted_grads.get(var).unwrap())
-            );
+        let vars = layers.iter().flat_map(|(weight, bias, _)| [weight, bias]);
+        for var in vars.chain([&images]) {
+            let [found, wanted] = [&grads, &wanted_grads].map(|it| values(it.get(var).unwrap()));
+            assert_eq!(found, wanted);
         }
     }
     assert!(conv_stack(&floats(&[1, 4, 4, 1], rng), &[], Precision::F32).is_err());
@@ -126,11 +121,8 @@ fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
         .sum_all()?
         .backward()?;
     for var in [&images, &weight, &bias] {
-        assert!(
-            values(grads.get(var).unwrap())
-                .iter()
-                .all(|&grad| grad == 0.0)
-        );
+        let grads = values(grads.get(var).unwrap());
+        assert!(grads.iter().all(|&grad| grad == 0.0));
     }
     Ok(())
 }

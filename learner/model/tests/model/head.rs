@@ -92,10 +92,8 @@ fn a_loss_s_own_layer_is_linear_and_only_the_online_network_s() -> Result<()> {
     };
     let parameters = parameters(&config, 1);
     let network = Network::new(&config, &parameters).unwrap();
-    let f4 = network
-        .features(&frames(&config, 4, &mut rng(5)))
-        .unwrap()
-        .f4;
+    let features = network.features(&frames(&config, 4, &mut rng(5)));
+    let f4 = features.unwrap().f4;
     let next = network.loss_layer("next", &f4).unwrap();
     let [weight, bias] =
         ["weight", "bias"].map(|part| parameters.get(&format!("dim.next.{part}")).unwrap());

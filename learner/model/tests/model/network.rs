@@ -92,11 +92,9 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
             let [logits_loss, phi3_loss] =
                 [&logits, &phi3].map(|it| it.sqr().unwrap().sum_all().unwrap());
             let mut grads = Backward::of(&(logits_loss + phi3_loss).unwrap()).unwrap();
-            let grads = parameters
-                .iter()
-                .filter_map(|(_, var)| grads.remove(var).unwrap().as_ref().map(bits))
-                .collect::<Vec<_>>();
-            (bits(&logits), grads)
+            let vars = parameters.iter().map(|(_, var)| var);
+            let grads = vars.filter_map(|var| grads.remove(var).unwrap().as_ref().map(bits));
+            (bits(&logits), grads.collect::<Vec<_>>())
         };
         let one = pool(1).install(run);
         let shapes = config.parameter_shapes();

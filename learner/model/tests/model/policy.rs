@@ -1,11 +1,11 @@
 //! The policy against the network it must agree with.
 //! Loading broken weights is tested with the weights.
 
-use driml_model::{HeadNoise, Network, PolicyNetwork, Precision, TorsoName};
+use driml_model::{HeadConfig, HeadNoise, Network, PolicyNetwork, Precision, TorsoName};
 
 use crate::support::{
-    NOISY_DUELING, bytes, frames, kinds, parameters, policy, pool, q_values, residual, rng, small,
-    small_with, values,
+    bytes, frames, kinds, parameters, policy, pool, q_values, residual, rng, small, small_with,
+    values,
 };
 
 #[test]
@@ -102,7 +102,7 @@ fn wrong_lengths_are_errors() {
 /// Weights that come have no noise until it is drawn: evaluation, which draws none, acts by the means.
 #[test]
 fn noise_is_drawn_when_it_is_asked_for() {
-    let config = small_with(NOISY_DUELING);
+    let config = small_with(HeadConfig::RAINBOW);
     let drawn = parameters(&config, 3);
     let mut noisy = policy(&config, &drawn, Precision::F32);
     let frames = bytes(config.frame_len(), &mut rng(1));

@@ -40,12 +40,8 @@ pub(crate) fn double(tensor: &Tensor) -> Result<Tensor> {
 }
 
 pub(crate) fn values(tensor: &Tensor) -> Vec<f64> {
-    double(tensor)
-        .unwrap()
-        .flatten_all()
-        .unwrap()
-        .to_vec1()
-        .unwrap()
+    let flat = double(tensor).unwrap().flatten_all().unwrap();
+    flat.to_vec1().unwrap()
 }
 
 pub(crate) fn bits(tensor: &Tensor) -> Vec<u32> {
@@ -59,12 +55,8 @@ pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, toleranc
     assert_eq!(found.dims(), wanted.dims(), "{what}");
     let (found, wanted) = (values(found), values(wanted));
     let norm = wanted.iter().map(|value| value * value).sum::<f64>().sqrt();
-    let error = found
-        .iter()
-        .zip(&wanted)
-        .map(|(a, b)| (a - b) * (a - b))
-        .sum::<f64>()
-        .sqrt();
+    let squares = found.iter().zip(&wanted).map(|(a, b)| (a - b) * (a - b));
+    let error = squares.sum::<f64>().sqrt();
     assert!(
         error <= tolerance * norm,
         "{what}: error {error}, norm {norm}"
@@ -119,13 +111,7 @@ pub(crate) fn small() -> ModelConfig {
         hidden: 19,
         embedding_dim: 13,
         action_embed: 9,
-        dim: DimHeads {
-            psi3: true,
-            phi3: true,
-            psi4: true,
-            phi4: true,
-            action: true,
-        },
+        dim: DimHeads::EVERY,
         loss_layers: vec![],
         head: HeadConfig::PLAIN,
     }
@@ -157,14 +143,9 @@ pub(crate) const NOISY: HeadConfig = HeadConfig {
     noisy_sigma: Some(0.5),
 };
 
-pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
-    dueling: true,
-    noisy_sigma: Some(0.5),
-};
-
 /// Small networks with every kind of head, and with every torso.
 pub(crate) fn kinds() -> impl Iterator<Item = ModelConfig> {
-    let heads = [HeadConfig::PLAIN, DUELING, NOISY, NOISY_DUELING].map(small_with);
+    let heads = [HeadConfig::PLAIN, DUELING, NOISY, HeadConfig::RAINBOW].map(small_with);
     let torsos = [TorsoName::Impala, TorsoName::Impoola].map(residual);
     heads.into_iter().chain(torsos)
 }
@@ -202,11 +183,10 @@ pub(crate) fn q_values(
 pub(crate) fn rounded(tensor: &Tensor, precision: Precision) -> Var {
     let rounded = match precision {
         Precision::F32 => tensor.clone(),
-        Precision::Bf16 => tensor
-            .to_dtype(DType::BF16)
-            .unwrap()
-            .to_dtype(DType::F32)
-            .unwrap(),
+        Precision::Bf16 => {
+            let halves = tensor.to_dtype(DType::BF16).unwrap();
+            halves.to_dtype(DType::F32).unwrap()
+        }
     };
     Var::from_tensor(&rounded.detach()).unwrap()
 }

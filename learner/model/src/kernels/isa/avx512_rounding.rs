@@ -131,12 +131,9 @@ pub(super) unsafe fn paired(first: &[bf16], second: &[bf16], pairs: &mut [bf16])
             }
         }
     }
-    for ((pair, &first), &second) in pair_tail
-        .chunks_exact_mut(2)
-        .zip(first_tail)
-        .zip(second_tail)
-    {
-        (pair[0], pair[1]) = (first, second);
+    let pairs = pair_tail.as_chunks_mut::<2>().0.iter_mut();
+    for ((pair, &first), &second) in pairs.zip(first_tail).zip(second_tail) {
+        *pair = [first, second];
     }
 }
 
@@ -190,12 +187,9 @@ pub(super) unsafe fn paired_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16
             _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words);
         }
     }
-    for ((pair, &first), &second) in pair_tail
-        .chunks_exact_mut(2)
-        .zip(first_tail)
-        .zip(second_tail)
-    {
-        (pair[0], pair[1]) = (bf16::of_byte(first), bf16::of_byte(second));
+    let pairs = pair_tail.as_chunks_mut::<2>().0.iter_mut();
+    for ((pair, &first), &second) in pairs.zip(first_tail).zip(second_tail) {
+        *pair = [first, second].map(bf16::of_byte);
     }
 }
 
