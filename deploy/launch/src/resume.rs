@@ -146,6 +146,10 @@ fn check_changes(
     config: &RunConfig,
     lockstep: bool,
 ) -> anyhow::Result<()> {
+    if let Some(key) = before.world.first_difference(&config.world) {
+        let why = usage!("world.{key} cannot change in a run: resume without this --set");
+        bail!(why);
+    }
     let parts = |it: &RunConfig| (it.run.clone(), it.model.clone(), it.learner.clone());
     if parts(before) != parts(config) {
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
