@@ -110,6 +110,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         return Ok(());
     };
     let pool = settings.chunk_memory();
+    activity.begin("makes its environments");
     let mut collector = Collector::new(
         &settings,
         pool.clone(),
