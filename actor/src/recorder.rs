@@ -71,9 +71,9 @@ impl ChunkRecorder {
         self.header.steps = steps;
     }
 
-    /// Transitions recorded so far, including those of the chunk being filled.
+    /// Transitions of all chunks that were filled.
     pub const fn produced(&self) -> u64 {
-        self.header.first_transition + self.filled_steps as u64 * self.header.streams as u64
+        self.header.first_transition
     }
 
     /// The numbers of the next chunk, between two of them.
@@ -125,7 +125,7 @@ impl ChunkRecorder {
         if self.filled_steps < self.header.steps {
             return None;
         }
-        self.header.first_transition = self.produced();
+        self.header.first_transition += header.transitions() as u64;
         self.header.sequence += 1;
         self.filled_steps = 0;
         self.chunk.take()
@@ -147,7 +147,7 @@ mod tests {
             }
             chunks.extend(recorder.record(&[step, 100 + step], &[step, step], &[0.5, -1.0], &ends));
         }
-        assert_eq!(recorder.produced(), 14);
+        assert_eq!(recorder.produced(), 12);
 
         assert_eq!(chunks[0].frames(), [0, 1, 2, 100, 101, 102]);
         assert_eq!(chunks[1].frames(), [3, 4, 5, 103, 104, 105]);

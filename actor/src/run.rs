@@ -187,7 +187,9 @@ fn play(
         }
         activity.begin("plays");
         let steps = chunk_steps(delivery.actors());
-        let chunk = collector.collect(delivery.inserted_total(), steps)?;
+        let frames = delivery.inserted_total();
+        let played = collector.collect_unless(|| shutdown.is_set(), frames, steps)?;
+        let Some(chunk) = played else { break };
         if let Some(waits) = delivery.describe_wait() {
             activity.begin(waits);
         }
