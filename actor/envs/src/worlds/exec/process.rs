@@ -126,6 +126,19 @@ impl WorldProcess {
         }
     }
 
+    /// Says something to a process that has given all its answers.
+    pub(super) fn ask(&mut self, text: &str) -> Result<(), EnvError> {
+        let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
+        // If this fails, so does the read of the answer. A closed stdout has nothing to read, and the answer to it is its error.
+        let _ = poll(&mut polled, PollTimeout::ZERO);
+        let found = polled[0].revents();
+        if found.is_some_and(|it| it.contains(PollFlags::POLLIN)) {
+            let why = "wrote to stdout between two steps: print to stderr instead";
+            return Err(self.fail(why));
+        }
+        self.say(text)
+    }
+
     pub(super) fn line(&mut self) -> Result<Vec<u8>, EnvError> {
         let deadline = Instant::now() + self.exchange.limit;
         let mut line = Vec::new();
