@@ -2,8 +2,10 @@
 //! which a process can fail. Needs `python3`, without any package; what needs Gymnasium is in `tests/system/own_worlds.rs`.
 
 use std::fs;
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use super::process::keep;
 use super::protocol::SavedExec;
 use super::world::seeds;
 use super::*;
@@ -225,6 +227,17 @@ fn what_is_printed_into_the_protocol_is_named() {
     let mut world = ExecWorld::new(&twice, 1, 1).unwrap();
     let stepped = world.step(&[0], &mut [0.0], &mut [StepEnd::Running]);
     fails(stepped, &["wrote to stdout between two steps"]);
+}
+
+#[test]
+fn a_flood_on_stderr_is_logged_in_part_and_its_last_lines_are_kept() {
+    let flood: String = (0..1000).map(|number| format!("{number}\n")).collect();
+    let (kept, mut logged) = (Mutex::default(), Vec::new());
+    keep(flood.as_bytes(), &kept, |line| logged.push(line.to_owned()));
+    assert_eq!(logged[49], "49");
+    assert_eq!(logged[50..], ["950 more lines left out"]);
+    let kept = kept.into_inner().unwrap();
+    assert!(kept.into_iter().eq((988..1000).map(|it| it.to_string())));
 }
 
 #[test]
