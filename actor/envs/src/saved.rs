@@ -20,7 +20,8 @@ pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
     }
 }
 
-pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
+/// The state that [`encode`] wrote.
+pub(crate) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
     let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
     let (state, used) = bincode::serde::decode_from_slice(bytes, config)
         .map_err(|e| EnvError::State(e.to_string()))?;
@@ -28,16 +29,6 @@ pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvEr
         0 => Ok(state),
         over => Err(EnvError::State(format!("{over} bytes after its end"))),
     }
-}
-
-/// The state of so many environments that [`encode`] wrote.
-pub(crate) fn decode<T: DeserializeOwned>(
-    bytes: &[u8],
-    num_envs: usize,
-) -> Result<Vec<T>, EnvError> {
-    let envs: Vec<T> = decode_whole(bytes)?;
-    check_env_count(envs.len(), num_envs)?;
-    Ok(envs)
 }
 
 /// An error unless a state is of as many environments as this world has.
@@ -52,11 +43,8 @@ pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvEr
 
 /// An error unless `holds`: a state that this world cannot be in.
 pub(crate) fn check(holds: bool, what: &str) -> Result<(), EnvError> {
-    if holds {
-        Ok(())
-    } else {
-        Err(EnvError::State(format!("{what} is none of these settings")))
-    }
+    let wrong = || EnvError::State(format!("{what} is none of these settings"));
+    holds.then_some(()).ok_or_else(wrong)
 }
 
 #[cfg(test)]

@@ -255,7 +255,7 @@ impl SavedExec {
         config: &ExecConfig,
         num_envs: usize,
     ) -> Result<Self, EnvError> {
-        let this: Self = saved::decode_whole(bytes)?;
+        let this: Self = saved::decode(bytes)?;
         let of = &this.config;
         if of.command != config.command {
             return Err(EnvError::State(format!(

@@ -280,7 +280,8 @@ impl Environment for ProcgenWorld {
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let envs: Vec<(u32, State)> = saved::decode(state, self.num_envs())?;
+        let envs: Vec<(u32, State)> = saved::decode(state)?;
+        saved::check_env_count(envs.len(), self.num_envs())?;
         for (env, (steps, state)) in envs.into_iter().enumerate() {
             self.game.set_state(env, &state)?;
             self.steps_taken[env] = steps;
