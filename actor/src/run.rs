@@ -172,7 +172,7 @@ fn play(
     activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
-    while !shutdown.is_set() && !delivery.is_finished() {
+    while !shutdown.is_set() && !delivery.progress().finished {
         let newer = newest.take_within(delivery.fresh_weights_max());
         if let Some(Weights {
             header,
@@ -186,8 +186,8 @@ fn play(
             );
         }
         activity.begin("plays");
-        let steps = chunk_steps(delivery.actors());
-        let frames = delivery.inserted_total();
+        let run = delivery.progress();
+        let (frames, steps) = (run.inserted_total, chunk_steps(run.actors));
         let played = collector.collect_unless(|| shutdown.is_set(), frames, steps)?;
         let Some(chunk) = played else { break };
         if let Some(waits) = delivery.describe_wait() {
