@@ -82,10 +82,8 @@ impl Maze {
             .filter(|&p| cell(p.into()) != b'#')
             .collect();
         let place = |pixel: usize| {
-            pixels
-                .iter()
-                .position(|&p| usize::from(p) == pixel)
-                .map(|p| p as Place)
+            let found = pixels.binary_search(&(pixel as u16));
+            found.ok().map(|place| place as Place)
         };
         let start = |mark: u8| {
             let pixel = (0..HEIGHT * WIDTH)
