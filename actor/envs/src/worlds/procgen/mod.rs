@@ -135,11 +135,6 @@ impl ProcgenWorld {
         })
     }
 
-    /// The level that each environment's current frame shows [N].
-    pub fn levels(&self) -> &[i32] {
-        self.game.level_seed()
-    }
-
     /// What the last step ended in environment `env`, whose steps were counted including it.
     fn end_of(&self, env: usize) -> StepEnd {
         let completed = self.game.prev_level_complete()[env] != 0;
