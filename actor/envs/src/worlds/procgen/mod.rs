@@ -75,25 +75,6 @@ struct LevelSet {
 }
 
 impl ProcgenWorld {
-    /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
-    pub const ACTION_NAMES: [&'static str; NUM_ACTIONS] = [
-        "left+down",
-        "left",
-        "left+up",
-        "down",
-        "no-op",
-        "up",
-        "right+down",
-        "right",
-        "right+up",
-        "d",
-        "a",
-        "w",
-        "s",
-        "q",
-        "e",
-    ];
-
     /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`procgen_sys::Engine::install`] for how to do that
     /// beforehand and watch it.
     ///
@@ -187,8 +168,10 @@ impl WorldSettings for ProcgenConfig {
         15.0
     }
 
+    /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
     fn action_names(&self) -> Vec<&str> {
-        ProcgenWorld::ACTION_NAMES.to_vec()
+        let names = "left+down left left+up down no-op up right+down right right+up d a w s q e";
+        names.split(' ').collect()
     }
 
     fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built {
