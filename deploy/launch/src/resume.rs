@@ -245,10 +245,9 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         && let [Some(old), Some(new)] = [&before, &config].map(alpha)
         && old != new
     {
-        return Err(usage!(
+        bail!(usage!(
             "replay.sampling.alpha = {new}, but the replay that is kept has its priorities to the power of {old}: resume without this --set"
-        )
-        .into());
+        ));
     }
     let point = ResumePoint {
         updates,

@@ -81,10 +81,9 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
     let (replay, recovery) = Replay::open(&args, &config.run, &config.replay, batch_size)?;
     // A server could continue with a part of it, but a lockstep run must be the same.
     match recovery.warnings.first() {
-        Some(why) if mark.is_some() => Err(usage!(
+        Some(why) if mark.is_some() => bail!(usage!(
             "the run cannot resume to the same weights: {why}. Start it again, in another folder"
-        )
-        .into()),
+        )),
         _ => Ok(replay),
     }
 }
