@@ -78,7 +78,8 @@ impl Collector {
     ) -> Result<Self, ActError> {
         let spec = &settings.spec;
         let config = &settings.actor;
-        let schedule = Schedule::new(config, incarnation.actor)?;
+        let Incarnation { actor, id, .. } = incarnation;
+        let schedule = Schedule::new(config, actor)?;
         let world_seed = incarnation.seed(spec, "world");
         let world_seed = u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes"));
         let (envs, threads) = (config.envs as usize, config.world_threads as usize);
@@ -104,23 +105,12 @@ impl Collector {
         }
         let rng = ChaCha8Rng::from_seed(incarnation.seed(spec, "exploration"));
         let world = RestrictedWorld::of(world, actions, sent).map_err(no_world)?;
-        let policy = NetworkPolicy::new(
-            &settings.model,
-            settings.input.enlarge(sent, &settings.model)?,
-            safetensors,
-            settings.actor.precision,
-        )?
-        .with_noise();
+        let enlarge = settings.input.enlarge(sent, &settings.model)?;
+        let policy = NetworkPolicy::new(&settings.model, enlarge, safetensors, config.precision)?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
-            recorder: ChunkRecorder::new(
-                pool,
-                incarnation.actor,
-                incarnation.id,
-                config.envs,
-                spec.frame_bytes() as u32,
-            ),
-            policy,
+            recorder: ChunkRecorder::new(pool, actor, id, config.envs, spec.frame_bytes() as u32),
+            policy: policy.with_noise(),
             weights_version,
             schedule,
         })

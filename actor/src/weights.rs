@@ -125,10 +125,7 @@ pub(crate) fn first(
     let mut said = LogLimiter::default();
     loop {
         let pulled = pull(client, 0);
-        let error = pulled
-            .as_ref()
-            .err()
-            .and_then(|e| e.downcast_ref::<SessionError>());
+        let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
         let mut is_recovering = false;
         if let Some(SessionError::Recovering(recovering)) = error {
             (started, is_recovering) = (Instant::now(), true);

@@ -223,11 +223,9 @@ impl Lockstep {
 
     /// [`Lockstep::save`] of a run whose replay is marked in its log.
     fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
-        let actors = self.actor_states();
+        let doing = "saving the worlds for a checkpoint; at the run's start it could be done";
         let saved = SavedParts {
-            actors: actors.context(
-                "saving the worlds for a checkpoint; at the run's start it could be done",
-            )?,
+            actors: self.actor_states().context(doing)?,
             replay: mark,
             turn: self.turn.clone(),
         };

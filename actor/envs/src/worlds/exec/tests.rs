@@ -69,10 +69,8 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
     let mut world = ExecWorld::new(&config, COPIES, 7).unwrap();
     assert_eq!((world.num_envs(), world.num_actions()), (COPIES, 3));
     assert_eq!(world.frame_shape(), config.frame_shape());
-    let seeds: Vec<u16> = seeds(7, COPIES)
-        .into_iter()
-        .map(|seed| (seed % 65_536) as u16)
-        .collect();
+    let seeds = seeds(7, COPIES).into_iter();
+    let seeds: Vec<u16> = seeds.map(|seed| (seed % 65_536) as u16).collect();
     let (mut episodes, mut steps) = ([0; COPIES], [0; COPIES]);
     for round in 0..100 {
         let expected: Vec<_> = (0..COPIES)

@@ -219,9 +219,8 @@ pub fn declaration(
 
 /// The seed of each copy, below 2^31 so that every language and engine has room for it.
 pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
-    (0..copies)
-        .map(|copy| env_rng(seed, copy, RngUse::Game).random::<u32>() >> 1)
-        .collect()
+    let seed = |copy| env_rng(seed, copy, RngUse::Game).random::<u32>() >> 1;
+    (0..copies).map(seed).collect()
 }
 
 impl WorldSettings for ExecConfig {

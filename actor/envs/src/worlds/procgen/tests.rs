@@ -40,9 +40,8 @@ pub(crate) fn config(game: Game) -> ProcgenConfig {
 }
 
 fn draw(rng: &mut ChaCha8Rng, num_envs: usize) -> Vec<u8> {
-    (0..num_envs)
-        .map(|_| rng.random_range(0..NUM_ACTIONS as u8))
-        .collect()
+    let draw = |_| rng.random_range(0..NUM_ACTIONS as u8);
+    (0..num_envs).map(draw).collect()
 }
 
 /// What a step gave: frames after it, rewards, ends.
