@@ -78,7 +78,8 @@ impl Collector {
     ) -> Result<Self, ActError> {
         let spec = &settings.spec;
         let config = &settings.actor;
-        let schedule = Schedule::new(config, incarnation.actor)?;
+        let Incarnation { actor, id, .. } = incarnation;
+        let schedule = Schedule::new(config, actor)?;
         let world_seed = incarnation.seed(spec, "world");
         let world_seed = u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes"));
         let (envs, threads) = (config.envs as usize, config.world_threads as usize);
@@ -104,23 +105,12 @@ impl Collector {
         }
         let rng = ChaCha8Rng::from_seed(incarnation.seed(spec, "exploration"));
         let world = RestrictedWorld::of(world, actions, sent).map_err(no_world)?;
-        let policy = NetworkPolicy::new(
-            &settings.model,
-            settings.input.enlarge(sent, &settings.model)?,
-            safetensors,
-            settings.actor.precision,
-        )?
-        .with_noise();
+        let enlarge = settings.input.enlarge(sent, &settings.model)?;
+        let policy = NetworkPolicy::new(&settings.model, enlarge, safetensors, config.precision)?;
         Ok(Self {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
-            recorder: ChunkRecorder::new(
-                pool,
-                incarnation.actor,
-                incarnation.id,
-                config.envs,
-                spec.frame_bytes() as u32,
-            ),
-            policy,
+            recorder: ChunkRecorder::new(pool, actor, id, config.envs, spec.frame_bytes() as u32),
+            policy: policy.with_noise(),
             weights_version,
             schedule,
         })
@@ -133,24 +123,35 @@ impl Collector {
         Ok(())
     }
 
-    /// Transitions collected so far.
+    /// Transitions of all chunks so far.
     pub const fn produced(&self) -> u64 {
         self.recorder.produced()
     }
 
     /// Acts until one chunk of `steps` steps is full. `frames` is the run's count so far, which fixes epsilon for the chunk.
     pub fn collect(&mut self, frames: u64, steps: u32) -> Result<Chunk, ActError> {
-        self.recorder.begin(self.weights_version, steps);
+        let chunk = self.collect_unless(|| false, frames, steps)?;
+        Ok(chunk.expect("it is never over"))
+    }
+
+    /// The same, or none once it `is_over`, with a chunk that is never filled: this must not collect any more.
+    pub(crate) fn collect_unless(
+        &mut self,
+        is_over: impl Fn() -> bool,
+        frames: u64,
+        steps: u32,
+    ) -> Result<Option<Chunk>, ActError> {
+        let recorder = &mut self.recorder;
+        recorder.begin(self.weights_version, steps);
         let epsilon = self.schedule.epsilon(frames);
-        loop {
+        while !is_over() {
             let step = self.acting.step(&mut self.policy, epsilon)?;
-            if let Some(chunk) =
-                self.recorder
-                    .record(step.frames, step.actions, step.rewards, step.ends)
-            {
+            let chunk = recorder.record(step.frames, step.actions, step.rewards, step.ends);
+            if chunk.is_some() {
                 return Ok(chunk);
             }
         }
+        Ok(None)
     }
 
     /// How it stands between two chunks.
@@ -243,6 +244,16 @@ mod tests {
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
         Collector::new(&settings, BufferPool::new(1), incarnation, 1, &weights)
+    }
+
+    #[test]
+    fn a_chunk_that_is_broken_off_is_dropped_and_not_counted() {
+        let mut collector = collector(settings(0.0), FIRST).unwrap();
+        let looks = std::cell::Cell::new(0);
+        let is_over = || looks.replace(looks.get() + 1) == 3;
+        let chunk = collector.collect_unless(is_over, 0, STEPS).unwrap();
+        assert!(chunk.is_none() && looks.get() == 4);
+        assert_eq!(collector.produced(), 0);
     }
 
     /// The actions of a life's first chunk.

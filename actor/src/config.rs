@@ -29,8 +29,8 @@ pub struct Config {
     /// Steps of every environment in one chunk: how often an actor sends, and takes newer weights.
     pub steps_per_chunk: u32,
     /// Transitions that one chunk of every actor of the run has together, at most: where there are many actors, chunks get
-    /// shorter than `steps_per_chunk`, so that no actor waits long to send what it has and to take newer weights. None: chunks
-    /// are always `steps_per_chunk` long.
+    /// shorter than `steps_per_chunk`, so that no actor waits long to send what it has and to take newer weights. None, and in
+    /// lockstep: chunks are always `steps_per_chunk` long.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub round_transitions_max: Option<u64>,
     /// Chunks waiting to be acknowledged; at this many the actor stops stepping until one is.

@@ -5,16 +5,6 @@ use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use serde::{Deserialize, Serialize};
 
-/// What a world ended, in the words of the wire.
-const fn end_on_the_wire(end: StepEnd) -> End {
-    match end {
-        StepEnd::Running => End::Running,
-        StepEnd::LevelChange => End::LevelChange,
-        StepEnd::TimedOut => End::TimedOut,
-        StepEnd::Terminal => End::Terminal,
-    }
-}
-
 /// Which chunk of an actor's life it is, and how many transitions were before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkNumbers {
@@ -71,9 +61,9 @@ impl ChunkRecorder {
         self.header.steps = steps;
     }
 
-    /// Transitions recorded so far, including those of the chunk being filled.
+    /// Transitions of all chunks that were filled.
     pub const fn produced(&self) -> u64 {
-        self.header.first_transition + self.filled_steps as u64 * self.header.streams as u64
+        self.header.first_transition
     }
 
     /// The numbers of the next chunk, between two of them.
@@ -114,18 +104,15 @@ impl ChunkRecorder {
         for (stream, frame) in frames.chunks_exact(frame_bytes).enumerate() {
             let row = stream * header.steps as usize + self.filled_steps as usize;
             chunk.frame_mut(row).copy_from_slice(frame);
-            chunk.set(
-                row,
-                actions[stream],
-                rewards[stream],
-                end_on_the_wire(ends[stream]),
-            );
+            let end = End::from_byte(ends[stream] as u8);
+            let end = end.expect("the wire numbers ends as worlds do");
+            chunk.set(row, actions[stream], rewards[stream], end);
         }
         self.filled_steps += 1;
         if self.filled_steps < self.header.steps {
             return None;
         }
-        self.header.first_transition = self.produced();
+        self.header.first_transition += header.transitions() as u64;
         self.header.sequence += 1;
         self.filled_steps = 0;
         self.chunk.take()
@@ -147,7 +134,7 @@ mod tests {
             }
             chunks.extend(recorder.record(&[step, 100 + step], &[step, step], &[0.5, -1.0], &ends));
         }
-        assert_eq!(recorder.produced(), 14);
+        assert_eq!(recorder.produced(), 12);
 
         assert_eq!(chunks[0].frames(), [0, 1, 2, 100, 101, 102]);
         assert_eq!(chunks[1].frames(), [3, 4, 5, 103, 104, 105]);

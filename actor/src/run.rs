@@ -47,14 +47,9 @@ pub struct RunArgs {
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints::to(args.connect);
-    let Some(session) = session::open_unless(
-        shutdown,
-        endpoints,
-        &keys,
-        args.credentials.as_ref(),
-        session::SMALL_MESSAGE_BYTES_MAX,
-    )?
-    else {
+    let (credentials, max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
+    let opened = session::open_unless(shutdown, endpoints, &keys, credentials, max)?;
+    let Some(session) = opened else {
         return Ok(());
     };
     let Some(run_info) = join::run_info(&session, &keys, shutdown)? else {
@@ -96,12 +91,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         );
     }
     let activity = Activity::new("waits for the learner's first weights");
-    reporter::start(
-        vec![client.clone()],
-        who,
-        activity.clone(),
-        shutdown.clone(),
-    )?;
+    let clients = vec![client.clone()];
+    reporter::start(clients, who, activity.clone(), shutdown.clone())?;
     let Some(first) = weights::first(&client, WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
     };
@@ -110,27 +101,19 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         return Ok(());
     };
     let pool = settings.chunk_memory();
-    let mut collector = Collector::new(
-        &settings,
-        pool.clone(),
-        Incarnation {
-            actor: join.actor,
-            id: join.incarnation,
-            after_updates: run_info.after_updates,
-            earlier_incarnations: welcome.earlier_incarnations,
-        },
-        first.header.version,
-        &first.safetensors,
-    )?;
-    let newest = weights::watch(client.clone(), first.header.version, shutdown.clone())?;
-    let delivery = Delivery::start(
-        client.clone(),
-        run_info.inserted_total,
-        DeliveryLimits::of(&settings.actor),
-        pool,
-        shutdown.clone(),
-    )?;
+    activity.begin("makes its environments");
+    let life = Incarnation {
+        actor: join.actor,
+        id: join.incarnation,
+        after_updates: run_info.after_updates,
+        earlier_incarnations: welcome.earlier_incarnations,
+    };
+    let (version, safetensors) = (first.header.version, &first.safetensors);
+    let mut collector = Collector::new(&settings, pool.clone(), life, version, safetensors)?;
+    let newest = weights::watch(client.clone(), version, shutdown.clone())?;
     let (actor, config) = (args.actor, &settings.actor);
+    let (inserted, limits) = (run_info.inserted_total, DeliveryLimits::of(config));
+    let delivery = Delivery::start(client.clone(), inserted, limits, pool, shutdown.clone())?;
     let envs = config.envs;
     tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
     // At the start not all are connected yet.
@@ -171,7 +154,7 @@ fn play(
     activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
-    while !shutdown.is_set() && !delivery.is_finished() {
+    while !shutdown.is_set() && !delivery.progress().finished {
         let newer = newest.take_within(delivery.fresh_weights_max());
         if let Some(Weights {
             header,
@@ -185,8 +168,10 @@ fn play(
             );
         }
         activity.begin("plays");
-        let steps = chunk_steps(delivery.actors());
-        let chunk = collector.collect(delivery.inserted_total(), steps)?;
+        let run = delivery.progress();
+        let (frames, steps) = (run.inserted_total, chunk_steps(run.actors));
+        let played = collector.collect_unless(|| shutdown.is_set(), frames, steps)?;
+        let Some(chunk) = played else { break };
         if let Some(waits) = delivery.describe_wait() {
             activity.begin(waits);
         }

@@ -36,6 +36,8 @@ pub(crate) struct NewestWeights {
 struct State {
     /// Newest version that was announced.
     announced: u64,
+    /// The same when the last pull began.
+    sought: u64,
     /// Version of the last ones that were pulled.
     pulled: u64,
     slot: Option<Weights>,
@@ -48,6 +50,7 @@ impl NewestWeights {
     fn after(version: u64) -> Self {
         let state = State {
             announced: version,
+            sought: version,
             pulled: version,
             slot: None,
             is_wanted: true,
@@ -85,6 +88,7 @@ impl NewestWeights {
         let changed = &self.shared.1;
         let waited = changed.wait_timeout_while(self.state(), wait_max, idle);
         let (mut state, waited) = waited.unwrap_or_else(PoisonError::into_inner);
+        state.sought = state.announced;
         if waited.timed_out() {
             return None;
         }
@@ -100,8 +104,9 @@ impl NewestWeights {
                 state.pulled = weights.header.version;
                 state.slot = Some(weights);
             }
-            // The process that announced them did not have them.
-            None => state.announced = state.pulled,
+            // The process that announced them did not have them. Later ones may have been announced meanwhile.
+            None if state.announced == state.sought => state.announced = state.pulled,
+            None => {}
         }
         self.shared.1.notify_all();
     }
@@ -120,10 +125,7 @@ pub(crate) fn first(
     let mut said = LogLimiter::default();
     loop {
         let pulled = pull(client, 0);
-        let error = pulled
-            .as_ref()
-            .err()
-            .and_then(|e| e.downcast_ref::<SessionError>());
+        let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
         let mut is_recovering = false;
         if let Some(SessionError::Recovering(recovering)) = error {
             (started, is_recovering) = (Instant::now(), true);
@@ -278,8 +280,12 @@ mod tests {
             2
         );
         assert_eq!(wanted(), Some(2));
-        // A foreign announcement: nothing newer exists, and nothing waits for it.
+        // Announced while a pull was on its way, which found nothing.
         newest.announce(1 << 60);
+        newest.put(None);
+        assert!(newest.take_within(Duration::ZERO).is_none());
+        assert_eq!(wanted(), Some(2));
+        // It was foreign: nothing newer exists, and nothing waits for it.
         newest.put(None);
         assert!(newest.take_within(Duration::from_secs(3600)).is_none());
         assert_eq!(wanted(), None);

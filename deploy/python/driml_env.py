@@ -81,7 +81,7 @@ def save(world, place):
 class Gymnasium:
     """Copies of a Gymnasium environment: of one that `make()` gives, or a vector of them that `make(copies)` gives."""
 
-    def __init__(self, make, copies, workers=False):
+    def __init__(self, make, copies, workers=False, channels=None):
         import gymnasium, numpy
         from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
@@ -105,7 +105,13 @@ class Gymnasium:
         if not isinstance(choice, gymnasium.spaces.Discrete):
             sys.exit(f"actions are {choice}, and driml chooses one of a few: Discrete")
         shape = (*space.shape, 1)[:3]
-        self.channels_first = shape[0] < 16 < shape[2]  # As ALE's own vectors have them.
+        if len(space.shape) == 2:
+            channels = "last"
+        elif not channels:  # There are fewer of them than rows and columns.
+            channels = "last" if shape[2] < min(shape[:2]) else "first" if shape[0] < min(shape[1:]) else None
+        if not channels:
+            sys.exit(f"frames of {shape} can have their channels first or last: add --channels first or --channels last")
+        self.channels_first = channels == "first"  # As ALE's own vectors have them.
         self.height, self.width, self.channels = (*shape[1:], shape[0]) if self.channels_first else shape
         self.first_action = int(choice.start)
         inner = getattr(self.env, "envs", None)
@@ -373,6 +379,7 @@ def parser():
     parser.add_argument("--pixels", action="store_true", help="frames are what the environment renders")
     parser.add_argument("--size", type=int, metavar="N", help="frames are made N x N")
     parser.add_argument("--grey", action="store_true", help="frames are made grey")
+    parser.add_argument("--channels", choices=("first", "last"), help="where frames have their channels, if they are not fewer than rows and columns")
     parser.add_argument("--kwargs", default="{}", metavar="JSON", help="arguments of gymnasium.make")
     parser.add_argument("--import", dest="imports", action="append", default=[], metavar="MODULE", help="what registers the environment")
     parser.add_argument("--workers", action="store_true", help="a process for each copy")
@@ -382,7 +389,7 @@ def parser():
 def main():
     args = parser().parse_args()
     try:
-        serve(lambda copies: Gymnasium(maker(args), copies, args.workers))
+        serve(lambda copies: Gymnasium(maker(args), copies, args.workers, args.channels))
     except ModuleNotFoundError as missing:
         package = {"gymnasium": "gymnasium", "numpy": "numpy", "ale_py": "ale-py"}.get(missing.name)
         if not package:

@@ -127,6 +127,7 @@ fn what_cannot_be_resumed() {
     system.refuses_each(
         "
         local --resume run --frames 2000 --set run.n_step=5 => belongs to a run with specification
+        local --resume run --frames 2000 --set world.reward_right=2 => world.reward_right cannot change in a run: resume without this --set
         local --resume run --frames 2000 --set model.atoms=31 => was saved with model.atoms = 51
         local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => in memory alone; add --durable
         local --resume step --frames 2000 --set local.actors=3 => but this run in lockstep has 1

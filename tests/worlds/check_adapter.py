@@ -220,6 +220,18 @@ if __name__ == "__main__":
     assert (world.height, world.width, world.channels) == (32, 20, 3)
     frames = np.frombuffer(bytes(world.reset([1, 2])), np.uint8).reshape(2, 32, 20, 3)
     assert (frames[1] == np.moveaxis(ChannelsFirst().observation(0), 0, -1)).all()
+    frames_of = lambda *shape: with_spaces(observation_space=gymnasium.spaces.Box(0, 255, shape, np.uint8))
+    for shape, channels, expected in [
+        ((3, 12, 12), None, (12, 12, 3)),
+        ((12, 12, 11), None, (12, 12, 11)),
+        ((12, 10, 1), None, (12, 10, 1)),
+        ((9, 9, 9), "last", (9, 9, 9)),
+        ((4, 3, 5), "first", (3, 5, 4)),
+        ((1, 5), "first", (1, 5, 1)),
+    ]:
+        world = driml_env.Gymnasium(frames_of(*shape), 2, channels=channels)
+        assert (world.height, world.width, world.channels) == expected, (shape, channels)
+    check_refused("add --channels first or --channels last", frames_of(9, 9, 9))
     for make in (Numbered, Chance, Own, wrapped, lambda: Chance(), ale("--atari"), ale("--atari", "--clip", "--size", "40")):
         check_saved(make)
     check_saved(ale("--grey", "--size", "64"))

@@ -84,10 +84,10 @@ pub trait Environment: Send {
         Err(EnvError::not_saved())
     }
 
-    /// Takes the state that [`save`](Self::save) gave. That the bytes are undamaged is the caller's to check.
+    /// Takes the state that [`save`](Self::save) gave. That the bytes are undamaged, and of the same settings, is the caller's to check.
     ///
     /// # Errors
-    /// Bytes of another world, of other settings or of another number of environments; the world must then not be used any more.
+    /// Bytes of another world or of another number of environments; the world must then not be used any more.
     fn load(&mut self, _state: &[u8]) -> Result<(), EnvError> {
         Err(EnvError::not_saved())
     }

@@ -98,7 +98,8 @@ impl<E: Env> Environment for Envs<E> {
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let saved = saved::decode(state, self.num_envs())?;
+        let saved: Vec<E::Saved> = saved::decode(state)?;
+        saved::check_env_count(saved.len(), self.num_envs())?;
         let mut envs = self.envs.iter_mut().zip(saved);
         envs.try_for_each(|(env, saved)| env.restore(&self.config, saved))
     }

@@ -138,6 +138,16 @@ impl WorldConfig {
         }
     }
 
+    /// The first setting that makes `other`, a world of this name, another task than this one: any but a time limit.
+    pub fn first_difference(&self, other: &Self) -> Option<String> {
+        let table = |it| Table::try_from(it).expect("settings are read from TOML");
+        let (before, after) = (table(self), table(other));
+        let mut keys = before.keys().chain(after.keys());
+        let differs =
+            |key: &&String| !key.ends_with("_timeout_ms") && before.get(*key) != after.get(*key);
+        keys.find(differs).cloned()
+    }
+
     /// The same world by the code that `name` has, where its own code is a person's: a command, or a library. A machine may have them
     /// elsewhere than the one on which the run was made.
     pub fn with_code_of(&self, name: WorldName) -> Result<Self, EnvError> {

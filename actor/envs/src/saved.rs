@@ -8,13 +8,20 @@ use crate::error::EnvError;
 /// Longest state of a world, bytes.
 const STATE_BYTES_MAX: usize = 1 << 28;
 
-/// The bytes of a world's state.
+/// The bytes of a world's state, which cannot be saved where they are more than are read back.
 pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
-    bincode::serde::encode_to_vec(state, bincode::config::standard())
-        .map_err(|e| EnvError::State(e.to_string()))
+    let bytes = bincode::serde::encode_to_vec(state, bincode::config::standard())
+        .map_err(|e| EnvError::State(e.to_string()))?;
+    match bytes.len() {
+        0..=STATE_BYTES_MAX => Ok(bytes),
+        long => Err(EnvError::NotSaved(format!(
+            "this world's state takes {long} bytes, and {STATE_BYTES_MAX} can be saved; use fewer environments (actor.envs)"
+        ))),
+    }
 }
 
-pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
+/// The state that [`encode`] wrote.
+pub(crate) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
     let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
     let (state, used) = bincode::serde::decode_from_slice(bytes, config)
         .map_err(|e| EnvError::State(e.to_string()))?;
@@ -22,16 +29,6 @@ pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvEr
         0 => Ok(state),
         over => Err(EnvError::State(format!("{over} bytes after its end"))),
     }
-}
-
-/// The state of so many environments that [`encode`] wrote.
-pub(crate) fn decode<T: DeserializeOwned>(
-    bytes: &[u8],
-    num_envs: usize,
-) -> Result<Vec<T>, EnvError> {
-    let envs: Vec<T> = decode_whole(bytes)?;
-    check_env_count(envs.len(), num_envs)?;
-    Ok(envs)
 }
 
 /// An error unless a state is of as many environments as this world has.
@@ -46,11 +43,8 @@ pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvEr
 
 /// An error unless `holds`: a state that this world cannot be in.
 pub(crate) fn check(holds: bool, what: &str) -> Result<(), EnvError> {
-    if holds {
-        Ok(())
-    } else {
-        Err(EnvError::State(format!("{what} is none of these settings")))
-    }
+    let wrong = || EnvError::State(format!("{what} is none of these settings"));
+    holds.then_some(()).ok_or_else(wrong)
 }
 
 #[cfg(test)]
@@ -58,6 +52,7 @@ pub(crate) mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
+    use super::{STATE_BYTES_MAX, encode};
     use crate::playing::{fails, play};
     use crate::worlds::{chain, ising};
     use crate::{Environment, IsingConfig, RestrictedWorld, StepEnd, WorldConfig};
@@ -92,6 +87,12 @@ pub(crate) mod tests {
             assert!(make().load(wrong).is_err(), "{name}: {} bytes", wrong.len());
         }
         ended
+    }
+
+    #[test]
+    fn a_state_that_would_not_be_read_back_is_not_saved() {
+        let long = encode(&" ".repeat(STATE_BYTES_MAX));
+        fails(long, &["takes 268435461 bytes, and 268435456 can be saved"]);
     }
 
     fn chain() -> WorldConfig {

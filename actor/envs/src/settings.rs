@@ -62,9 +62,8 @@ pub trait WorldSettings {
 
     /// For each action, the one that it amounts to; an action that stands for itself maps to itself.
     fn visible_actions(&self) -> Vec<u8> {
-        (0..self.action_names().len())
-            .map(|action| action as u8)
-            .collect()
+        let count = self.action_names().len();
+        (0..count).map(|action| action as u8).collect()
     }
 
     /// Whether a run in this world can be resumed, which begins its episodes anew: false where the world continues from one

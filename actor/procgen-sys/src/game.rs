@@ -91,11 +91,6 @@ pub enum DistributionMode {
 
 impl fmt::Display for DistributionMode {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Easy => "easy",
-            Hard => "hard",
-            Extreme => "extreme",
-            Memory => "memory",
-        })
+        serde::Serialize::serialize(self, f)
     }
 }

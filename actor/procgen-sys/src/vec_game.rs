@@ -136,11 +136,6 @@ impl VecGame {
         self.read(&self.first)
     }
 
-    /// The level in which the last actions were taken [N].
-    pub fn prev_level_seed(&self) -> &[i32] {
-        self.read(&self.prev_level_seed)
-    }
-
     /// 1 where the last action completed its level [N].
     pub fn prev_level_complete(&self) -> &[u8] {
         self.read(&self.prev_level_complete)

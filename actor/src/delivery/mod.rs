@@ -12,7 +12,7 @@ use std::{
 
 use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
 
-use state::DeliveryState;
+use state::{DeliveryState, Progress};
 use worker::DeliveryWorker;
 
 pub use state::{DeliveryError, DeliveryLimits};
@@ -55,33 +55,23 @@ impl Delivery {
         })
     }
 
-    /// Transitions that the run has stored, as of the last answer.
-    pub fn inserted_total(&self) -> u64 {
-        self.state.progress().inserted_total
-    }
-
-    /// Actors that are connected to the run, as of the last answer; 0 before the first.
-    pub fn actors(&self) -> u32 {
-        self.state.progress().actors
+    /// How far it is, as of the last answer.
+    pub(crate) fn progress(&self) -> Progress {
+        *self.state.progress()
     }
 
     /// How long the actor has time to wait for newer weights before it begins its next chunk: where the rate limiter makes its
     /// chunks wait, it loses nothing by acting with the newest.
     pub fn fresh_weights_max(&self) -> Duration {
-        match self.state.progress().is_held {
+        match self.progress().is_held {
             true => FRESH_WEIGHTS_MAX,
             false => Duration::ZERO,
         }
     }
 
-    /// The run has all the transitions it wants.
-    pub fn is_finished(&self) -> bool {
-        self.state.progress().finished
-    }
-
     /// What the next chunk would wait for now; none if it would not.
     pub fn describe_wait(&self) -> Option<&'static str> {
-        let progress = *self.state.progress();
+        let progress = self.progress();
         match progress.is_held {
             true if progress.waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
             false if progress.waiting >= self.limit => Some("waits for the replay server's answer"),

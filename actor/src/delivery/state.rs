@@ -42,10 +42,13 @@ pub(super) struct DeliveryState {
 
 /// How far the delivery is, as of the last answer.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Progress {
-    pub(super) inserted_total: u64,
-    pub(super) actors: u32,
-    pub(super) finished: bool,
+pub(crate) struct Progress {
+    /// Transitions that the run has stored.
+    pub(crate) inserted_total: u64,
+    /// Actors that are connected to the run; 0 before the first answer.
+    pub(crate) actors: u32,
+    /// The run has all the transitions it wants.
+    pub(crate) finished: bool,
     /// The rate limiter makes chunks wait: more than one at a time would only grow old.
     pub(super) is_held: bool,
     /// Chunks that were sent and are not yet settled.

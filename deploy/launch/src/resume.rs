@@ -152,6 +152,10 @@ fn check_changes(
     config: &RunConfig,
     lockstep: bool,
 ) -> anyhow::Result<()> {
+    if let Some(key) = before.world.first_difference(&config.world) {
+        let why = usage!("world.{key} cannot change in a run: resume without this --set");
+        bail!(why);
+    }
     let parts = |it: &RunConfig| (it.run.clone(), it.model.clone(), it.learner.clone());
     if parts(before) != parts(config) {
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
@@ -247,10 +251,9 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         && let [Some(old), Some(new)] = [&before, &config].map(alpha)
         && old != new
     {
-        return Err(usage!(
+        bail!(usage!(
             "replay.sampling.alpha = {new}, but the replay that is kept has its priorities to the power of {old}: resume without this --set"
-        )
-        .into());
+        ));
     }
     let point = ResumePoint {
         updates,

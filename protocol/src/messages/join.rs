@@ -83,6 +83,6 @@ pub struct Leave {
     pub actor: u32,
     /// Which life of it.
     pub incarnation: u64,
-    /// Transitions produced, less those that the replay server answered with `Finished` or `Refused`.
+    /// Transitions produced, less those that the replay server answered with `Finished`. Those that it refused count as lost.
     pub produced: u64,
 }

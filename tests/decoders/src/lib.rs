@@ -1,5 +1,6 @@
-//! Everything that reads bytes of others, as functions of bytes alone: what fuzzers and the bounded runs in CI call.
+//! What reads messages, settings, checkpoints and logs, as functions of bytes alone: what fuzzers and the bounded runs in CI call.
 //! None may panic, whatever the bytes; what is read must be written back unchanged.
+//! Not among them: weights (safetensors) and the line in which a world declares itself.
 //!
 //! A new decoder is a function here, a line in [`ALL`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test holds that none
 //! of these is forgotten.

@@ -68,12 +68,8 @@ fn open(dir: &Path) -> Result<Replay, String> {
 
 /// A folder in memory if there is such a place: whether a real disk keeps what it was given is not what is tried.
 fn folder() -> tempfile::TempDir {
-    let memory = Path::new("/dev/shm");
-    if memory.is_dir() {
-        tempfile::tempdir_in(memory).unwrap()
-    } else {
-        tempfile::tempdir().unwrap()
-    }
+    let memory = tempfile::tempdir_in("/dev/shm");
+    memory.or_else(|_| tempfile::tempdir()).unwrap()
 }
 
 /// The file of segment `number`.
@@ -211,7 +207,7 @@ fn mend(segment: &mut [u8]) {
         }
         head[BODY_BYTES].copy_from_slice(&(length as u64).to_le_bytes());
         head[CHECKED_BYTES].copy_from_slice(&(checked as u32).to_le_bytes());
-        let sum = crc32(&[&head[..RECORD_SUM.start], &body[..checked]]);
+        let sum = crc32fast::hash(&[&head[..RECORD_SUM.start], &body[..checked]].concat());
         head[RECORD_SUM].copy_from_slice(&sum.to_le_bytes());
         at += HEAD_BYTES + length;
     }
@@ -226,14 +222,8 @@ pub(crate) fn mend_message(body: &mut [u8]) {
     let header = number(&body[HEADER_BYTES]).min(after);
     body[HEADER_BYTES].copy_from_slice(&(header as u32).to_le_bytes());
     body[PAYLOAD_BYTES].copy_from_slice(&((after - header) as u64).to_le_bytes());
-    let sum = crc32(&[&body[..MESSAGE_SUM.start], &body[MESSAGE_SUM.end..]]);
+    let sum = crc32fast::hash(&[&body[..MESSAGE_SUM.start], &body[MESSAGE_SUM.end..]].concat());
     body[MESSAGE_SUM].copy_from_slice(&sum.to_le_bytes());
-}
-
-fn crc32(pieces: &[&[u8]]) -> u32 {
-    let mut sum = crc32fast::Hasher::new();
-    pieces.iter().for_each(|piece| sum.update(piece));
-    sum.finalize()
 }
 
 fn header(actor: u32, sequence: u64, first_transition: u64) -> ChunkHeader {

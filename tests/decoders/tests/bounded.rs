@@ -119,9 +119,11 @@ impl Drop for Said<'_> {
     }
 }
 
-/// A test for each decoder.
+/// A test for each decoder, and their names.
 macro_rules! bounded {
     ($($name:ident)*) => {
+        const BOUNDED: &[&str] = &[$(stringify!($name)),*];
+
         $(#[test]
         fn $name() {
             run(stringify!($name));
@@ -140,10 +142,11 @@ fn stored(file: &Path, bytes: &[u8]) -> Vec<u8> {
     fs::read(file).unwrap_or_default()
 }
 
-/// Each decoder has a target, and `messages` has the seeds of `wire` (which a test of the protocol writes), without their prefix:
-/// `UPDATE_CORPUS=1` writes them.
+/// Each decoder has a bounded run and a target, and `messages` has the seeds of `wire` (which a test of the protocol writes), without
+/// their prefix: `UPDATE_CORPUS=1` writes them.
 #[test]
 fn every_decoder_has_a_target_and_seeds() {
+    assert!(ALL.iter().map(|(name, _)| name).eq(BOUNDED));
     let fuzz = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz");
     let manifest = fs::read_to_string(fuzz.join("Cargo.toml")).unwrap();
     assert!(fuzz.join("fuzz_targets/decoder.rs").exists());

@@ -51,11 +51,6 @@ pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
 /// nothing: nothing is left to chance.
 pub type ChainWorld = Envs<Corridor>;
 
-impl ChainWorld {
-    /// The actions, in their order.
-    pub const ACTION_NAMES: [&str; 3] = ["no-op", "left", "right"];
-}
-
 /// Where the agent is in one corridor, and in which step of the episode. It is its own saved form.
 #[derive(Clone, Copy, Serialize, Deserialize)]
 pub struct Corridor {
@@ -97,7 +92,7 @@ impl WorldSettings for ChainConfig {
     }
 
     fn action_names(&self) -> Vec<&str> {
-        ChainWorld::ACTION_NAMES.to_vec()
+        vec!["no-op", "left", "right"]
     }
 
     fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {

@@ -81,10 +81,9 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
     let (replay, recovery) = Replay::open(&args, &config.run, &config.replay, batch_size)?;
     // A server could continue with a part of it, but a lockstep run must be the same.
     match recovery.warnings.first() {
-        Some(why) if mark.is_some() => Err(usage!(
+        Some(why) if mark.is_some() => bail!(usage!(
             "the run cannot resume to the same weights: {why}. Start it again, in another folder"
-        )
-        .into()),
+        )),
         _ => Ok(replay),
     }
 }
@@ -224,11 +223,9 @@ impl Lockstep {
 
     /// [`Lockstep::save`] of a run whose replay is marked in its log.
     fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
-        let actors = self.actor_states();
+        let doing = "saving the worlds for a checkpoint; at the run's start it could be done";
         let saved = SavedParts {
-            actors: actors.context(
-                "saving the worlds for a checkpoint; at the run's start it could be done",
-            )?,
+            actors: self.actor_states().context(doing)?,
             replay: mark,
             turn: self.turn.clone(),
         };

@@ -135,6 +135,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
     let on = match args.levels {
+        Levels::Train if !world.is_resumable() => "from the start of world.lethal_schedule",
         Levels::Train => "as trained on",
         Levels::TrainSingle => "on the levels trained on, one an episode",
         Levels::Unseen => "on unseen levels",

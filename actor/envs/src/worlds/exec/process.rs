@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
-use std::process::{Child, ChildStderr, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -25,6 +25,9 @@ const GUARD: &str = "read -r line; sleep 1; kill -KILL 0";
 
 /// Lines of stderr that an error repeats.
 const WORDS_MAX: usize = 12;
+
+/// Lines of stderr that are logged within a second; then the log says how many there were more.
+const LINES_A_SECOND_MAX: usize = 50;
 
 /// Characters of such a line; more are cut off.
 const WORD_LENGTH_MAX: usize = 400;
@@ -101,7 +104,10 @@ impl WorldProcess {
         let (stderr, log) = (child.stderr.take().expect(pipe), Arc::clone(&words));
         let keeper = thread::Builder::new().name("world-stderr".into());
         keeper.spawn(move || {
-            keep(stderr, &log, level);
+            keep(BufReader::new(stderr), &log, |text| match level {
+                Level::INFO => tracing::info!("world: {text}"),
+                _ => tracing::debug!("world: {text}"),
+            });
             // There is nothing more to say.
             drop(speaks);
         })?;
@@ -124,6 +130,19 @@ impl WorldProcess {
             Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(self.system(&e)),
             _ => Ok(()),
         }
+    }
+
+    /// Says something to a process that has given all its answers.
+    pub(super) fn ask(&mut self, text: &str) -> Result<(), EnvError> {
+        let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
+        // If this fails, so does the read of the answer. A closed stdout has nothing to read, and the answer to it is its error.
+        let _ = poll(&mut polled, PollTimeout::ZERO);
+        let found = polled[0].revents();
+        if found.is_some_and(|it| it.contains(PollFlags::POLLIN)) {
+            let why = "wrote to stdout between two steps: print to stderr instead";
+            return Err(self.fail(why));
+        }
+        self.say(text)
     }
 
     pub(super) fn line(&mut self) -> Result<Vec<u8>, EnvError> {
@@ -259,25 +278,36 @@ fn describe(status: ExitStatus) -> String {
     }
 }
 
-/// Writes every line of a world's stderr into this process's log and keeps the last ones.
-fn keep(stderr: ChildStderr, words: &Mutex<VecDeque<String>>, level: Level) {
-    let mut stderr = BufReader::new(stderr);
+/// Logs the lines of a world's stderr, as many as are allowed, and keeps the last ones.
+pub(super) fn keep(
+    mut stderr: impl BufRead,
+    words: &Mutex<VecDeque<String>>,
+    mut log: impl FnMut(&str),
+) {
     let mut line = Vec::new();
+    let (mut began, mut lines) = (Instant::now(), 0);
     loop {
         line.clear();
-        let limit = LINE_MAX as u64;
-        match (&mut stderr).take(limit).read_until(b'\n', &mut line) {
-            Ok(0) | Err(_) => return,
-            Ok(_) => {}
+        let mut rest = (&mut stderr).take(LINE_MAX as u64);
+        let is_over = !matches!(rest.read_until(b'\n', &mut line), Ok(1..));
+        if is_over || began.elapsed() >= Duration::from_secs(1) {
+            let more = usize::saturating_sub(lines, LINES_A_SECOND_MAX);
+            if more > 0 {
+                log(&format!("{more} more lines left out"));
+            }
+            (began, lines) = (Instant::now(), 0);
+        }
+        if is_over {
+            return;
         }
         let text = String::from_utf8_lossy(&line);
         let text: String = text.trim_end().chars().take(WORD_LENGTH_MAX).collect();
         if text.is_empty() {
             continue;
         }
-        match level {
-            Level::INFO => tracing::info!("world: {text}"),
-            _ => tracing::debug!("world: {text}"),
+        lines += 1;
+        if lines <= LINES_A_SECOND_MAX {
+            log(&text);
         }
         let mut words = words.lock().unwrap_or_else(PoisonError::into_inner);
         if words.len() == WORDS_MAX {

@@ -31,7 +31,7 @@
 //! the i-th. `PATH` is memory that both share; the numbers are where in it the columns begin, by bytes: `actions` [N] u8,
 //! `rewards` [N] f32 of the machine's order, `ends` [N] u8 as [`StepEnd`](crate::StepEnd) numbers them (0 runs on, 1 next
 //! level, 2 timed out, 3 terminal) and `frames` [N, H, W, C] u8. The frame after an end is the first of the next episode.
-//! What the process writes to stderr is the actor's log.
+//! What the process writes to stderr is in the actor's log, up to 50 lines a second.
 //!
 //! The memory has no name in the file system, and a shell that waits for the actor's end kills the process: when an actor
 //! is killed, nothing is left. This side reads and writes the memory as a file, which needs no unsafe code.
@@ -255,7 +255,7 @@ impl SavedExec {
         config: &ExecConfig,
         num_envs: usize,
     ) -> Result<Self, EnvError> {
-        let this: Self = saved::decode_whole(bytes)?;
+        let this: Self = saved::decode(bytes)?;
         let of = &this.config;
         if of.command != config.command {
             return Err(EnvError::State(format!(

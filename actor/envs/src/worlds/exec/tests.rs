@@ -2,8 +2,10 @@
 //! which a process can fail. Needs `python3`, without any package; what needs Gymnasium is in `tests/system/own_worlds.rs`.
 
 use std::fs;
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use super::process::keep;
 use super::protocol::SavedExec;
 use super::world::seeds;
 use super::*;
@@ -67,10 +69,8 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
     let mut world = ExecWorld::new(&config, COPIES, 7).unwrap();
     assert_eq!((world.num_envs(), world.num_actions()), (COPIES, 3));
     assert_eq!(world.frame_shape(), config.frame_shape());
-    let seeds: Vec<u16> = seeds(7, COPIES)
-        .into_iter()
-        .map(|seed| (seed % 65_536) as u16)
-        .collect();
+    let seeds = seeds(7, COPIES).into_iter();
+    let seeds: Vec<u16> = seeds.map(|seed| (seed % 65_536) as u16).collect();
     let (mut episodes, mut steps) = ([0; COPIES], [0; COPIES]);
     for round in 0..100 {
         let expected: Vec<_> = (0..COPIES)
@@ -220,6 +220,22 @@ fn what_is_printed_into_the_protocol_is_named() {
     let config = config(declares(ONE) + "; echo ready");
     let sentence = "the byte 0x72 and not with `.`";
     fails(ExecWorld::new(&config, 1, 1), &[sentence]);
+    // What would be taken for the answer to the next step.
+    let twice = self::config(declares(ONE) + "; printf ..; read -r line");
+    let mut world = ExecWorld::new(&twice, 1, 1).unwrap();
+    let stepped = world.step(&[0], &mut [0.0], &mut [StepEnd::Running]);
+    fails(stepped, &["wrote to stdout between two steps"]);
+}
+
+#[test]
+fn a_flood_on_stderr_is_logged_in_part_and_its_last_lines_are_kept() {
+    let flood: String = (0..1000).map(|number| format!("{number}\n")).collect();
+    let (kept, mut logged) = (Mutex::default(), Vec::new());
+    keep(flood.as_bytes(), &kept, |line| logged.push(line.to_owned()));
+    assert_eq!(logged[49], "49");
+    assert_eq!(logged[50..], ["950 more lines left out"]);
+    let kept = kept.into_inner().unwrap();
+    assert!(kept.into_iter().eq((988..1000).map(|it| it.to_string())));
 }
 
 #[test]

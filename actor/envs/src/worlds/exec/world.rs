@@ -112,7 +112,7 @@ impl ExecWorld {
     /// Says that a state is to be saved or loaded, and where it lies.
     fn say_state(&mut self, what: &str, memory: &File) -> Result<(), EnvError> {
         let place = json!({"state": path(memory), "bytes_max": WORLD_STATE_BYTES_MAX});
-        self.process.say(&format!("{what}{place}\n"))
+        self.process.ask(&format!("{what}{place}\n"))
     }
 
     /// The process's own bytes for how its copies stand.
@@ -219,9 +219,8 @@ pub fn declaration(
 
 /// The seed of each copy, below 2^31 so that every language and engine has room for it.
 pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
-    (0..copies)
-        .map(|copy| env_rng(seed, copy, RngUse::Game).random::<u32>() >> 1)
-        .collect()
+    let seed = |copy| env_rng(seed, copy, RngUse::Game).random::<u32>() >> 1;
+    (0..copies).map(seed).collect()
 }
 
 impl WorldSettings for ExecConfig {
@@ -312,7 +311,7 @@ impl Environment for ExecWorld {
         self.process.exchange = self.config.stepping("in the middle of a step");
         let written = self.block.write_actions(actions);
         written.map_err(|e| self.process.system(&e))?;
-        self.process.say(STEP)?;
+        self.process.ask(STEP)?;
         self.hear_done()?;
         let numbers = self.block.read_results(rewards);
         let numbers = numbers.map_err(|e| self.process.system(&e))?;

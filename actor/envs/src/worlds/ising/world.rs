@@ -54,9 +54,6 @@ pub struct Now {
 }
 
 impl IsingWorld {
-    /// The only action.
-    pub const ACTION_NAMES: [&str; 1] = ["no-op"];
-
     /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if `env` is out of range.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
         self.envs.get(env).map(|field| field.now.origin)
@@ -87,7 +84,7 @@ impl WorldSettings for IsingConfig {
     }
 
     fn action_names(&self) -> Vec<&str> {
-        IsingWorld::ACTION_NAMES.to_vec()
+        vec!["no-op"]
     }
 
     fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {

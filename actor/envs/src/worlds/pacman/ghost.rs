@@ -68,9 +68,8 @@ impl Ghost {
 
     fn wander(&self, rng: &mut impl Rng) -> Direction {
         let open = MAZE.open(self.place);
-        let onward = self
-            .heading
-            .map_or(open, |heading| open & !(1 << (heading ^ 1)));
+        let back = self.heading.map_or(0, |heading| 1 << (heading ^ 1));
+        let onward = open & !back;
         draw(if onward == 0 { open } else { onward }, rng)
     }
 

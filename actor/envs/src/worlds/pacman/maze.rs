@@ -82,10 +82,8 @@ impl Maze {
             .filter(|&p| cell(p.into()) != b'#')
             .collect();
         let place = |pixel: usize| {
-            pixels
-                .iter()
-                .position(|&p| usize::from(p) == pixel)
-                .map(|p| p as Place)
+            let found = pixels.binary_search(&(pixel as u16));
+            found.ok().map(|place| place as Place)
         };
         let start = |mark: u8| {
             let pixel = (0..HEIGHT * WIDTH)
@@ -93,24 +91,20 @@ impl Maze {
                 .expect("the layout marks every start");
             place(pixel).expect("a start is an open cell")
         };
-        let next: Vec<[Place; DIRECTIONS]> = (0..pixels.len())
-            .map(|from| {
-                beside(pixels[from].into()).map(|pixel| place(pixel).unwrap_or(from as Place))
-            })
-            .collect();
-        let open = |from: usize| {
-            (0..DIRECTIONS)
-                .map(|d| u8::from(usize::from(next[from][d]) != from) << d)
-                .sum()
+        let next_of = |from: usize| {
+            beside(pixels[from].into()).map(|pixel| place(pixel).unwrap_or(from as Place))
         };
-        let items: Vec<Item> = pixels
-            .iter()
-            .map(|&pixel| match cell(pixel.into()) {
-                b'.' => Item::Pellet,
-                b'o' => Item::Boost,
-                _ => Item::Nothing,
-            })
-            .collect();
+        let next: Vec<_> = (0..pixels.len()).map(next_of).collect();
+        let open = |from: usize| {
+            let bit = |d| u8::from(usize::from(next[from][d]) != from) << d;
+            (0..DIRECTIONS).map(bit).sum()
+        };
+        let item = |&pixel: &u16| match cell(pixel.into()) {
+            b'.' => Item::Pellet,
+            b'o' => Item::Boost,
+            _ => Item::Nothing,
+        };
+        let items: Vec<Item> = pixels.iter().map(item).collect();
         Self {
             open: (0..pixels.len()).map(open).collect(),
             runs: pixels.iter().map(|&pixel| runs(pixel.into())).collect(),

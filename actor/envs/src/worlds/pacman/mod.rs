@@ -53,7 +53,7 @@ impl WorldSettings for PacmanConfig {
     }
 
     fn action_names(&self) -> Vec<&str> {
-        PacmanWorld::ACTION_NAMES.to_vec()
+        vec!["no-op", "up", "down", "left", "right"]
     }
 
     fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
@@ -64,11 +64,6 @@ impl WorldSettings for PacmanConfig {
         // Which ghost is lethal depends on how many episodes were played.
         self.lethal_schedule.is_none()
     }
-}
-
-impl PacmanWorld {
-    /// The actions, in their order.
-    pub const ACTION_NAMES: [&str; 5] = ["no-op", "up", "down", "left", "right"];
 }
 
 impl Env for Board {

@@ -75,25 +75,6 @@ struct LevelSet {
 }
 
 impl ProcgenWorld {
-    /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
-    pub const ACTION_NAMES: [&'static str; NUM_ACTIONS] = [
-        "left+down",
-        "left",
-        "left+up",
-        "down",
-        "no-op",
-        "up",
-        "right+down",
-        "right",
-        "right+up",
-        "d",
-        "a",
-        "w",
-        "s",
-        "q",
-        "e",
-    ];
-
     /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`procgen_sys::Engine::install`] for how to do that
     /// beforehand and watch it.
     ///
@@ -133,11 +114,6 @@ impl ProcgenWorld {
             shape,
             shrink: (shape.bytes() < FRAME_BYTES).then(|| Shrink::new(shape)),
         })
-    }
-
-    /// The level that each environment's current frame shows [N].
-    pub fn levels(&self) -> &[i32] {
-        self.game.level_seed()
     }
 
     /// What the last step ended in environment `env`, whose steps were counted including it.
@@ -192,8 +168,10 @@ impl WorldSettings for ProcgenConfig {
         15.0
     }
 
+    /// What each action presses, by the engine's numbering. Source: `get_combos` in `procgen/env.py`.
     fn action_names(&self) -> Vec<&str> {
-        ProcgenWorld::ACTION_NAMES.to_vec()
+        let names = "left+down left left+up down no-op up right+down right right+up d a w s q e";
+        names.split(' ').collect()
     }
 
     fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built {
@@ -280,7 +258,8 @@ impl Environment for ProcgenWorld {
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let envs: Vec<(u32, State)> = saved::decode(state, self.num_envs())?;
+        let envs: Vec<(u32, State)> = saved::decode(state)?;
+        saved::check_env_count(envs.len(), self.num_envs())?;
         for (env, (steps, state)) in envs.into_iter().enumerate() {
             self.game.set_state(env, &state)?;
             self.steps_taken[env] = steps;

@@ -40,9 +40,8 @@ pub(crate) fn config(game: Game) -> ProcgenConfig {
 }
 
 fn draw(rng: &mut ChaCha8Rng, num_envs: usize) -> Vec<u8> {
-    (0..num_envs)
-        .map(|_| rng.random_range(0..NUM_ACTIONS as u8))
-        .collect()
+    let draw = |_| rng.random_range(0..NUM_ACTIONS as u8);
+    (0..num_envs).map(draw).collect()
 }
 
 /// What a step gave: frames after it, rewards, ends.
@@ -320,7 +319,7 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
         for _ in 0..1000 {
             let (_, rewards, ends) = step(&mut world, &draw(&mut rng, 16));
             let set = start_level as i32..(start_level + num_levels) as i32;
-            let mut levels = world.levels().iter();
+            let mut levels = world.game.level_seed().iter();
             assert!(levels.all(|level| set.contains(level)), "{game}");
             for (end, reward) in ends.into_iter().zip(rewards) {
                 if end == StepEnd::LevelChange {
@@ -361,7 +360,7 @@ fn a_redrawn_level_is_the_level_itself() {
             redraw(&mut world, 1);
             let unchanged = [0, 2].map(|env| world.game.state(env).unwrap());
             assert!(others == unchanged, "{game}");
-            let mut alone = alone(engine, &config, world.levels()[1], last_move);
+            let mut alone = alone(engine, &config, world.game.level_seed()[1], last_move);
             let frame = |frames: &[u8]| frames[FRAME_BYTES..2 * FRAME_BYTES].to_vec();
             let at = format!("{game}, round {round}");
             assert!(frame(world.game.frames()) == alone.frames(), "{at}");
@@ -390,9 +389,9 @@ fn redrawn_levels_are_uniform_over_the_set_after_each_level() {
     let mut world = ProcgenWorld::new(&config, 1, 17, 0).unwrap();
     let mut counts = [[0.0; 5]; 5];
     for _ in 0..2500 {
-        let before = world.levels()[0] as usize;
+        let before = world.game.level_seed()[0] as usize;
         redraw(&mut world, 0);
-        counts[before][world.levels()[0] as usize] += 1.0;
+        counts[before][world.game.level_seed()[0] as usize] += 1.0;
     }
     let chi_square_of = |row: &[f64; 5]| {
         let expected = row.iter().sum::<f64>() / 5.0;
