@@ -183,17 +183,19 @@ impl Replay {
 
     /// Begins another segment when one is full, and removes those that are not needed any more.
     pub(crate) fn tidy(&mut self) {
-        if let Some(log) = self.log.as_ref().filter(|log| log.is_full()) {
-            if let Some(oldest) = log.over_budget(|| self.snapshot()) {
-                self.forget_before(oldest);
-                self.prune();
-            }
-            self.begin_segment();
+        if self.log.as_ref().is_some_and(Journal::is_full) {
+            self.next_segment();
         }
         self.prune();
     }
 
-    pub(crate) fn begin_segment(&mut self) {
+    /// Begins another segment; where the disk budget does not allow it, the oldest transitions go first.
+    pub(crate) fn next_segment(&mut self) {
+        let log = self.log.as_ref();
+        if let Some(oldest) = log.and_then(|log| log.over_budget(|| self.snapshot())) {
+            self.forget_before(oldest);
+            self.prune();
+        }
         let snapshot = self.log.is_some().then(|| self.snapshot());
         if let (Some(log), Some(snapshot)) = (&mut self.log, snapshot) {
             log.rotate(&snapshot);

@@ -125,7 +125,7 @@ impl Replay {
             let has_saved = learned.saved_updates > self.state.learned.saved_updates;
             self.state.learned = learned;
             if has_saved {
-                self.begin_segment();
+                self.next_segment();
             }
         }
         Ok(())
