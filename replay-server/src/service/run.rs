@@ -214,7 +214,7 @@ fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// Reads what is kept into `empty`, with the newest weights that were handed over, and logs what was found.
+/// Reads what is kept into `empty`, with the newest weights that were handed over to that replay, and logs what was found.
 fn read(
     kept: KeptReplay,
     empty: Replay,
@@ -245,7 +245,8 @@ fn read(
     } else {
         tracing::info!("keeps the replay in {dir}");
     }
-    Ok((replay, WeightsStore::kept_in(&folder, spec_hash)))
+    let weights = WeightsStore::kept_in(&folder, spec_hash, recovery.found);
+    Ok((replay, weights))
 }
 
 type Queryables = Vec<Queryable<()>>;

@@ -11,6 +11,8 @@ use driml_protocol::{
     PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, codec,
 };
 
+use crate::persist::journal::remove;
+
 const FILE: &str = "weights.message";
 
 /// Versions that are kept while actors pull them. When so many are being pulled, one that begins gets the newest of these: many
@@ -32,10 +34,14 @@ pub(super) struct WeightsStore {
 }
 
 impl WeightsStore {
-    /// Weights that are kept beside the replay in `dir`, from now on and before: actors that start after a restart need some before
-    /// the learner publishes again.
-    pub(super) fn kept_in(dir: &Path, spec_hash: u64) -> Self {
+    /// Weights that are kept beside the replay in `dir`, from now on and, where it `was_kept`, before: actors that start after a
+    /// restart need some before the learner publishes again. Those of a replay that is gone are removed: with them actors would store
+    /// chunks before the learner joins.
+    pub(super) fn kept_in(dir: &Path, spec_hash: u64, was_kept: bool) -> Self {
         let path = dir.join(FILE);
+        if !was_kept {
+            remove(&path);
+        }
         let read = |bytes: &[u8]| {
             let (upload, safetensors) = codec::decode::<WeightsUpload>(bytes, Some(spec_hash))?;
             anyhow::Ok(Weights {
@@ -246,5 +252,17 @@ mod tests {
         assert_eq!(store.found(newer(last), later), Ok((last + 5, 0)));
         let gone = store.found(piece(1, 0), later);
         assert_eq!(gone, Err(WeightsReply::Gone));
+    }
+
+    #[test]
+    fn weights_are_used_again_with_the_replay_that_they_were_kept_with() {
+        let folder = tempfile::tempdir().unwrap();
+        let kept_in = |was_kept| WeightsStore::kept_in(folder.path(), 5, was_kept);
+        let mut store = kept_in(true);
+        store.put(WeightsHeader::new(7, 0, b"a"), b"a").unwrap();
+        store.keeper().unwrap()();
+        for (was_kept, version) in [(true, 7), (false, 0), (true, 0)] {
+            assert_eq!(kept_in(was_kept).version(), version, "{was_kept}");
+        }
     }
 }
