@@ -22,6 +22,8 @@ const KEPT_MAX: usize = 8;
 const KEPT_FOR: Duration = Duration::from_secs(5);
 /// Most versions that one upload may be ahead of the one before: a learner does not count so far.
 const VERSION_STEP_MAX: u64 = 1 << 20;
+/// Highest version of the first upload: of a run that is resumed without its replay, it may be any that a run reaches.
+const FIRST_VERSION_MAX: u64 = 1 << 53;
 
 /// The newest weights, and older ones that are being pulled.
 #[derive(Default)]
@@ -90,11 +92,12 @@ impl WeightsStore {
         header: WeightsHeader,
         safetensors: &[u8],
     ) -> Result<bool, String> {
-        let newest = self.version();
-        if self.newest.as_ref().is_some_and(|it| it.header == header) {
-            return Ok(false);
-        }
-        if header.version <= newest || header.version - newest > VERSION_STEP_MAX {
+        let (newest, step_max) = match &self.newest {
+            Some(newest) if newest.header == header => return Ok(false),
+            Some(newest) => (newest.header.version, VERSION_STEP_MAX),
+            None => (0, FIRST_VERSION_MAX),
+        };
+        if header.version <= newest || header.version - newest > step_max {
             return Err(format!("version {} after version {newest}", header.version));
         }
         self.newest = Some(Arc::new(Weights {
@@ -208,6 +211,10 @@ mod tests {
             assert!(store.put(other, b"c").is_err(), "{version}");
         }
         assert_eq!(store.version(), 3);
+        // A run that is resumed without its replay begins with any.
+        let first = |version| WeightsStore::default().put(header(version), b"a");
+        assert_eq!(first(2 << 20), Ok(true));
+        assert!(first(FIRST_VERSION_MAX + 1).is_err());
     }
 
     #[test]
