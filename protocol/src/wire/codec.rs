@@ -25,7 +25,8 @@ pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
 
-const VALUE_BYTES_MAX: usize = 1 << 28;
+/// Longest value of [`encode_value`], bytes.
+pub const VALUE_BYTES_MAX: usize = 1 << 28;
 
 /// The prefix's integers: of fixed width, without gaps.
 const FIXED: Configuration<LittleEndian, Fixint> =

@@ -169,6 +169,17 @@ fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
     }
     // The 2,000 transitions held take 34 kB in chunks, and a state 16 kB.
     assert!(most < 200_000, "{most}");
+    // One that could not be written is refused at the start.
+    let fits = |capacity| {
+        let unlimited = Config::unlimited(capacity);
+        Config {
+            sampling,
+            ..unlimited
+        }
+        .check_on_disk()
+        .is_ok()
+    };
+    assert!(fits(31_000_000) && !fits(32_000_000));
 }
 
 #[test]

@@ -68,6 +68,7 @@ pub struct KeptReplay {
 impl KeptReplay {
     /// Takes the folder and looks whose replay is in it, if any: at once, however much there is.
     pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
+        config.check_on_disk()?;
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {
             format: FORMAT,
