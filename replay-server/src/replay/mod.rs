@@ -132,7 +132,10 @@ impl Replay {
         ReplayStatus {
             transitions_inserted: counts.this_shard.inserted,
             transitions_refilled: counts.refilled,
-            transitions_held: self.ring.inserted() - self.ring.oldest(),
+            transitions_held: match counts.refill_left {
+                0 => self.ring.inserted() - self.ring.oldest(),
+                _ => 0,
+            },
             frame_bytes_held: self.ring.frames().bytes_held(),
             rows_sampled: counts.this_shard.rows_sampled,
             updates: self.state.learned.updates,

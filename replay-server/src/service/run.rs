@@ -232,7 +232,7 @@ fn read(
         tracing::info!(
             "continues with the replay in {dir}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
             status.transitions_inserted,
-            status.transitions_held,
+            replay.ring.inserted() - replay.ring.oldest(),
             status.rows_sampled,
             recovery.bytes >> 20,
             recovery.took.as_secs_f64()
