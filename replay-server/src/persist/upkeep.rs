@@ -294,7 +294,7 @@ impl Replay {
             (snapshot.inserted, snapshot.oldest, snapshot.capacity),
             (counts.this_shard.inserted, counts.refilled),
             (counts.refill_left, state.resumed_after),
-            (state.actors, state.learner, state.inserted_before),
+            (state.actors, state.learner),
             state.statistics.of_stored(),
         ))
     }
