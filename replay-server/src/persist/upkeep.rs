@@ -4,7 +4,7 @@
 use std::{
     borrow::Cow,
     path::{Path, PathBuf},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use driml_protocol::{
@@ -104,12 +104,11 @@ impl KeptReplay {
         mut replay: Replay,
         reading: &Reading,
     ) -> Result<(Replay, Recovery), PersistError> {
-        let started = Instant::now();
         let (folder, id) = (self.folder, self.id);
         if let Some(mark) = self.mark {
             go_back(&folder, mark)?;
         }
-        let (place, mut recovery) = recover(&folder, id, &mut replay, self.mark, reading)?;
+        let (place, recovery) = recover(&folder, id, &mut replay, self.mark, reading)?;
         if !recovery.found {
             folder.write_id(&id)?;
         }
@@ -117,7 +116,6 @@ impl KeptReplay {
         let journal = Journal::begin(folder, id, place, self.limits, &snapshot)?;
         replay.log = Some(journal);
         replay.tidy();
-        recovery.took = started.elapsed();
         Ok((replay, recovery))
     }
 }

@@ -6,17 +6,13 @@ use driml_protocol::{
     RequestId, Waiting,
 };
 
-use super::Replay;
+use super::{Replay, VERSION_AHEAD_MAX};
 use crate::{
     config,
     ledger::requests::Requests,
     persist::snapshot::{COUNT_MAX, Note},
     sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
-
-/// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
-/// know all.
-const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
 /// Who learns, and what it says it has learned.
 impl Replay {
