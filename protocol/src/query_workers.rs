@@ -27,7 +27,7 @@ use crate::{
     session,
     wire::{
         buffers::{Buffer, BufferPool},
-        codec::{self, PAYLOAD_BYTES_MAX},
+        codec,
         error::CodecError,
         keys::Keys,
         message::{Message, Request},
@@ -172,15 +172,9 @@ impl<R: Request + 'static> QueryWorkers<R> {
         })
     }
 
-    /// Takes the requests in the client's run, until the result is dropped. No other process need be asked: the
-    /// reply is complete.
-    pub fn declare(&self, client: &RunClient) -> zenoh::Result<Queryable<()>> {
-        self.declare_limited(client, PAYLOAD_BYTES_MAX, |_| ())
-    }
-
-    /// As [`QueryWorkers::declare`], for queries of at most `bytes_max` bytes: longer ones are dropped before anything is copied,
-    /// and `refused` is told their bytes.
-    pub fn declare_limited(
+    /// Takes the requests in the client's run, until the result is dropped, of at most `bytes_max` bytes: longer ones are dropped before
+    /// anything is copied, and `refused` is told their bytes. No other process need be asked: the reply is complete.
+    pub fn declare(
         &self,
         client: &RunClient,
         bytes_max: usize,

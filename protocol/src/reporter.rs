@@ -1,5 +1,6 @@
 //! The thread with which an actor or the learner tells the replay server what it does.
-//! Nothing waits for a report, and a lost one is not sent again: the next one follows.
+//! Nothing waits for a report, and a lost one is not sent again: the next one follows. The learner's last one, that the run is
+//! finished, is sent until it arrives.
 
 use std::{
     thread::JoinHandle,
@@ -8,8 +9,12 @@ use std::{
 
 use crate::{
     client::RunClient,
-    messages::report::{Participant, Report, Warning},
-    process::{activity::Activity, fail_point, last_warning, shutdown::Shutdown},
+    messages::{
+        report::{Participant, Report, Warning},
+        table::Ack,
+    },
+    process::{activity::Activity, fail_point, last_warning, shutdown::Shutdown, silence::Silence},
+    session::SessionError,
 };
 
 /// How often a process reports although nothing has changed.
@@ -17,15 +22,35 @@ const PERIOD: Duration = Duration::from_secs(2);
 /// How often it looks whether something has.
 const TICK: Duration = Duration::from_millis(250);
 const TIMEOUT: Duration = Duration::from_secs(2);
+/// How long a replay server that does not answer is told that the run is finished: it may be starting again.
+const FINISHED_MAX: Duration = Duration::from_secs(30);
 
-/// Tells the replay servers of `clients` once that `who`, the learner, has finished the run after so many
-/// updates, whatever comes of it.
-pub fn say_finished(clients: &[RunClient], who: Participant, updates: u64) {
+/// Tells each replay server of `clients` that `who`, the learner, has finished the run after so many updates: until it answers, as long
+/// as it reads its replay back, [`FINISHED_MAX`] where it does not, or `shutdown`.
+pub fn say_finished(clients: &[RunClient], who: Participant, updates: u64, shutdown: &Shutdown) {
     let finished = Report {
         finished: Some(updates),
         ..report(who, "has finished", Duration::ZERO)
     };
-    send(clients, &finished);
+    for client in clients {
+        send_until_heard(|| client.ask(&finished, TIMEOUT), shutdown);
+    }
+}
+
+fn send_until_heard(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdown: &Shutdown) {
+    let mut silence = Silence::default();
+    while let Err(e) = send() {
+        if matches!(e, SessionError::Recovering(_)) {
+            silence.answered();
+        }
+        if silence.unanswered() > FINISHED_MAX {
+            tracing::warn!("a replay server does not know that the run is finished: {e}; stop it");
+            return;
+        }
+        if shutdown.wait_timeout(TICK) {
+            return;
+        }
+    }
 }
 
 /// What `who` says of itself, and the last warning in the log of this process.
@@ -33,14 +58,6 @@ fn report(who: Participant, doing: &str, since: Duration) -> Report {
     let warning = last_warning::get();
     let warning = warning.map(|(text, age)| Warning::new(&text, age.as_secs_f64()));
     Report::new(who, doing, since.as_secs_f64(), warning)
-}
-
-fn send(clients: &[RunClient], report: &Report) {
-    for client in clients {
-        if let Err(e) = client.ask(report, TIMEOUT) {
-            tracing::debug!("a report did not arrive: {e}");
-        }
-    }
 }
 
 /// Reports what `who` does to the replay servers of `clients`, until `shutdown` or the end of their sessions.
@@ -57,7 +74,12 @@ pub fn start(
             let (doing, since) = activity.get();
             let is_old = |(said, at): &(String, Instant)| *said != doing || at.elapsed() > PERIOD;
             if said.as_ref().is_none_or(is_old) {
-                send(&clients, &report(who, &doing, since));
+                let report = report(who, &doing, since);
+                for client in &clients {
+                    if let Err(e) = client.ask(&report, TIMEOUT) {
+                        tracing::debug!("a report did not arrive: {e}");
+                    }
+                }
                 said = Some((doing, Instant::now()));
             }
             if shutdown.wait_timeout(TICK) || clients.iter().all(|it| it.session().is_closed()) {
@@ -68,4 +90,23 @@ pub fn start(
     std::thread::Builder::new()
         .name("reporter".into())
         .spawn(work)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::messages::recovering::Recovering;
+
+    #[test]
+    fn that_the_run_is_finished_is_sent_until_a_server_that_comes_back_hears_it() {
+        let key = String::new();
+        let mut answers = [
+            Err(SessionError::NoAnswerer { key }),
+            Err(SessionError::Recovering(Recovering::default())),
+            Ok(Ack),
+        ]
+        .into_iter();
+        send_until_heard(|| answers.next().unwrap(), &Shutdown::default());
+        assert_eq!(answers.count(), 0);
+    }
 }

@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     BatchHeader, RunSpec, Sampling, TRANSITION_BYTES,
-    codec::PAYLOAD_BYTES_MAX,
+    codec::{PAYLOAD_BYTES_MAX, VALUE_BYTES_MAX},
     config::{ConfigError, check},
 };
 use serde::{Deserialize, Serialize};
@@ -11,6 +11,8 @@ use serde::{Deserialize, Serialize};
 pub(crate) const SHARDS_MAX: u32 = 256;
 
 pub(crate) const SEGMENT_BYTES_MIN: u64 = 1 << 20;
+/// Most priorities of a shard on disk, 8 bytes each: a state holds all of them, and leaves a sixteenth for the rest.
+const PRIORITIES_MAX: u64 = VALUE_BYTES_MAX as u64 / 16 * 15 / 8;
 
 /// How frames are kept in memory. Batches are the same, bit for bit, whatever it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -131,6 +133,18 @@ impl Config {
             })?;
         }
         Ok(())
+    }
+
+    /// Checks that the state of a shard can be written, for a replay that is kept on disk.
+    pub(crate) fn check_on_disk(&self) -> Result<(), ConfigError> {
+        let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
+        let is_prioritised = self.sampling.is_prioritised();
+        let fits = !is_prioritised || capacity / u64::from(self.shards) <= PRIORITIES_MAX;
+        check(fits, key, capacity, || {
+            format!(
+                "each shard of a prioritised replay on disk holds at most {PRIORITIES_MAX}: hold fewer, use more shards, or keep it in memory"
+            )
+        })
     }
 
     /// Checks every value, alone and against `batch_size`, the rows of the learner's batches.

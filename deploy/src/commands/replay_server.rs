@@ -19,7 +19,7 @@ pub(crate) struct ReplayServerArgs {
     /// quic/HOST:PORT, such as quic/0.0.0.0:7447, with --tls-dir
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) listen: Vec<String>,
-    /// Router to connect to as well; not with --tls-dir, because a router does not apply the rules for roles
+    /// Router to connect to as well; not with --tls-dir, because a router does not apply the rules for roles, nor with several shards
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "tls_dir")]
     pub(crate) connect: Vec<String>,
     /// Number of this shard, from 0
@@ -47,14 +47,16 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     let credentials = args.tls.credentials(Role::ReplayServer)?;
     args.run.over.server_alone = true;
     let (config, _) = flags::resolve(&args.run, &Machine::this())?;
+    if config.replay.shards > 1 && !args.connect.is_empty() {
+        let why = "replay shards behind one router would each store every transition: leave --connect out";
+        return Err(usage!("{why}").into());
+    }
     if args.replay_dir.is_none() {
         let checked = config.replay.check_in_memory("--replay-dir DIR");
         checked.map_err(|e| usage!("{e}"))?;
     }
     let GracefulShutdown { ending, now } = join(&args.join, GracefulShutdown::on_signals)?;
-    for note in &config.notes {
-        tracing::warn!("{note}");
-    }
+    config.notes.iter().for_each(|it| tracing::warn!("{it}"));
     open_files::warn_of_server(&config);
     let run = driml_replay_server::RunArgs {
         listen: args.listen,

@@ -14,7 +14,7 @@ use std::{
 use driml_protocol::{
     Ack, AffinityUpdate, CodecError, Incoming, LearnerStatus, LogLimiter, PriorityUpdate,
     QueryWorkers, Request, RunClient, Sampling, Sealed, Shutdown, Weights, WeightsUpload,
-    fail_point, lock, session::SessionError,
+    codec::PAYLOAD_BYTES_MAX, fail_point, lock, session::SessionError,
 };
 use zenoh::query::Queryable;
 
@@ -115,7 +115,7 @@ impl Publisher {
         let status_asked = QueryWorkers::start("learner-status", 1, spec_hash, give)?;
         let mut queryables = Vec::new();
         for client in clients {
-            let declared = status_asked.declare(client);
+            let declared = status_asked.declare(client, PAYLOAD_BYTES_MAX, |_| ());
             queryables.push(
                 declared.map_err(|e| anyhow::anyhow!("declaring the learner's status: {e}"))?,
             );

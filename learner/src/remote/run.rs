@@ -174,8 +174,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         tracing::info!("priorities of {arrived} updates have arrived");
     }
     if !shutdown.is_set() {
-        let updates = learner.updates();
-        reporter::say_finished(&clients, Participant::Learner(requests.learner), updates);
+        let (updates, who) = (learner.updates(), Participant::Learner(requests.learner));
+        reporter::say_finished(&clients, who, updates, shutdown);
     }
     drop(membership);
     let closed = shards.close();

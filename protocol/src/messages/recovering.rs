@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::wire::{error::CodecError, message::no_payload};
 
 /// How far a replay server is with reading its replay back from disk.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecoveryProgress {
     /// Bytes of the log that have been read.
     pub bytes_read: u64,
@@ -33,7 +33,7 @@ impl fmt::Display for RecoveryProgress {
 }
 
 /// The replay server cannot answer yet, because it is reading its replay back. The query had no effect.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Recovering {
     /// How far it is.
     pub progress: RecoveryProgress,

@@ -104,16 +104,14 @@ impl BufferPool {
 }
 
 impl Shared {
-    /// Never waits: a receiver that died may keep its pieces for a while.
+    /// Never waits. A receiver that is killed keeps its pieces as long as this process runs: zenoh frees one once all have released it.
     fn take(&self, bytes: usize) -> Option<ZShmMut> {
         if !lock(&self.trust).ask() {
             return None;
         }
         let piece = self.provider.alloc(bytes);
         let taken = piece.with_policy::<Defragment<GarbageCollect>>().wait();
-        if let Err(e) = &taken {
-            tracing::debug!("{bytes} bytes of shared memory are not free: {e:?}");
-        }
+        lock(&self.trust).found(taken.is_ok());
         taken.ok()
     }
 }

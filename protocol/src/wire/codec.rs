@@ -25,7 +25,8 @@ pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
 
-const VALUE_BYTES_MAX: usize = 1 << 28;
+/// Longest value of [`encode_value`], bytes.
+pub const VALUE_BYTES_MAX: usize = 1 << 28;
 
 /// The prefix's integers: of fixed width, without gaps.
 const FIXED: Configuration<LittleEndian, Fixint> =
@@ -89,22 +90,15 @@ pub fn encode<M: Message>(
     message: &M,
     payload: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    let mut out = seal(spec_hash, message, payload)?;
-    out.extend_from_slice(payload);
-    Ok(out)
+    Ok([&seal(spec_hash, message, payload)?, payload].concat())
 }
 
 /// Checks a message in one piece and gives it and its payload.
 ///
 /// `spec_hash` is the hash of this process's run, or `None` where any run is accepted (a process that joins to learn it).
 pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
-    let prefix = Prefix::read(bytes.first_chunk(), bytes.len())?;
-    let (header, payload) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());
-    let mut sum = prefix.checksum_begun();
-    sum.update(header);
-    sum.update(payload);
-    let message = prefix.message(sum, header, payload, spec_hash)?;
-    Ok((message, payload))
+    let (message, payload) = receive(bytes, bytes.len(), &BufferPool::new(0), spec_hash)?;
+    Ok((message, &bytes[bytes.len() - payload.len()..]))
 }
 
 /// Checks a message of `len` bytes and copies its payload into own memory of `pool`.

@@ -27,6 +27,8 @@ const TICK: Duration = Duration::from_millis(2);
 const AVOID_COUNT: u32 = 64;
 /// So many losses without a message that arrived between them, and shared memory is not tried again.
 const LOSSES_MAX: u32 = 2;
+/// After so many pieces that were not free, far more than are in use at a time, a warning says that some may be lost.
+const MISSES_MAX: u32 = 64;
 /// Number of the capability by which a process may lock as much memory as it likes (`capabilities(7)`).
 const CAP_IPC_LOCK: u32 = 14;
 
@@ -36,6 +38,7 @@ pub struct Trust {
     /// Messages that are still to go through the socket.
     avoid: u32,
     losses_in_a_row: u32,
+    misses_in_a_row: u32,
 }
 
 impl Trust {
@@ -56,6 +59,18 @@ impl Trust {
             tracing::warn!(
                 "messages in shared memory do not arrive, so all go through sockets from now on, which is slower; the other side may \
                  not be allowed to lock memory: raise its `ulimit -l`, or --set transport.shared_memory=false"
+            );
+        }
+    }
+
+    /// Whether there was a free piece for a message; without one it goes through the socket.
+    pub fn found(&mut self, is_free: bool) {
+        let misses = self.misses_in_a_row.saturating_add(1);
+        self.misses_in_a_row = if is_free { 0 } else { misses };
+        if self.misses_in_a_row == MISSES_MAX {
+            tracing::warn!(
+                "no shared memory is free, so messages go through sockets, which is slower; a process that was killed may hold it: start \
+                 this one again to free it"
             );
         }
     }

@@ -258,19 +258,19 @@ impl Actors {
         (&mut actor.streams, difference)
     }
 
-    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second `Leave`
-    /// reveals nothing. A life that never joined is an error: the reason, for a person.
-    pub(crate) fn leave(&mut self, leave: &Leave) -> Result<Difference, String> {
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; none if it has come before.
+    /// A life that never joined is an error: the reason, for a person.
+    pub(crate) fn leave(&mut self, leave: &Leave) -> Result<Option<Difference>, String> {
         let (actor, produced) = (leave.actor, leave.produced);
         let known = self.actors.get_mut(&actor).into_iter();
         let mut lives = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let life = lives.find(|life| life.incarnation == leave.incarnation);
         let life = life.ok_or_else(|| format!("no such life of actor {actor} has joined"))?;
         if std::mem::replace(&mut life.has_left, true) {
-            return Ok(Difference::default());
+            return Ok(None);
         }
         let stored = std::mem::replace(&mut life.produced, produced);
-        Ok(Difference::between(produced, stored))
+        Ok(Some(Difference::between(produced, stored)))
     }
 
     pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::snapshot::Snapshot;
 
 /// Form of the log, and of the messages in it, in thousands and ones; one of another form is refused.
-pub(super) const FORMAT: u32 = 5_000 + PROTOCOL_VERSION as u32;
+pub(super) const FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
 /// The file that says which log it is.
 const ID: &str = "log.toml";
 /// Highest number of a segment; files of higher ones are none of a log's.

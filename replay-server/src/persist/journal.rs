@@ -373,7 +373,7 @@ fn begin_segment(
 }
 
 /// Removes a file; if that fails it is tried again, or does no harm.
-fn remove(path: &Path) -> bool {
+pub(crate) fn remove(path: &Path) -> bool {
     match fs::remove_file(path) {
         Err(e) if e.kind() != io::ErrorKind::NotFound => {
             tracing::debug!("removing {}: {e}", path.display());

@@ -62,8 +62,6 @@ pub struct Recovery {
     pub found: bool,
     /// Bytes of the log that were read.
     pub bytes: u64,
-    /// How long that took.
-    pub took: Duration,
     /// Damage, and what came of it: sentences for a person.
     pub warnings: Vec<String>,
 }

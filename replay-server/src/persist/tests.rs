@@ -92,16 +92,21 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     };
     replay.join_learner(learner).unwrap();
     let file = refuse(&mut replay);
-    replay.leave(&Leave {
+    let leave = Leave {
         actor: 0,
         incarnation: 1,
         produced: 0,
-    });
+    };
+    replay.leave(&leave);
     assert!(replay.is_refused_by_disk());
     replay.log.as_mut().unwrap().file = file;
     // The learner's checkpoint is the first that there is room for.
     save_checkpoint(&mut replay);
     replay.join_actor(join(1, 1)).unwrap();
+    let bytes = |replay: &Replay| replay.log.as_ref().unwrap().bytes();
+    let before = bytes(&replay);
+    replay.leave(&leave);
+    assert_eq!(bytes(&replay), before, "a repeated `Leave` is not written");
     check_comes_back(replay, folder.path());
 }
 
@@ -164,6 +169,17 @@ fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
     }
     // The 2,000 transitions held take 34 kB in chunks, and a state 16 kB.
     assert!(most < 200_000, "{most}");
+    // One that could not be written is refused at the start.
+    let fits = |capacity| {
+        let unlimited = Config::unlimited(capacity);
+        Config {
+            sampling,
+            ..unlimited
+        }
+        .check_on_disk()
+        .is_ok()
+    };
+    assert!(fits(31_000_000) && !fits(32_000_000));
 }
 
 #[test]

@@ -4,7 +4,7 @@
 use std::{
     borrow::Cow,
     path::{Path, PathBuf},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use driml_protocol::{
@@ -68,6 +68,7 @@ pub struct KeptReplay {
 impl KeptReplay {
     /// Takes the folder and looks whose replay is in it, if any: at once, however much there is.
     pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
+        config.check_on_disk()?;
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {
             format: FORMAT,
@@ -103,12 +104,11 @@ impl KeptReplay {
         mut replay: Replay,
         reading: &Reading,
     ) -> Result<(Replay, Recovery), PersistError> {
-        let started = Instant::now();
         let (folder, id) = (self.folder, self.id);
         if let Some(mark) = self.mark {
             go_back(&folder, mark)?;
         }
-        let (place, mut recovery) = recover(&folder, id, &mut replay, self.mark, reading)?;
+        let (place, recovery) = recover(&folder, id, &mut replay, self.mark, reading)?;
         if !recovery.found {
             folder.write_id(&id)?;
         }
@@ -116,7 +116,6 @@ impl KeptReplay {
         let journal = Journal::begin(folder, id, place, self.limits, &snapshot)?;
         replay.log = Some(journal);
         replay.tidy();
-        recovery.took = started.elapsed();
         Ok((replay, recovery))
     }
 }
@@ -183,17 +182,19 @@ impl Replay {
 
     /// Begins another segment when one is full, and removes those that are not needed any more.
     pub(crate) fn tidy(&mut self) {
-        if let Some(log) = self.log.as_ref().filter(|log| log.is_full()) {
-            if let Some(oldest) = log.over_budget(|| self.snapshot()) {
-                self.forget_before(oldest);
-                self.prune();
-            }
-            self.begin_segment();
+        if self.log.as_ref().is_some_and(Journal::is_full) {
+            self.next_segment();
         }
         self.prune();
     }
 
-    pub(crate) fn begin_segment(&mut self) {
+    /// Begins another segment; where the disk budget does not allow it, the oldest transitions go first.
+    pub(crate) fn next_segment(&mut self) {
+        let log = self.log.as_ref();
+        if let Some(oldest) = log.and_then(|log| log.over_budget(|| self.snapshot())) {
+            self.forget_before(oldest);
+            self.prune();
+        }
         let snapshot = self.log.is_some().then(|| self.snapshot());
         if let (Some(log), Some(snapshot)) = (&mut self.log, snapshot) {
             log.rotate(&snapshot);
@@ -291,7 +292,7 @@ impl Replay {
             (snapshot.inserted, snapshot.oldest, snapshot.capacity),
             (counts.this_shard.inserted, counts.refilled),
             (counts.refill_left, state.resumed_after),
-            (state.actors, state.learner, state.inserted_before),
+            (state.actors, state.learner),
             state.statistics.of_stored(),
         ))
     }

@@ -33,13 +33,14 @@ impl Replay {
         Ok(earlier_incarnations)
     }
 
-    /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors.
-    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
+    /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors, and names them.
+    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
         let absent = self.state.actors.absent(is_connected);
         if !absent.is_empty() {
             self.state.actors.forget(&absent);
-            self.note(Note::Forgotten(absent));
+            self.note(Note::Forgotten(absent.clone()));
         }
+        absent
     }
 
     /// The life of `actor` whose chunks are stored; none before it joins.
@@ -251,15 +252,13 @@ impl Replay {
             )),
         };
         match said {
-            Ok(difference) => {
+            Ok(Some(difference)) => {
                 self.count(leave.actor, difference);
                 self.note(Note::Leave(*leave));
-                None
             }
-            Err(why) => {
-                self.counted().messages_refused += 1;
-                Some(why)
-            }
+            Ok(None) => {}
+            Err(_) => self.counted().messages_refused += 1,
         }
+        said.err()
     }
 }

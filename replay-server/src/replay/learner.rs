@@ -6,17 +6,13 @@ use driml_protocol::{
     RequestId, Waiting,
 };
 
-use super::Replay;
+use super::{Replay, VERSION_AHEAD_MAX};
 use crate::{
     config,
     ledger::requests::Requests,
     persist::snapshot::{COUNT_MAX, Note},
     sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
-
-/// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
-/// know all.
-const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
 /// Who learns, and what it says it has learned.
 impl Replay {
@@ -52,7 +48,7 @@ impl Replay {
         let unlearned = self.counts().rows_sampled.saturating_sub(learned);
         let again = done.saturating_sub(join.updates);
         self.limiter.refund(unlearned);
-        self.set_rows_sampled(learned);
+        self.limiter.counts.this_shard.rows_sampled = learned;
         self.limiter.counts.other_shards = join.other_shards;
         let state = &mut self.state;
         state.statistics.counted.rows_unlearned += unlearned;
@@ -86,17 +82,8 @@ impl Replay {
         self.limiter.counts.other_shards = join.other_shards;
         self.limiter
             .resume_empty(join.counts, refill, self.batch_size);
-        self.state.inserted_before = join.counts.inserted;
-        self.state.rows_before = join.counts.rows_sampled as i64;
         self.state.resumed_after = join.updates;
         self.state.draw_anew(self.origin.shard, join.updates);
-    }
-
-    /// So many rows were sampled here, whatever was counted.
-    fn set_rows_sampled(&mut self, rows: u64) {
-        let counted = self.counts().rows_sampled;
-        self.state.rows_before += rows as i64 - counted as i64;
-        self.limiter.counts.this_shard.rows_sampled = rows;
     }
 
     /// The learner that is served.
@@ -118,14 +105,14 @@ impl Replay {
             ));
         }
         if std::mem::take(&mut self.awaits_learner) {
-            self.set_rows_sampled(rows);
+            self.limiter.counts.this_shard.rows_sampled = rows;
         }
         // A request may overtake another.
         if updates >= self.state.learned.updates {
             let has_saved = learned.saved_updates > self.state.learned.saved_updates;
             self.state.learned = learned;
             if has_saved {
-                self.begin_segment();
+                self.next_segment();
             }
         }
         Ok(())

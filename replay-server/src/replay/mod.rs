@@ -19,6 +19,10 @@ use crate::{
     storage::{frame_store::Frames, ring::Ring},
 };
 
+/// How far the version of an affinity matrix may be ahead of the rows served, and that of weights that acted ahead of the newest: a
+/// replay that was started anew may not know all.
+pub(crate) const VERSION_AHEAD_MAX: u64 = 1 << 32;
+
 /// Everything the replay server knows. Kept in memory alone, or, with a log, on disk too: [`KeptReplay`](crate::KeptReplay).
 pub struct Replay {
     pub(crate) spec: RunSpec,
@@ -132,7 +136,10 @@ impl Replay {
         ReplayStatus {
             transitions_inserted: counts.this_shard.inserted,
             transitions_refilled: counts.refilled,
-            transitions_held: self.ring.inserted() - self.ring.oldest(),
+            transitions_held: match counts.refill_left {
+                0 => self.ring.inserted() - self.ring.oldest(),
+                _ => 0,
+            },
             frame_bytes_held: self.ring.frames().bytes_held(),
             rows_sampled: counts.this_shard.rows_sampled,
             updates: self.state.learned.updates,

@@ -11,10 +11,7 @@ use super::{
     parked::ParkedChunk,
     server::{Question, Service, State},
 };
-use crate::storage::pack::PackedChunk;
-
-/// How far the version that acted may be ahead of the newest that is here: it is where this server was started anew, but not by any number.
-const VERSION_AHEAD_MAX: u64 = 1 << 32;
+use crate::{replay::VERSION_AHEAD_MAX, storage::pack::PackedChunk};
 
 /// Answers that are to be sent once the lock is free.
 type Answers = Vec<(Question, InsertReply)>;

@@ -114,7 +114,8 @@ impl State {
             return Err(JoinReply::Taken { why });
         }
         // Else a process that joins under one number after the other would use them up.
-        self.replay.forget_absent(is_connected);
+        let absent = self.replay.forget_absent(is_connected);
+        participants.forget(&absent);
         let earlier_incarnations = self.replay.join_actor(join).map_err(refused)?;
         participants.joined(Alive::actor(actor, incarnation), Instant::now());
         self.count_actors();

@@ -10,8 +10,8 @@ use driml_protocol::{
 
 use crate::config::Config;
 
-/// What stands before a payload: the prefix and the header.
-const HEAD_BYTES_MAX: usize = 1 << 12;
+/// What stands before a payload, the prefix and the header: all of a message that has none.
+pub(super) const HEAD_BYTES_MAX: usize = 1 << 12;
 
 /// Lives of actors that may send through shared memory. A reader keeps what it has mapped until it exits, also after the
 /// writer has exited (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
@@ -31,8 +31,6 @@ pub(super) struct Limits {
     pub(super) affinity: usize,
     /// Priorities of a batch's rows, which are their header.
     pub(super) priorities: usize,
-    /// Whatever has no payload.
-    pub(super) small: usize,
     pub(super) batch_rows: u32,
 }
 
@@ -58,7 +56,6 @@ impl Limits {
                 .saturating_add(HEAD_BYTES_MAX),
             affinity: 4 * actions * actions + HEAD_BYTES_MAX,
             priorities: PRIORITY_BYTES_MAX * batch_rows as usize + 2 * HEAD_BYTES_MAX,
-            small: HEAD_BYTES_MAX,
             batch_rows,
         })
     }

@@ -60,6 +60,13 @@ impl Participants {
         self.processes.insert(who.process, account);
     }
 
+    /// Forgets actors that do not take part any more.
+    pub(super) fn forget(&mut self, actors: &[u32]) {
+        for &actor in actors {
+            self.processes.remove(&ProcessName::Actor(actor));
+        }
+    }
+
     /// The participant of this life, if it takes part.
     fn of(&mut self, who: Alive) -> Option<&mut Account> {
         let account = self.processes.get_mut(&who.process)?;
@@ -254,6 +261,8 @@ mod tests {
         assert_eq!(participants.actor_lives(), 2);
         let again = &participants.processes(at(21), |_| None)[1];
         assert!(again.lives == 2 && again.connected && again.last_seen_s.is_none());
+        participants.forget(&[3, 4]);
+        assert_eq!(participants.actor_lives(), 0);
     }
 
     #[test]

@@ -21,7 +21,7 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable, sample::SampleKind};
 
 use super::{
-    limits::{Limits, number, shared_memory_bytes},
+    limits::{HEAD_BYTES_MAX, Limits, number, shared_memory_bytes},
     parked::ParkedChunks,
     participants::Participants,
     server::{Admission, Service, State},
@@ -214,14 +214,14 @@ fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// Reads what is kept into `empty`, with the newest weights that were handed over, and logs what was found.
+/// Reads what is kept into `empty`, with the newest weights that were handed over to that replay, and logs what was found.
 fn read(
     kept: KeptReplay,
     empty: Replay,
     reading: &Reading,
     spec_hash: u64,
 ) -> Result<(Replay, WeightsStore), PersistError> {
-    let folder = kept.dir().to_owned();
+    let (started, folder) = (Instant::now(), kept.dir().to_owned());
     let (replay, recovery) = kept.read(empty, reading)?;
     let dir = folder.display();
     for warning in &recovery.warnings {
@@ -232,10 +232,10 @@ fn read(
         tracing::info!(
             "continues with the replay in {dir}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
             status.transitions_inserted,
-            status.transitions_held,
+            replay.ring.inserted() - replay.ring.oldest(),
             status.rows_sampled,
             recovery.bytes >> 20,
-            recovery.took.as_secs_f64()
+            started.elapsed().as_secs_f64()
         );
         if replay.priority_counts().is_some() {
             tracing::info!(
@@ -245,7 +245,8 @@ fn read(
     } else {
         tracing::info!("keeps the replay in {dir}");
     }
-    Ok((replay, WeightsStore::kept_in(&folder, spec_hash)))
+    let weights = WeightsStore::kept_in(&folder, spec_hash, recovery.found);
+    Ok((replay, weights))
 }
 
 type Queryables = Vec<Queryable<()>>;
@@ -274,7 +275,7 @@ impl<'a> Answers<'a> {
             queryables: Vec::new(),
             threads: Threads::new(),
         };
-        let small = limits.small;
+        let small = HEAD_BYTES_MAX;
         this.answer("insert", 1, limits.chunk, Service::insert)?;
         this.answer("poll", 1, small, Service::poll)?;
         this.answer("request", 1, small, Service::request)?;
@@ -314,7 +315,7 @@ impl<'a> Answers<'a> {
             Some(service) => service.refuse_long(name, bytes, bytes_max),
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };
-        let queryable = workers.declare_limited(self.client, bytes_max, refused)?;
+        let queryable = workers.declare(self.client, bytes_max, refused)?;
         self.queryables.push(queryable);
         self.threads.extend(workers.into_threads());
         Ok(())

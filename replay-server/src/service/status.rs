@@ -74,13 +74,14 @@ impl Service {
     pub(super) fn report(&self, incoming: Incoming<Report>) {
         self.answer(incoming, |state, report| {
             let finished = report.finished;
-            // Otherwise its process has been replaced, or is about to join.
-            if state.participants.reported(report, Instant::now()) {
+            // Otherwise its process has been replaced, or is about to join: the end of the run is reported again.
+            let has_joined = state.participants.reported(report, Instant::now());
+            if has_joined {
                 state.replay.note_updates(finished.unwrap_or(0));
             } else {
                 tracing::debug!("a report of a process that has not joined");
             }
-            Some(Ack)
+            (has_joined || finished.is_none()).then_some(Ack)
         });
     }
 

@@ -11,6 +11,8 @@ use driml_protocol::{
     PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, codec,
 };
 
+use crate::persist::journal::remove;
+
 const FILE: &str = "weights.message";
 
 /// Versions that are kept while actors pull them. When so many are being pulled, one that begins gets the newest of these: many
@@ -20,6 +22,8 @@ const KEPT_MAX: usize = 8;
 const KEPT_FOR: Duration = Duration::from_secs(5);
 /// Most versions that one upload may be ahead of the one before: a learner does not count so far.
 const VERSION_STEP_MAX: u64 = 1 << 20;
+/// Highest version of the first upload: of a run that is resumed without its replay, it may be any that a run reaches.
+const FIRST_VERSION_MAX: u64 = 1 << 53;
 
 /// The newest weights, and older ones that are being pulled.
 #[derive(Default)]
@@ -32,10 +36,14 @@ pub(super) struct WeightsStore {
 }
 
 impl WeightsStore {
-    /// Weights that are kept beside the replay in `dir`, from now on and before: actors that start after a restart need some before
-    /// the learner publishes again.
-    pub(super) fn kept_in(dir: &Path, spec_hash: u64) -> Self {
+    /// Weights that are kept beside the replay in `dir`, from now on and, where it `was_kept`, before: actors that start after a
+    /// restart need some before the learner publishes again. Those of a replay that is gone are removed: with them actors would store
+    /// chunks before the learner joins.
+    pub(super) fn kept_in(dir: &Path, spec_hash: u64, was_kept: bool) -> Self {
         let path = dir.join(FILE);
+        if !was_kept {
+            remove(&path);
+        }
         let read = |bytes: &[u8]| {
             let (upload, safetensors) = codec::decode::<WeightsUpload>(bytes, Some(spec_hash))?;
             anyhow::Ok(Weights {
@@ -84,11 +92,12 @@ impl WeightsStore {
         header: WeightsHeader,
         safetensors: &[u8],
     ) -> Result<bool, String> {
-        let newest = self.version();
-        if self.newest.as_ref().is_some_and(|it| it.header == header) {
-            return Ok(false);
-        }
-        if header.version <= newest || header.version - newest > VERSION_STEP_MAX {
+        let (newest, step_max) = match &self.newest {
+            Some(newest) if newest.header == header => return Ok(false),
+            Some(newest) => (newest.header.version, VERSION_STEP_MAX),
+            None => (0, FIRST_VERSION_MAX),
+        };
+        if header.version <= newest || header.version - newest > step_max {
             return Err(format!("version {} after version {newest}", header.version));
         }
         self.newest = Some(Arc::new(Weights {
@@ -202,6 +211,10 @@ mod tests {
             assert!(store.put(other, b"c").is_err(), "{version}");
         }
         assert_eq!(store.version(), 3);
+        // A run that is resumed without its replay begins with any.
+        let first = |version| WeightsStore::default().put(header(version), b"a");
+        assert_eq!(first(2 << 20), Ok(true));
+        assert!(first(FIRST_VERSION_MAX + 1).is_err());
     }
 
     #[test]
@@ -246,5 +259,17 @@ mod tests {
         assert_eq!(store.found(newer(last), later), Ok((last + 5, 0)));
         let gone = store.found(piece(1, 0), later);
         assert_eq!(gone, Err(WeightsReply::Gone));
+    }
+
+    #[test]
+    fn weights_are_used_again_with_the_replay_that_they_were_kept_with() {
+        let folder = tempfile::tempdir().unwrap();
+        let kept_in = |was_kept| WeightsStore::kept_in(folder.path(), 5, was_kept);
+        let mut store = kept_in(true);
+        store.put(WeightsHeader::new(7, 0, b"a"), b"a").unwrap();
+        store.keeper().unwrap()();
+        for (was_kept, version) in [(true, 7), (false, 0), (true, 0)] {
+            assert_eq!(kept_in(was_kept).version(), version, "{was_kept}");
+        }
     }
 }

@@ -130,10 +130,13 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         assert_eq!(replay.inserted_total(), 120);
         let chunks = refill.div_ceil(6);
         for sequence in 0..chunks {
+            let held = replay.status().transitions_held;
+            assert_eq!(held, 0, "no row is drawn from a shard that fills again");
             insert(&mut replay, header(0, 1, sequence, 6 * sequence));
         }
         let status = replay.status();
         assert_eq!(status.transitions_refilled, refill);
+        assert_eq!(status.transitions_held, 6 * chunks);
         assert_eq!(status.transitions_inserted, counted + 6 * chunks - refill);
     }
 }

@@ -16,6 +16,7 @@ use crate::{
     calls::{Actor, join},
     history::{History, StreamKey, identity, spec},
     law::ChiSquare,
+    persist::args,
 };
 
 const ROWS: u32 = 64;
@@ -192,6 +193,32 @@ fn draws_follow_the_law_of_their_rule() {
             setup.check_law(&format!("{what}, stack {frame_stack}"));
         }
         assert!(setup.history.oldest() > 0 && setup.anchors().len() > 100);
+    }
+}
+
+/// What is kept on disk of a replay is opened again with another alpha. At 0 it tells no priorities: then all have the highest.
+#[test]
+fn priorities_that_were_kept_follow_the_law_of_another_alpha() {
+    for (before, now) in [(0.5, 0.5), (0.5, 1.0), (1.0, 0.3), (0.4, 0.0), (0.0, 0.6)] {
+        let mut setup = Setup::new(200, Some(before), 1, TimeoutRule::Terminal);
+        let (folder, spec) = (tempfile::tempdir().unwrap(), setup.history.spec.clone());
+        let args = args(folder.path(), 1 << 20);
+        let open = |alpha| Replay::open(&args, &spec, &prioritised(200, alpha), ROWS).unwrap();
+        setup.replay = open(before).0;
+        (0..4).for_each(|actor| join(&mut setup.replay, actor, 1));
+        for _ in 0..20 {
+            setup.insert(0, 2, 5);
+            setup.insert(1, 1, 3);
+            setup.learn();
+        }
+        setup.replay.mark().unwrap();
+        drop(setup.replay);
+        (setup.replay, setup.alpha) = (open(now).0, Some(now));
+        if before == 0.0 {
+            setup.priorities.clear();
+            setup.first.values_mut().for_each(|it| *it = setup.highest);
+        }
+        setup.check_law(&format!("after {before}"));
     }
 }
 

@@ -73,6 +73,8 @@ pub(crate) enum RowsState {
     Uniform { are_listed: bool },
     /// What cannot be told from the transitions held.
     Prioritised {
+        /// The exponent of the masses.
+        alpha: f64,
         highest: f64,
         /// Of each transition held, the oldest first, its mass.
         masses: Vec<f64>,
@@ -89,16 +91,20 @@ impl RowsState {
 
     pub(crate) fn check(&self, held: u64) -> Result<(), &'static str> {
         let Self::Prioritised {
-            highest, masses, ..
+            alpha,
+            highest,
+            masses,
+            ..
         } = self
         else {
             return Ok(());
         };
         let is_mass = |mass: &f64| mass.is_finite() && *mass >= 0.0;
         let are_masses = masses.iter().chain([highest]).all(is_mass);
-        match masses.len() as u64 == held && are_masses {
+        let is_alpha = (0.0..=1.0).contains(alpha);
+        match masses.len() as u64 == held && are_masses && is_alpha {
             true => Ok(()),
-            false => Err("a state with priorities of other transitions, or with one below 0"),
+            false => Err("a state with priorities of other transitions, or none that a run has"),
         }
     }
 }

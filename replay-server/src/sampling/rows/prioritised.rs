@@ -68,6 +68,19 @@ impl Priorities {
         (priority + PRIORITY_MIN).powf(self.alpha)
     }
 
+    /// A `mass` that was raised to the power of another `alpha`; where that was 0, all were the same and have the `highest` now.
+    fn raised(&self, mass: f64, alpha: f64, highest: f64) -> f64 {
+        if mass == 0.0 || alpha == self.alpha {
+            return mass;
+        }
+        match alpha {
+            0.0 => self.mass(highest),
+            _ => mass
+                .powf(self.alpha / alpha)
+                .clamp(PRIORITY_MIN, f32::MAX.into()),
+        }
+    }
+
     /// Sets the priorities of rows that were drawn from `ring`. Of one transition that was drawn twice the last counts.
     fn set(&mut self, ring: &Ring, part: &PriorityPart) {
         for (&index, &priority) in part.transitions.iter().zip(&part.priorities) {
@@ -191,6 +204,7 @@ impl RowSampler for Priorities {
     fn state(&self, ring: &Ring) -> RowsState {
         let held = ring.oldest()..ring.inserted();
         RowsState::Prioritised {
+            alpha: self.alpha,
             highest: self.highest,
             masses: held.map(|i| self.masses.get(self.slot(i))).collect(),
             last: self.last,
@@ -201,6 +215,7 @@ impl RowSampler for Priorities {
     fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState) {
         // Of a run that drew by another rule: each transition keeps the highest.
         let RowsState::Prioritised {
+            alpha,
             highest,
             masses,
             last,
@@ -217,6 +232,7 @@ impl RowSampler for Priorities {
             // Where steps that followed it are gone, it cannot be an anchor any more.
             let lacks_steps = self.masses.get(slot) == 0.0 && self.episodes.is_whole(ring, index);
             if !lacks_steps {
+                let mass = self.raised(mass, *alpha, *highest);
                 self.masses.set(slot, mass);
             }
         }
