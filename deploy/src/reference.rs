@@ -82,10 +82,8 @@ fn commands() -> String {
             write!(page, " Alias: `{}`.", aliases.join("`, `")).unwrap();
         }
         page += "\n\n";
-        let (shared, own): (Vec<_>, Vec<_>) = command
-            .get_arguments()
-            .filter(|it| !it.is_hide_set())
-            .partition(|it| is_shared(it));
+        let shown = command.get_arguments().filter(|it| !it.is_hide_set());
+        let (shared, own): (Vec<_>, Vec<_>) = shown.partition(|it| is_shared(it));
         for arg in own {
             page += &entry(arg);
         }

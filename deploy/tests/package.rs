@@ -30,9 +30,8 @@ const VALUES: [(&str, &str); 7] = [
 ];
 
 fn recipe(name: &str) -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("package")
-        .join(name);
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("package");
+    let path = package.join(name);
     std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
@@ -59,15 +58,11 @@ fn calls(text: &str) -> Vec<Vec<String>> {
     let mut lines = lines.filter(|line| !line.starts_with('#')).peekable();
     let mut found = Vec::new();
     while let Some(line) = lines.next() {
-        let of_yaml = line
-            .strip_prefix("command:")
-            .or_else(|| line.strip_prefix("args:"));
+        let of_yaml = line.strip_prefix("command:");
+        let of_yaml = of_yaml.or_else(|| line.strip_prefix("args:"));
         let of_slurm = || {
-            Some(
-                line.strip_prefix("process ")?
-                    .split_once("\"$program\" ")?
-                    .1,
-            )
+            let process = line.strip_prefix("process ")?;
+            Some(process.split_once("\"$program\" ")?.1)
         };
         let of_systemd = || line.strip_prefix("ExecStart=/usr/local/bin/driml ");
         let Some(call) = of_yaml.or_else(of_slurm).or_else(of_systemd) else {

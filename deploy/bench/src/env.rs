@@ -47,9 +47,8 @@ fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> a
     let config = settings::of_run(world, "c51", "paper", &[])?;
     let mut world = config.world.build(ENVS, 1, threads)?;
     let num_actions = world.num_actions() as u8;
-    let actions: Vec<[u8; ENVS]> = (0..STEPS)
-        .map(|_| std::array::from_fn(|_| rng.random_range(0..num_actions)))
-        .collect();
+    let mut of_step = |_| std::array::from_fn(|_| rng.random_range(0..num_actions));
+    let actions: Vec<[u8; ENVS]> = (0..STEPS).map(&mut of_step).collect();
     let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
     let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
     // A step that starts episodes takes longer than others, so the mean counts.

@@ -39,8 +39,7 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
                     Ok(())
                 })?;
                 let name = named(&format!("{batch} frames of {network}"), precision);
-                let rate = rate * batch as f64;
-                bench.figures.found(name, rate, "frames/s");
+                bench.figures.found(name, rate * batch as f64, "frames/s");
             }
         }
     }

@@ -205,13 +205,8 @@ impl Wire {
             Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?),
             _ => None,
         };
-        let endpoints = Endpoints::to(vec![self.endpoint.clone()]);
-        let credentials = credentials.as_ref();
-        Ok(session::open_as(
-            &endpoints,
-            keys,
-            credentials,
-            MESSAGE_BYTES_MAX,
-        )?)
+        let to = Endpoints::to(vec![self.endpoint.clone()]);
+        let opened = session::open_as(&to, keys, credentials.as_ref(), MESSAGE_BYTES_MAX);
+        Ok(opened?)
     }
 }

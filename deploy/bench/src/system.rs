@@ -258,9 +258,8 @@ impl Run {
     /// Waits for the run's end, with this exit code, and gives its summary.
     fn finish(mut self, code: i32) -> anyhow::Result<Summary> {
         self.poller.close();
-        let end = self
-            .launcher
-            .wait_until(Instant::now() + WAIT_MAX, || false);
+        let deadline = Instant::now() + WAIT_MAX;
+        let end = self.launcher.wait_until(deadline, || false);
         let code_of_end = end.and_then(|end| end.code());
         ensure!(code_of_end == Some(code), "{}", self.launcher.exit_report());
         Summary::read(&RunFolder::new(self.folder.path().join("run")))

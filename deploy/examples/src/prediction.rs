@@ -79,10 +79,8 @@ impl AuxiliaryLoss for Prediction {
         let predicted = inputs.online.loss_layer(NAME, now)?;
         let valid = inputs.batch.positive_valid;
         let rows = valid.iter().filter(|&&valid| valid != 0).count().max(1);
-        let weights: Vec<f32> = valid
-            .iter()
-            .map(|&valid| f32::from(u8::from(valid != 0)) / rows as f32)
-            .collect();
+        let weight = |&valid: &u8| f32::from(u8::from(valid != 0)) / rows as f32;
+        let weights: Vec<f32> = valid.iter().map(weight).collect();
         let weights = Tensor::from_vec(weights, valid.len(), now.device())?;
         let errors = (predicted - later.f4.detach())?.sqr()?.mean(D::Minus1)?;
         let loss = (errors.to_dtype(DType::F32)? * weights)?.sum_all()?;

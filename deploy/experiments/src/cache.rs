@@ -7,7 +7,7 @@ use std::{
     time::{Instant, SystemTime},
 };
 
-use anyhow::Context;
+use anyhow::{Context, bail, ensure};
 use driml_figure::{Figure, Look};
 use driml_launch::{
     console::{self, print},
@@ -76,11 +76,10 @@ impl Session {
         let folder = folder(name, flags);
         let has = |what| folder.join(what).is_dir();
         if report_only && !has(PIECES) && !has(RUNS) {
-            return Err(usage!(
-                "nothing was made in {} yet: there is nothing to report",
-                folder.display()
-            )
-            .into());
+            let folder = folder.display();
+            bail!(usage!(
+                "nothing was made in {folder} yet: there is nothing to report"
+            ));
         }
         let pieces = folder.join(PIECES);
         fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
@@ -89,13 +88,10 @@ impl Session {
         let path = pieces.join(SETTINGS);
         match fs::read(&path) {
             Ok(found) if found == settings.as_bytes() => {}
-            Ok(_) => {
-                return Err(usage!(
-                    "{} holds what was made with other settings: choose another --out, or remove that folder",
-                    folder.display()
-                )
-                .into());
-            }
+            Ok(_) => bail!(usage!(
+                "{} holds what was made with other settings: choose another --out, or remove that folder",
+                folder.display()
+            )),
             Err(_) if report_only => {}
             Err(_) => write_whole(&path, settings.as_bytes())?,
         }
@@ -168,7 +164,7 @@ impl Session {
 
     /// Makes sure that no run is missing, unless a report of what there is was asked for.
     pub(crate) fn check_made(&self) -> anyhow::Result<()> {
-        anyhow::ensure!(
+        ensure!(
             self.missing.is_empty() || self.report_only,
             "these runs failed and are in no number of the page; the same command tries them again: {}",
             self.missing.join(", ")
@@ -180,7 +176,7 @@ impl Session {
     pub(crate) fn check_any<T>(&self, made: &[T]) -> anyhow::Result<()> {
         if made.is_empty() {
             self.check_made()?;
-            return Err(usage!("no run is finished yet: there is nothing to report").into());
+            bail!(usage!("no run is finished yet: there is nothing to report"));
         }
         Ok(())
     }
@@ -327,7 +323,7 @@ mod tests {
         assert_eq!(copied.kept_piece::<u32>(CORES), None, "of another machine");
         let mut session = open("a").unwrap();
         assert_eq!(session.piece_of("", "one", 2, |_| Ok(7)).unwrap(), 7);
-        let failed = session.piece_of::<u32>("", "two", 2, |_| anyhow::bail!("stopped"));
+        let failed = session.piece_of::<u32>("", "two", 2, |_| bail!("stopped"));
         assert!(failed.is_err());
 
         let made = |key: &str, made: u32| open("a").unwrap().piece_of("", key, 2, |_| Ok(made));
@@ -353,8 +349,7 @@ mod tests {
         let made = session.piece_of("w, an old program", "errors", 1, |_| Ok(1));
         assert_eq!(made.unwrap(), 1);
         let computed = |session: &mut Session, what: &str, made: u32| {
-            let found = session.computed(what, "errors", 1, |_| Ok(made));
-            found.unwrap()
+            session.computed(what, "errors", 1, |_| Ok(made)).unwrap()
         };
         assert_eq!(computed(&mut reported, "w", 2), 1);
         assert_eq!(computed(&mut session, "w", 3), 3);

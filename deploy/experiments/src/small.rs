@@ -39,11 +39,9 @@ pub(crate) fn least() -> ModelConfig {
 
 /// Scalars in all parameters together.
 pub(crate) fn len(config: &ModelConfig) -> usize {
-    let shapes = config.parameter_shapes();
-    shapes
-        .iter()
-        .map(|(_, shape)| shape.iter().product::<usize>())
-        .sum()
+    let shapes = config.parameter_shapes().into_iter();
+    let scalars = |(_, shape): (_, Vec<usize>)| shape.iter().product::<usize>();
+    shapes.map(scalars).sum()
 }
 
 /// Tensors with these scalars, one after the other; 0 where there are no more.

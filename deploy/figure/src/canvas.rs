@@ -147,10 +147,8 @@ impl Canvas {
     fn polyline(&mut self, points: &[Point], pen: &str) {
         // A line without length has no direction to be drawn in.
         if points.iter().any(|point| *point != points[0]) {
-            let points = corners(points);
-            self.add(&format!(
-                r#"<polyline points="{points}" fill="none" {pen}/>"#
-            ));
+            let points = format!(r#"points="{}""#, corners(points));
+            self.add(&format!(r#"<polyline {points} fill="none" {pen}/>"#));
         }
     }
 
@@ -175,9 +173,8 @@ impl Canvas {
 
     fn circle(&mut self, (x, y): Point, radius: f64, ink: &str) {
         let [x, y] = [x, y].map(number);
-        self.add(&format!(
-            r#"<circle cx="{x}" cy="{y}" r="{radius}" {ink}/>"#
-        ));
+        let place = format!(r#"cx="{x}" cy="{y}" r="{radius}""#);
+        self.add(&format!("<circle {place} {ink}/>"));
     }
 
     /// Draws filled rectangles of one colour, with hard edges; none for a side of 0 or NaN.

@@ -113,10 +113,8 @@ impl Scale<'_> {
             ([], true) => ticks::log(10f64.powf(self.low), 10f64.powf(self.high)),
             ([], false) => ticks::linear(self.low, self.high, (length / each).max(2.0) as usize),
             (names, _) => {
-                return (0_u32..)
-                    .map(f64::from)
-                    .zip(names.iter().cloned())
-                    .collect();
+                let places = (0_u32..).map(f64::from);
+                return places.zip(names.iter().cloned()).collect();
             }
         };
         let labels = ticks::labels(&ticks);
@@ -234,9 +232,8 @@ impl Chart {
         let points = || self.series.iter().flat_map(|series| &series.points);
         let bands = || self.series.iter().flat_map(|series| &series.band);
         let xs = points().map(|point| point.0);
-        let ys = points()
-            .map(|point| point.1)
-            .chain(bands().flat_map(|(_, low, high)| [*low, *high]));
+        let ends = bands().flat_map(|(_, low, high)| [*low, *high]);
+        let ys = points().map(|point| point.1).chain(ends);
         let (Some(x), Some(y)) = (self.x.scale(xs, SLACK / 2.0), self.y.scale(ys, SLACK)) else {
             let middle = (place.x + place.width / 2.0, place.y + place.height / 2.0);
             canvas.text(middle, "no values yet", soft(LABEL_SIZE, Anchor::Middle));
@@ -247,16 +244,9 @@ impl Chart {
         let y_ticks = y.ticks(place.height - below, 42.0);
         let y_labels = y_ticks.iter().map(|(_, label)| label);
         let left = font::widest(y_labels, TICK_SIZE) + LABEL_SIZE + 18.0;
-        let plot = Plot {
-            rect: Rect::new(
-                place.x + left,
-                place.y + 4.0,
-                place.width - left - 8.0,
-                place.height - below - 4.0,
-            ),
-            x,
-            y,
-        };
+        let (width, height) = (place.width - left - 8.0, place.height - below - 4.0);
+        let rect = Rect::new(place.x + left, place.y + 4.0, width, height);
+        let plot = Plot { rect, x, y };
         plot.axes(canvas, &y_ticks, place.x);
         for series in &self.series {
             plot.series(canvas, series);
@@ -289,8 +279,7 @@ impl Chart {
                 _ => series.marks(canvas, &[(x + LEGEND_MARK / 2.0, middle)]),
             }
             let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
-            let ink = TextStyle::new(LEGEND_SIZE, INK, Anchor::Start);
-            canvas.text(at, &name, ink);
+            canvas.text(at, &name, TextStyle::new(LEGEND_SIZE, INK, Anchor::Start));
             x += width;
         }
         let used = y + LEGEND_LEADING + 4.0 - place.y;
@@ -327,15 +316,13 @@ impl Plot<'_> {
         };
         for (tick, label) in &x_ticks {
             let x = self.at(*tick, 1.0).0;
-            let line = [(x, plot.y), (x, plot.bottom())];
-            canvas.line(&line, GRID, 1.0);
+            canvas.line(&[(x, plot.y), (x, plot.bottom())], GRID, 1.0);
             let at = (x, plot.bottom() + TICK_SIZE + 5.0);
             canvas.text(at, label, soft(TICK_SIZE, Anchor::Middle).within(x_room));
         }
         for (tick, label) in y_ticks {
             let y = self.at(1.0, *tick).1;
-            let line = [(plot.x, y), (plot.right(), y)];
-            canvas.line(&line, GRID, 1.0);
+            canvas.line(&[(plot.x, y), (plot.right(), y)], GRID, 1.0);
             let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
         }

@@ -94,11 +94,8 @@ pub(super) fn heat_colour(share: f64) -> Colour {
 /// Black or white, whichever reads better on `colour`.
 pub(super) fn ink_on(colour: Colour) -> Colour {
     let [r, g, b] = colour.rgb.map(f64::from);
-    if 0.299 * r + 0.587 * g + 0.114 * b > 140.0 {
-        INK
-    } else {
-        CARD
-    }
+    let brightness = 0.299 * r + 0.587 * g + 0.114 * b;
+    if brightness > 140.0 { INK } else { CARD }
 }
 
 #[cfg(test)]

@@ -112,12 +112,9 @@ impl Figure {
         }
         for (index, panel) in self.panels.iter().enumerate() {
             let (row, column) = ((index / columns) as f64, (index % columns) as f64);
-            let place = Rect::new(
-                MARGIN + column * (panel_width + MARGIN),
-                head + row * (panel_height + MARGIN),
-                panel_width,
-                panel_height,
-            );
+            let x = MARGIN + column * (panel_width + MARGIN);
+            let y = head + row * (panel_height + MARGIN);
+            let place = Rect::new(x, y, panel_width, panel_height);
             match panel {
                 Panel::Chart(chart) => {
                     let legend = look == Look::Card || index == 0;
@@ -134,11 +131,8 @@ impl Figure {
     /// The card, the title and the notes.
     fn head(&self, canvas: &mut Canvas, notes: &[String]) {
         let (width, height) = (canvas.width, canvas.height);
-        canvas.card(
-            Rect::new(0.5, 0.5, width - 1.0, height - 1.0),
-            CARD,
-            CARD_BORDER,
-        );
+        let whole = Rect::new(0.5, 0.5, width - 1.0, height - 1.0);
+        canvas.card(whole, CARD, CARD_BORDER);
         let title = TextStyle::new(TITLE_SIZE, INK, Anchor::Start).bold();
         let title = title.within(width - 2.0 * MARGIN);
         canvas.text((MARGIN, MARGIN + TITLE_SIZE - 3.0), &self.title, title);
@@ -157,12 +151,9 @@ mod tests {
 
     fn figure() -> Figure {
         let line = Series::line("one & two", 0, vec![(0.0, 1.0), (10_000.0, 3.0)]);
-        let chart = Chart::new(
-            "returns",
-            Axis::linear("frames"),
-            Axis::linear("return"),
-            vec![line, Series::line("none", 1, vec![])],
-        );
+        let series = vec![line, Series::line("none", 1, vec![])];
+        let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
+        let chart = Chart::new("returns", x, y, series);
         let heat = Heat::new("A", 2, vec![Some(0.0), Some(1.0), None, Some(0.5)]);
         let lattice = Lattice {
             title: "spins".into(),
@@ -238,8 +229,7 @@ mod tests {
     fn text_is_drawn_without_a_font_of_the_machine() {
         let canvas = |text: &str| {
             let mut canvas = Canvas::new(80.0, 30.0, Letters::Outlines);
-            let style = TextStyle::new(16.0, INK, Anchor::Start);
-            canvas.text((4.0, 20.0), text, style);
+            canvas.text((4.0, 20.0), text, TextStyle::new(16.0, INK, Anchor::Start));
             render::png(&canvas.svg(), 1.0).unwrap()
         };
         assert_ne!(canvas("alpha"), canvas(""));

@@ -172,9 +172,8 @@ mod tests {
 
     #[test]
     fn more_colours_than_a_gif_has_are_brought_near() {
-        let pixels: Vec<u8> = (0..64 * 64)
-            .flat_map(|i| [(i % 64) * 4, (i / 64) * 4, 128].map(|c| c as u8))
-            .collect();
+        let pixel = |i: i32| [(i % 64) * 4, (i / 64) * 4, 128].map(|c| c as u8);
+        let pixels: Vec<u8> = (0..64 * 64).flat_map(pixel).collect();
         // Of the second picture only the lower half is new.
         let mut later = pixels.clone();
         later[3 * 32 * 64..].reverse();

@@ -111,9 +111,8 @@ impl Heat {
             false => LABEL_SIZE + 6.0,
         };
         let below = names_below + label_below + 4.0;
-        let room = (place.width - left - right)
-            .min(place.height - below)
-            .max(10.0);
+        let room = (place.width - left - right).min(place.height - below);
+        let room = room.max(10.0);
         let cell = room / self.side as f64;
         let map = Rect::new(place.x + left, place.y, room, room);
 

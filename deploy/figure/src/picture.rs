@@ -180,10 +180,8 @@ mod tests {
         picture.bars(area, &[1.0, f64::NAN], 0.5);
         let rgb = picture.rgb();
         let found = [rgb[0], rgb[10], rgb[19]];
-        assert_eq!(
-            found,
-            [series_colour(0), series_colour(1), CARD].map(|it| it.rgb)
-        );
+        let wanted = [series_colour(0), series_colour(1), CARD];
+        assert_eq!(found, wanted.map(|it| it.rgb));
         picture.cells(area, 2, &[0.0, 1.0, f64::NAN, 0.5]);
         let rgb = picture.rgb();
         let found = [rgb[0], rgb[19], rgb[9 * 20], rgb[10 * 20 - 1]];

@@ -10,17 +10,14 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
     let power = 10f64.powf(raw.log10().floor());
     // The round step nearest to the one asked for, by ratio.
     let off = |step: &f64| (step / raw).ln().abs();
-    let step = [1.0, 2.0, 5.0, 10.0]
-        .map(|times| times * power)
-        .into_iter()
-        .min_by(|a, b| off(a).total_cmp(&off(b)))
-        .unwrap_or(power);
+    let steps = [1.0, 2.0, 5.0, 10.0].map(|times| times * power);
+    let nearest = steps.into_iter().min_by(|a, b| off(a).total_cmp(&off(b)));
+    let step = nearest.unwrap_or(power);
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;
     // At most a few more than asked for; the bound keeps an odd range from filling memory.
-    (first..=last.min(first + 50))
-        .map(|i| i as f64 * step)
-        .collect()
+    let all = first..=last.min(first + 50);
+    all.map(|i| i as f64 * step).collect()
 }
 
 /// Powers of ten in `low..=high`; with multiples of them where there are fewer than three.

@@ -59,9 +59,8 @@ pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
 /// `text` with its lines broken where `separator` stands, so that none is wider than the terminal where that can be; a line continues
 /// after `indent` blanks.
 pub(crate) fn wrapped(text: &str, separator: &str, indent: usize) -> String {
-    let width = Term::stderr()
-        .size_checked()
-        .map_or(usize::MAX, |it| it.1.into());
+    let size = Term::stderr().size_checked();
+    let width = size.map_or(usize::MAX, |it| it.1.into());
     wrapped_to(text, separator, indent, width)
 }
 

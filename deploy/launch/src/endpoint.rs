@@ -217,10 +217,8 @@ mod tests {
         for endpoint in &endpoints {
             let said = check_unused(std::slice::from_ref(endpoint)).unwrap_err().0;
             let begins = format!("cannot listen on {endpoint}: another process listens there");
-            assert!(
-                said.starts_with(&begins) && said.contains("--listen"),
-                "{said}"
-            );
+            let is_told = said.starts_with(&begins) && said.contains("--listen");
+            assert!(is_told, "{said}");
         }
         drop((tcp, udp, socket));
         assert!(check_unused(&endpoints).is_ok());
@@ -246,8 +244,7 @@ mod tests {
             ];
             assert!(words.iter().all(|it| said.contains(it)), "{said}");
             assert_eq!(listening(open, false, true), Ok(()), "{open}");
-            let encrypted = open.replace("tcp", "quic");
-            assert_eq!(listening(&encrypted, true, false), Ok(()));
+            assert_eq!(listening(&open.replace("tcp", "quic"), true, false), Ok(()));
         }
     }
 }

@@ -133,12 +133,8 @@ impl ManagedProcess {
     }
 
     fn signal(&mut self, signal: Signal) {
-        // Once it was waited for, its number may belong to another process.
         if self.end().is_none() {
-            let pid = Pid::from_raw(self.child.id() as i32);
-            if let Err(e) = kill(pid, signal) {
-                tracing::debug!("sending {signal} to {}: {e}", self.name);
-            }
+            send(&self.child, &self.name, signal);
         }
     }
 
@@ -187,12 +183,22 @@ impl Drop for ManagedProcess {
     fn drop(&mut self) {
         self.kill();
         // Without end where the kernel does not let it go, as a driver that hangs.
-        if self
-            .wait_until(Instant::now() + KILLED_MAX, || false)
-            .is_none()
-        {
+        let end = self.wait_until(Instant::now() + KILLED_MAX, || false);
+        if end.is_none() {
             tracing::warn!("{} (process {}) does not end", self.name, self.child.id());
         }
+    }
+}
+
+/// Asks a child process that was not waited for yet to drain and end.
+pub fn ask_to_stop(child: &Child, name: &str) {
+    send(child, name, Signal::SIGTERM);
+}
+
+fn send(child: &Child, name: &str, signal: Signal) {
+    // Once it was waited for, its number may belong to another process.
+    if let Err(e) = kill(Pid::from_raw(child.id() as i32), signal) {
+        tracing::debug!("sending {signal} to {name}: {e}");
     }
 }
 
@@ -250,10 +256,8 @@ mod tests {
         let killed = stopped("kill -TERM $$", false);
         assert!(killed[0].contains("signal 15 SIGTERM"), "{killed:?}");
         let failed = stopped("echo 'error: no room' >&2; exit 3", false);
-        let said = "script exited with code 3";
-        assert!(
-            failed[0].starts_with(said) && failed[0].ends_with(".log): no room"),
-            "{failed:?}"
-        );
+        let ends = ("script exited with code 3", ".log): no room");
+        let is_told = failed[0].starts_with(ends.0) && failed[0].ends_with(ends.1);
+        assert!(is_told, "{failed:?}");
     }
 }

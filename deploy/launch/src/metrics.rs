@@ -154,8 +154,7 @@ fn updates(it: &RunView) -> Option<f64> {
 
 /// What the last update computed; none before the first, as a 0 would look like a loss.
 fn learned(it: &RunView, value: fn(&LearnerStatus) -> f64) -> Option<f64> {
-    let learner = it.learner_shown().filter(|it| it.updates > 0);
-    learner.map(value)
+    it.learner_shown().filter(|it| it.updates > 0).map(value)
 }
 
 fn losses(it: &RunView) -> Vec<Member> {
@@ -285,8 +284,7 @@ mod tests {
     #[test]
     fn the_columns_of_the_file_keep_their_names_and_their_order() {
         let view = of_two_losses(ReplayStatus::default(), Some(LearnerStatus::default()));
-        let cells = cells(&view).into_iter();
-        let names: Vec<_> = cells.map(|(name, _)| name).collect();
+        let names: Vec<_> = cells(&view).into_iter().map(|(name, _)| name).collect();
         let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
                       dim_3t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon";
         assert!(names.join(",").starts_with(before), "{names:?}");

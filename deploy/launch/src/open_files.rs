@@ -43,16 +43,14 @@ pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
         true => (of_server, "the replay server"),
         false => (of_launcher, "the launcher"),
     };
-    let whose = format!("{whose} of a run with {actors} actors");
-    check(needed, &whose).map_err(Usage)
+    check(needed, &format!("{whose} of a run with {actors} actors")).map_err(Usage)
 }
 
 /// Warns if a replay server that is started by hand may not open as many files as the actors take that its settings know of.
 pub fn warn_of_server(config: &RunConfig) {
     let actors = u64::from(config.local.actors);
     let needed = of_server(actors, config.transport.shared_memory);
-    let whose = format!("a replay server for {actors} actors");
-    if let Err(why) = check(needed, &whose) {
+    if let Err(why) = check(needed, &format!("a replay server for {actors} actors")) {
         tracing::warn!("{why}");
     }
 }

@@ -138,10 +138,7 @@ mod tests {
 
     #[test]
     fn more_cores_and_less_to_learn_take_less_time() {
-        let time = |agent, cores| {
-            let config = config("paper", "procgen:bigfish", agent, &[]);
-            estimate(&config, cores)
-        };
+        let time = |agent, cores| estimate(&config("paper", "procgen:bigfish", agent, &[]), cores);
         assert!(time("driml-ada", 4) < time("driml-ada", 2));
         let time = |agent| time(agent, 2);
         let ascending = ["c51", "driml-ada", "driml-fix", "cpc"].map(time);

@@ -202,10 +202,8 @@ mod tests {
                 .to_described_safetensors(StoredAs::F16, DESCRIPTION, &description.to_string())
                 .unwrap();
             let text = said(&[("chain", &bytes[..])], "chain");
-            assert!(
-                text.contains(why) && text.contains("pretrained:chain"),
-                "{text}"
-            );
+            let is_told = text.contains(why) && text.contains("pretrained:chain");
+            assert!(is_told, "{text}");
         }
         mixed.network = untrained("mspacman", "c51").network;
         let bytes = export(&mixed).unwrap();

@@ -27,9 +27,8 @@ pub fn remove_own() {
 /// The segments that a process has in its memory.
 fn segments(pid: &str) -> BTreeSet<PathBuf> {
     let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default();
-    let paths = maps
-        .lines()
-        .filter_map(|line| line.split_whitespace().nth(5));
+    let lines = maps.lines();
+    let paths = lines.filter_map(|line| line.split_whitespace().nth(5));
     let segments = paths.filter(|it| it.starts_with(FOLDER) && it.ends_with(EXTENSION));
     segments.map(PathBuf::from).collect()
 }

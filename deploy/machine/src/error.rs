@@ -30,8 +30,7 @@ pub struct Interrupted;
 /// ` (did you mean "..."?)` with the candidate most like `name`, or nothing if none is near.
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
     let distance = |candidate: &str| strsim::levenshtein(name, candidate);
-    let nearest = candidates.into_iter().min_by_key(|it| distance(it));
-    match nearest {
+    match candidates.into_iter().min_by_key(|it| distance(it)) {
         Some(best) if distance(best) <= 1 + name.len() / 4 => format!(" (did you mean {best:?}?)"),
         _ => String::new(),
     }

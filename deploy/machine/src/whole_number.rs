@@ -72,10 +72,8 @@ mod tests {
             "1e1e1", "0x10",
         ] {
             let said = read(text).unwrap_err();
-            assert!(
-                said.contains("is not a whole number; write one as"),
-                "{text}: {said}"
-            );
+            let is_told = said.contains("is not a whole number; write one as");
+            assert!(is_told, "{text}: {said}");
         }
         for text in ["18446744073709551616", "1e20", "1e99999999"] {
             assert!(read(text).unwrap_err().contains("is more than"), "{text}");

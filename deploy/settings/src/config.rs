@@ -127,9 +127,8 @@ impl RunConfig {
     pub fn action_names(&self) -> Vec<String> {
         let actions = self.world.actions(self.actor.actions).into_iter();
         let names = self.world.action_names();
-        actions
-            .map(|it| names[usize::from(it)].to_owned())
-            .collect()
+        let name = |action: u8| names[usize::from(action)].to_owned();
+        actions.map(name).collect()
     }
 
     /// Transitions of the whole run.

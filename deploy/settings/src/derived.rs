@@ -181,8 +181,7 @@ fn beta_updates(table: &mut Table) {
     };
     // What is missing, or no number above 0, its own check says.
     if let Some(updates) = updates().filter(|updates| updates.is_finite() && *updates > 0.0) {
-        let whole = (updates as i64).max(1);
-        put(table, PATH, Value::Integer(whole));
+        put(table, PATH, Value::Integer((updates as i64).max(1)));
     }
 }
 
@@ -202,9 +201,8 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
 
 /// Reads the text of a file that driml wrote. What it says of what follows must be what follows.
 pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
-    let read: Table = text
-        .parse()
-        .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
+    let read = text.parse::<Table>();
+    let read = read.map_err(|e| usage!("{name} is not TOML: {}", e.message()))?;
     let mut right = read.clone();
     derive(&mut right).map_err(|e| usage!("{name}: {e}"))?;
     for (path, how) in all_that_follows() {
@@ -225,10 +223,9 @@ pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
 pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').unwrap_or((path, ""));
     let value = table.get(first)?;
-    if rest.is_empty() {
-        Some(value)
-    } else {
-        find(value.as_table()?, rest)
+    match rest {
+        "" => Some(value),
+        rest => find(value.as_table()?, rest),
     }
 }
 
@@ -239,9 +236,8 @@ pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
             table.insert(path.into(), value);
         }
         Some((first, rest)) => {
-            let inner = table
-                .entry(first)
-                .or_insert_with(|| Value::Table(Table::new()));
+            let new = || Value::Table(Table::new());
+            let inner = table.entry(first).or_insert_with(new);
             if let Some(inner) = inner.as_table_mut() {
                 put(inner, rest, value);
             }

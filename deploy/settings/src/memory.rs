@@ -65,10 +65,8 @@ pub(crate) fn fit(
     }
     replay.capacity_transitions = capacity;
     // A replay that holds the whole run anyway is as good as a larger one.
-    if replay
-        .transitions_max
-        .is_none_or(|frames| frames > capacity)
-    {
+    let of_run = replay.transitions_max;
+    if of_run.is_none_or(|frames| frames > capacity) {
         config.notes.push(format!(
             "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
         ));

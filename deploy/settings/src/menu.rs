@@ -64,10 +64,8 @@ fn lambdas(table: &Table) -> String {
     let all = find(table, "learner.update.lambda").and_then(Value::as_table);
     let weighs = |value: &Value| value.as_float().is_some_and(|value| value > 0.0);
     let some = all.into_iter().flatten().filter(|(_, value)| weighs(value));
-    let texts: Vec<_> = some
-        .map(|(pair, value)| format!("{pair} {value}"))
-        .collect();
-    texts.join(", ")
+    let text = |(pair, value): (&String, &Value)| format!("{pair} {value}");
+    some.map(text).collect::<Vec<_>>().join(", ")
 }
 
 /// The resolved settings, each with its source.
@@ -220,10 +218,8 @@ mod tests {
     #[test]
     fn comments_are_found_beside_above_and_below() {
         let text = "# of the file\n\n[a]\nx = 1   # one\ny = 2   # two,\n        # and more\n# above\nz = 3\n";
-        let found = comments(text);
-        let found = found
-            .iter()
-            .map(|(path, comment)| format!("{path}: {comment}"));
+        let found = comments(text).into_iter();
+        let found = found.map(|(path, comment)| format!("{path}: {comment}"));
         let expected = ["a.x: one", "a.y: two, and more", "a.z: above"];
         assert_eq!(found.collect::<Vec<_>>(), expected);
     }

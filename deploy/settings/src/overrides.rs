@@ -18,9 +18,8 @@ impl Override {
     /// Reads `key=value`; a value that is not TOML is taken as a word.
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form = "--set takes table.key=value, such as learner.update.adam.lr=1e-4";
-        let (path, value) = text
-            .split_once('=')
-            .ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
+        let parts = text.split_once('=');
+        let (path, value) = parts.ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
         let (path, value) = (path.trim(), value.trim());
         if path.split('.').any(|key| key.trim().is_empty()) {
             return Err(usage!("--set {text:?} has no key before '='; {form}"));
@@ -40,8 +39,7 @@ impl Override {
     /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
     pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
         let unknown = self.unknown(table);
-        let split = self.path.rsplit_once('.');
-        let (tables, key) = split.ok_or_else(|| unknown.clone())?;
+        let (tables, key) = self.path.rsplit_once('.').ok_or_else(|| unknown.clone())?;
         let mut inner = table;
         for name in tables.split('.') {
             let found = inner.get_mut(name).and_then(Value::as_table_mut);

@@ -142,10 +142,8 @@ pub fn register(agents: Vec<Agent>) {
 
 /// Every agent, with those that the program added.
 pub(crate) fn agents() -> Vec<&'static Agent> {
-    AGENTS
-        .iter()
-        .chain(CUSTOM.get().into_iter().flatten())
-        .collect()
+    let custom = CUSTOM.get().into_iter().flatten();
+    AGENTS.iter().chain(custom).collect()
 }
 
 /// One for each kind of world in the registry of worlds.
@@ -171,9 +169,8 @@ fn world_layer(world: WorldName) -> Layer {
 /// A world by its name, or by its game's.
 pub fn world(name: &str) -> Result<WorldName, Usage> {
     let game = format!("procgen:{name}");
-    let known = name
-        .parse::<WorldName>()
-        .or_else(|e| game.parse().map_err(|_| e));
+    let known = name.parse::<WorldName>();
+    let known = known.or_else(|e| game.parse().map_err(|_| e));
     known.map_err(|e| Usage(e.to_string()))
 }
 

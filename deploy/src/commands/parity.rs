@@ -35,10 +35,7 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }
-    anyhow::ensure!(
-        failed == 0,
-        "{failed} of {} files are out of tolerance",
-        args.files.len()
-    );
+    let all = args.files.len();
+    anyhow::ensure!(failed == 0, "{failed} of {all} files are out of tolerance");
     Ok(())
 }

@@ -2,13 +2,12 @@
 
 use std::path::PathBuf;
 
-use anyhow::ensure;
 use clap::{ArgGroup, Args};
 use driml_launch::{
     endpoint::{NAMESPACE, check_endpoints},
     run_folder::RunFolder,
     view::Poller,
-    watch::{self, Live, Outputs, Over, endpoints_of},
+    watch::{self, Asked, WatchFlags, endpoints_of},
 };
 use driml_protocol::tls::Role;
 
@@ -35,22 +34,8 @@ pub(crate) struct LookFlags {
 pub(crate) struct WatchArgs {
     #[command(flatten)]
     look: LookFlags,
-    /// Write settings, metrics and summary into this folder; a folder of the same run is continued
-    #[arg(long, value_name = "DIR")]
-    pub(crate) run_dir: Option<PathBuf>,
-    /// Write TensorBoard events into that folder
-    #[arg(long, requires = "run_dir")]
-    pub(crate) tensorboard: bool,
-    /// Print the page of `driml status` and exit: with code 0 if no process is missing, else 1
-    #[arg(long, conflicts_with = "run_dir")]
-    pub(crate) once: bool,
-    /// With --once, print one JSON object
-    #[arg(long, requires = "once")]
-    pub(crate) json: bool,
-    /// Replace this file with the metrics in Prometheus' text format, once a second; for node_exporter's textfile collector, which
-    /// reads files named *.prom
-    #[arg(long, value_name = "FILE")]
-    pub(crate) prometheus: Option<PathBuf>,
+    #[command(flatten)]
+    flags: WatchFlags,
 }
 
 #[derive(Debug, Args)]
@@ -66,33 +51,7 @@ pub(crate) struct StatusArgs {
 }
 
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    let opened = args.look.open();
-    if !matches!(opened, Ok(Ok(_)))
-        && let Some(path) = &args.prometheus
-    {
-        watch::write_down(path)?;
-    }
-    let poller = match opened? {
-        Ok(poller) => poller,
-        Err(over) => {
-            over.print(args.json)?;
-            let is_well = over.is_well || !args.once;
-            ensure!(
-                is_well,
-                "the run needs attention: it is not finished and no process of it runs"
-            );
-            return Ok(());
-        }
-    };
-    let outputs = Outputs {
-        run_dir: args.run_dir.as_ref().map(RunFolder::new),
-        tensorboard: args.tensorboard,
-        prometheus: args.prometheus.clone(),
-    };
-    match args.once {
-        true => watch::once(poller, &outputs, args.json),
-        false => watch::run(poller, &outputs),
-    }
+    watch::run(args.look.open(), &args.flags)
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
@@ -107,27 +66,26 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
 
 impl LookFlags {
     /// A connection to the run, or how it stands if it cannot be asked.
-    fn open(&self) -> anyhow::Result<Result<Poller, Box<Over>>> {
+    fn open(&self) -> anyhow::Result<Asked<Poller>> {
         check_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
-        let endpoints = match self.live()? {
-            None => self.connect.clone(),
-            Some(Live::At(endpoints)) => endpoints,
-            Some(Live::Over(over)) => return Ok(Err(over)),
+        let endpoints = match self.endpoints()? {
+            Ok(endpoints) => endpoints,
+            Err(over) => return Ok(Err(over)),
         };
         let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
         // It may have ended meanwhile.
         if opened.is_err()
-            && let Some(Live::Over(over)) = self.live()?
+            && let Err(over) = self.endpoints()?
         {
             return Ok(Err(over));
         }
         opened.map(Ok)
     }
 
-    /// How the run stands by its folder, if one was given.
-    fn live(&self) -> anyhow::Result<Option<Live>> {
-        self.folder().map(|it| endpoints_of(&it)).transpose()
+    fn endpoints(&self) -> anyhow::Result<Asked<Vec<String>>> {
+        let of_folder = self.folder().map(|it| endpoints_of(&it));
+        of_folder.unwrap_or_else(|| Ok(Ok(self.connect.clone())))
     }
 
     fn folder(&self) -> Option<RunFolder> {

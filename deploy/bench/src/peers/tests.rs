@@ -34,10 +34,8 @@ fn a_ratio_is_the_median_of_the_rounds_ratios() {
         sides.add_theirs("PyTorch 9".into(), [("C51".into(), value)].into());
     }
     let found = row(&pair("C51", None), &sides).unwrap();
-    assert_eq!(
-        (found.ours, found.theirs, found.ratio),
-        (6.0, Some(3.0), Some(2.0))
-    );
+    let numbers = (found.ours, found.theirs, found.ratio);
+    assert_eq!(numbers, (6.0, Some(3.0), Some(2.0)));
     assert_eq!((found.peer.as_str(), found.skipped), ("PyTorch 9", None));
     let found = row(&pair("stock", Some("candle")), &sides).unwrap();
     assert_eq!((found.ratio, found.peer.as_str()), (Some(12.0), "candle"));

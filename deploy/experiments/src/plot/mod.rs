@@ -61,10 +61,9 @@ const OVERVIEW: [&str; 7] = [
 /// A folder that is not a run's, a column that is not there, a file that cannot be written.
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     Format::of(&args.out).map_err(|e| usage!("{e}"))?;
-    let figure = if args.affinity {
-        affinity::figure(&folders(args)?)?
-    } else {
-        charts(args)?
+    let figure = match args.affinity {
+        true => affinity::figure(&folders(args)?)?,
+        false => charts(args)?,
     };
     let look = if args.plain { Look::Plain } else { Look::Card };
     figure.save(&args.out, look)?;

@@ -101,8 +101,7 @@ mod tests {
             (many, "", "a=1, b=1, c=1, and 2 more settings"),
         ] {
             let [own, other] = [own, other].map(|text| flat(&text.parse().unwrap()));
-            let found = differences(&own, &[&other, &own]);
-            assert_eq!(found.join(", "), expected);
+            assert_eq!(differences(&own, &[&other, &own]).join(", "), expected);
         }
     }
 }

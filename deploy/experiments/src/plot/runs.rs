@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use driml_launch::run_folder::{RunFolder, Table};
 use driml_machine::error::{Usage, nearest, usage};
 use driml_settings::leaves;
@@ -44,13 +44,13 @@ impl Run {
         let text = std::fs::read(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
         let columns = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
-        if columns.place("frames").is_none() {
-            return Err(usage!(
+        ensure!(
+            columns.place("frames").is_some(),
+            usage!(
                 "{} has no column \"frames\": it is not a run's",
                 path.display()
             )
-            .into());
-        }
+        );
         let (settings, seed) = settings(&folder.config()).unzip();
         let word = |name: &str| settings.as_ref()?.get(name);
         let what = word("run.world").zip(word("run.agent"));
@@ -124,11 +124,11 @@ impl Run {
 
     /// The columns of auxiliary losses: those between C51's loss and the total.
     pub(super) fn auxiliary_losses(&self) -> &[String] {
-        let place = |name: &str| self.columns.header.iter().position(|it| it == name);
-        let between = place(C51_LOSS).zip(place(TOTAL_LOSS));
-        between
-            .and_then(|(first, last)| self.columns.header.get(first + 1..last))
-            .unwrap_or_default()
+        let ends = [C51_LOSS, TOTAL_LOSS].map(|name| self.columns.place(name));
+        match ends {
+            [Some(first), Some(last)] if first < last => &self.columns.header[first + 1..last],
+            _ => &[],
+        }
     }
 
     /// Whether the column is there and not empty.

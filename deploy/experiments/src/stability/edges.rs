@@ -54,9 +54,8 @@ pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
         }
         _ => {
             let size = finite(rng);
-            (0..count)
-                .map(|_| size * rng.random_range(-1.0f32..1.0))
-                .collect()
+            let share = |_| size * rng.random_range(-1.0f32..1.0);
+            (0..count).map(share).collect()
         }
     }
 }
@@ -206,10 +205,8 @@ pub(super) fn not_finite(rng: &mut impl Rng) -> f32 {
 
 /// One of these.
 pub(super) fn one_of<T: Clone>(values: &[T], rng: &mut impl Rng) -> T {
-    let value = values.choose(rng);
-    value
-        .cloned()
-        .expect("a list that is written out has an item")
+    let value = values.choose(rng).cloned();
+    value.expect("a list that is written out has an item")
 }
 
 /// Displays the first of `values`, and how many they are.

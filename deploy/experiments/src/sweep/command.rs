@@ -200,10 +200,8 @@ fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
             number.map_or(String::new(), |it| format!("{it:.decimals$}"))
         });
         let values = cell.iter().map(|it| it.1.clone());
-        values
-            .chain([runs.len().to_string()])
-            .chain(numbers)
-            .collect()
+        let row = values.chain([runs.len().to_string()]).chain(numbers);
+        row.collect()
     };
     cells.iter().enumerate().map(row).collect()
 }

@@ -12,7 +12,7 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::{
-    managed_process::exit_with_this_process,
+    managed_process::{ask_to_stop, exit_with_this_process},
     resume::{self, Found},
     run_folder::{Progress as RunProgress, progress as how_far},
 };
@@ -23,10 +23,6 @@ use driml_machine::{
 };
 use driml_protocol::lock_file;
 use driml_settings::flags::Flags;
-use nix::{
-    sys::signal::{Signal, kill},
-    unistd::Pid,
-};
 
 use super::{
     plan::{Made, Planned, PlannedRun},
@@ -139,18 +135,15 @@ impl Queue {
             while self.running.len() < self.jobs as usize
                 && let Some(next) = self.waiting.pop_front()
             {
-                let running = self.start(next, progress)?;
-                self.running.extend(running);
+                self.running.extend(self.start(next, progress)?);
             }
             if self.running.is_empty() {
                 return Ok(());
             }
             let names = self.running.iter().map(|it| it.job.plan.name.as_str());
             let waiting = self.waiting.len();
-            progress.begin(&format!(
-                "{}; {waiting} waiting",
-                names.collect::<Vec<_>>().join(", ")
-            ));
+            let names = names.collect::<Vec<_>>().join(", ");
+            progress.begin(&format!("{names}; {waiting} waiting"));
             std::thread::sleep(POLL);
             self.look(progress)?;
             progress.advance(0)?;
@@ -168,7 +161,7 @@ impl Queue {
             progress.advance(fresh)?;
             if enough && !running.enough {
                 running.enough = true;
-                signal(&running.child, Signal::SIGTERM);
+                ask_to_stop(&running.child, &running.job.plan.name);
             }
             let ended = running.child.try_wait();
             match ended.with_context(|| format!("waiting for {}", running.job.plan.name))? {
@@ -342,7 +335,7 @@ impl Queue {
         }
         progress.line("stopping the runs; the same command resumes those that are not finished");
         for running in &self.running {
-            signal(&running.child, Signal::SIGTERM);
+            ask_to_stop(&running.child, &running.job.plan.name);
         }
         let deadline = Instant::now() + DRAIN_MAX;
         while !self.running.is_empty() {
@@ -358,13 +351,6 @@ impl Queue {
                 .retain_mut(|running| matches!(running.child.try_wait(), Ok(None)));
             std::thread::sleep(POLL);
         }
-    }
-}
-
-fn signal(child: &Child, signal: Signal) {
-    // It was not waited for yet, so the number is its own.
-    if let Err(e) = kill(Pid::from_raw(child.id() as i32), signal) {
-        tracing::debug!("sending {signal}: {e}");
     }
 }
 

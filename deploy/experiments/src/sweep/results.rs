@@ -90,9 +90,8 @@ mod tests {
         let folder = RunFolder::new(folder.path());
         assert_eq!(players(&folder, 3).unwrap(), [Which::Newest]);
         for updates in [1, 2, 3, 4] {
-            let path = folder
-                .checkpoints()
-                .join(format!("checkpoint-{updates:012}"));
+            let name = format!("checkpoint-{updates:012}");
+            let path = folder.checkpoints().join(name);
             fs::create_dir_all(path).unwrap();
         }
         let newest = [4, 3, 2].map(Which::After);

@@ -296,13 +296,10 @@ impl Launch<'_> {
         let error = result.as_ref().err();
         let error = error.map_or(String::new(), |e| format!("{e:#}"));
         let mut warnings: Vec<_> = actors.into_iter().chain(others).collect();
-        let failed = failed.filter(|it| !warnings.contains(it));
-        warnings.extend(failed);
-        for warning in warnings.iter().filter(|it| !error.contains(*it)) {
-            self.display
-                .screen
-                .line(&format!("while stopping, {warning}"));
-        }
+        warnings.extend(failed.filter(|it| !warnings.contains(it)));
+        let new = warnings.iter().filter(|it| !error.contains(*it));
+        let lines = new.map(|warning| format!("while stopping, {warning}"));
+        self.display.screen.lines(lines);
         result
     }
 

@@ -92,8 +92,7 @@ impl Launch<'_> {
     /// Starts the processes up to this number that are not started yet.
     pub(super) fn start_up_to(&mut self, count: usize) -> anyhow::Result<()> {
         for number in self.processes.len()..count {
-            let process = self.start(number)?;
-            self.processes.push(process);
+            self.processes.push(self.start(number)?);
         }
         Ok(())
     }

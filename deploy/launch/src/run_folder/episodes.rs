@@ -159,9 +159,7 @@ impl TrainingEpisodes {
 
     /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
     fn cut(&mut self, rows: &mut Table, frames_max: u64) -> anyhow::Result<()> {
-        let all = rows.rows.len();
-        rows.keep(&self.folder.episodes(), |row: Row| row.frames <= frames_max)?;
-        if rows.rows.len() < all {
+        if rows.keep(&self.folder.episodes(), |row: Row| row.frames <= frames_max)? {
             *self = Self::begin(&self.folder, rows.clone(), None)?;
         }
         Ok(())

@@ -63,10 +63,8 @@ impl RunRecorder {
         let resume_point = resumed.unwrap_or_default();
         let earlier = Uncounted::read(folder);
         let summarised = Summary::read(folder).map_or(0.0, |it| it.wall_seconds);
-        let seconds_before = earlier
-            .as_ref()
-            .map_or(0.0, |it| it.seconds)
-            .max(summarised);
+        let noted = earlier.as_ref().map_or(0.0, |it| it.seconds);
+        let seconds_before = noted.max(summarised);
         let kept = resume_point.replay_is_kept;
         let kept = kept.then_some(earlier).transpose()?;
         let (rows, seconds) = match resumed {
@@ -178,8 +176,7 @@ impl RunRecorder {
         let points = points(view);
         let events = self.events.as_mut();
         let drawn = events.and_then(|it| it.add(&points, &view.replay, view.learner.finished));
-        let written = self.metrics.add([row]);
-        written.into_iter().chain(drawn).collect()
+        self.metrics.add([row]).into_iter().chain(drawn).collect()
     }
 
     /// What to say about rows that could not be written up to now.

@@ -206,10 +206,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
             fs::write(run.metrics(), text).unwrap();
         }
         let recorder = open(&run, &["actor-0"], Some(point(31))).unwrap();
-        let rows = |name: &str| {
-            let table = Table::read(&run.path().join(name)).unwrap();
-            table.rows.len()
-        };
+        let rows = |name: &str| Table::read(&run.path().join(name)).unwrap().rows.len();
         assert_eq!(rows("episodes.csv"), 2, "{what}");
         assert_eq!(rows("episodes.aside-1.csv"), 1, "{what}");
         let rows_of_metrics = (rows("metrics.csv"), rows("metrics.aside-1.csv"));

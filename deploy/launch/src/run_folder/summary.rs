@@ -43,7 +43,8 @@ impl Earned {
     /// Of these returns, at least one; both ends are the mean of a single one.
     pub(crate) fn of(returns: &[f64]) -> Self {
         let (mean, _) = mean_and_deviation(returns);
-        let (low, high) = interval(returns).unwrap_or((mean, mean));
+        let ends = interval(returns).and_then(|it| it.ends);
+        let (low, high) = ends.unwrap_or((mean, mean));
         Self { mean, low, high }
     }
 }
@@ -197,8 +198,7 @@ impl Summary {
             plot(run_dir),
         ];
         if is_resumable {
-            let longer = format!("train --resume {run} --frames {more}");
-            next.push((longer, "trains on"));
+            next.push((format!("train --resume {run} --frames {more}"), "trains on"));
         }
         self.earned() + &commands(&next)
     }

@@ -24,10 +24,8 @@ fn statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesSt
 
 /// The status of the learner and of all actors, each with the endpoint of the server that it is connected to.
 fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
-    statuses(view).flat_map(|(server, account)| {
-        let processes = account.processes.iter();
-        processes.map(|it| (&*server.endpoint, it))
-    })
+    statuses(view)
+        .flat_map(|(server, account)| account.processes.iter().map(|it| (&*server.endpoint, it)))
 }
 
 /// Which side waits at the rate limiter and since when.
@@ -87,10 +85,8 @@ fn of_disk((server, account): (&ServerAnswer, &ProcessesStatus)) -> Option<Strin
 }
 
 fn of_learner(view: &RunView) -> Option<String> {
-    let servers = view.servers.iter();
-    let connects: String = servers
-        .map(|it| format!(" --connect {}", it.endpoint))
-        .collect();
+    let connect = |it: &ServerAnswer| format!(" --connect {}", it.endpoint);
+    let connects: String = view.servers.iter().map(connect).collect();
     let tls = certificates(&view.servers[0].endpoint);
     let command = format!("`driml learner{connects}{tls} --run-dir DIR`");
     match processes(view).find(|(_, process)| process.who == ProcessName::Learner) {

@@ -111,9 +111,8 @@ struct Page {
 impl Page {
     /// A metric: its head, and a sample for each member that has a value; nothing if none has. `label` tells several members apart.
     fn metric(&mut self, kind: &str, name: &str, help: &str, label: &str, members: &[Member]) {
-        let known = members
-            .iter()
-            .filter_map(|(member, value)| Some((member, (*value)?)));
+        let members = members.iter();
+        let known = members.filter_map(|(member, value)| Some((member, (*value)?)));
         for (nth, (member, value)) in known.enumerate() {
             if nth == 0 {
                 self.text += &format!("# HELP driml_{name} {help}\n# TYPE driml_{name} {kind}\n");

@@ -56,10 +56,8 @@ pub(crate) fn page(view: &RunView) -> String {
         notes.extend(warning("replay-server", account.last_warning.as_ref()));
         for process in account.processes.iter().take(ACTORS_MAX + 1) {
             rows.push(process_row(process));
-            notes.extend(warning(
-                &process.who.to_string(),
-                process.last_warning.as_ref(),
-            ));
+            let who = process.who.to_string();
+            notes.extend(warning(&who, process.last_warning.as_ref()));
         }
         if let more @ 1.. = account.processes.len().saturating_sub(ACTORS_MAX + 1) {
             rows.push(vec![format!("and {more} more actors")]);
@@ -96,10 +94,8 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
         1 => "replay on disk".to_owned(),
         _ => format!("{}, replay on disk", server.endpoint),
     };
-    let most = log
-        .bytes_max
-        .map(|max| format!(" of at most {:.1}", mib(max)));
-    let most = most.unwrap_or_default();
+    let at_most = |max| format!(" of at most {:.1}", mib(max));
+    let most = log.bytes_max.map(at_most).unwrap_or_default();
     let bytes = mib(log.bytes);
     let flushed = seconds(log.flushed_s);
     let mut line = format!(
@@ -163,15 +159,14 @@ fn process_row(process: &ProcessStatus) -> Vec<String> {
             false => doing,
         }
     });
+    let version = process.weights_version.map(|it| it.to_string());
     vec![
         process.who.to_string(),
         state,
         doing,
         ago(process.last_seen_s),
         process.held_s.map_or("-".into(), seconds),
-        process
-            .weights_version
-            .map_or("-".into(), |it| it.to_string()),
+        version.unwrap_or_else(|| "-".into()),
         process.lives.to_string(),
     ]
 }

@@ -81,8 +81,7 @@ impl Poller {
                 client: RunClient::new(session, keys.clone(), hash),
             });
         }
-        let config = config.context("no endpoint to ask")?;
-        Ok(Self::new(&config, servers))
+        Ok(Self::new(&config.context("no endpoint to ask")?, servers))
     }
 
     /// Asks all processes. Those that do not answer are named in the view.
@@ -204,8 +203,7 @@ fn settings(
         Ok(run_info) => run_info.config_toml,
         Err(SessionError::Recovering(recovering)) => recovering.config_toml,
         Err(SessionError::Unreadable { why, .. }) => {
-            let what = format!("the run info of the replay server on {endpoint}");
-            return Err(why).context(what);
+            return Err(why).context(format!("the run info of the replay server on {endpoint}"));
         }
         Err(SessionError::NoAnswerer { .. }) => {
             bail!(usage!(

@@ -3,14 +3,14 @@
 
 mod watched;
 
-use std::{path::Path, time::Duration};
+use std::{path::PathBuf, time::Duration};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
+use clap::Args;
 use driml_machine::error::{Interrupted, usage};
 use driml_protocol::{LogLimiter, Shutdown, atomic_write, reach};
 use serde::Serialize;
 
-pub use self::watched::Outputs;
 use self::watched::Watched;
 use crate::{
     chosen::config_of,
@@ -18,6 +18,30 @@ use crate::{
     run_folder::{Outcome, Progress, RunFolder, Summary, commands, plot, progress},
     view::{Poller, PrometheusFile, json, needed, page, recovery},
 };
+
+/// What `driml watch` does with a run.
+#[derive(Debug, Args)]
+pub struct WatchFlags {
+    /// Write settings, metrics and summary into this folder; a folder of the same run is continued
+    #[arg(long, value_name = "DIR")]
+    run_dir: Option<PathBuf>,
+    /// Write TensorBoard events into that folder
+    #[arg(long, requires = "run_dir")]
+    tensorboard: bool,
+    /// Print the page of `driml status` and exit: with code 0 if no process is missing, else 1
+    #[arg(long, conflicts_with = "run_dir")]
+    once: bool,
+    /// With --once, print one JSON object
+    #[arg(long, requires = "once")]
+    json: bool,
+    /// Replace this file with the metrics in Prometheus' text format, once a second; for node_exporter's textfile collector, which
+    /// reads files named *.prom
+    #[arg(long, value_name = "FILE")]
+    prometheus: Option<PathBuf>,
+}
+
+/// A connection to a run, or how it stands if no process of it can be asked.
+pub type Asked<T> = Result<T, Box<Over>>;
 
 const POLL: Duration = Duration::from_secs(1);
 /// The same once all frames are in: the learner's last word is not to be missed, as its process may end soon after.
@@ -44,7 +68,7 @@ pub fn look(
     loop {
         let view = poller.ask();
         if let Some(folder) = folder.filter(|_| view.is_gone())
-            && let Live::Over(over) = endpoints_of(folder)?
+            && let Err(over) = endpoints_of(folder)?
         {
             return over.print(as_json);
         }
@@ -59,31 +83,45 @@ pub fn look(
     }
 }
 
-/// [`look`] once, for scripts and monitors.
+/// Watches a run that was `opened`: shows and records it until it is over, or looks at it once, for scripts and monitors. The file for
+/// Prometheus tells whether it answers.
 ///
 /// # Errors
-/// The run is not well: a process is missing, gone or unresponsive. A file that cannot be written; [`Interrupted`].
-pub fn once(mut poller: Poller, outputs: &Outputs, as_json: bool) -> anyhow::Result<()> {
-    look(&mut poller, None, false, as_json)?;
+/// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
+/// that serve another run; where it is looked at once, a run that is not well: a process is missing, gone or unresponsive.
+pub fn run(opened: anyhow::Result<Asked<Poller>>, flags: &WatchFlags) -> anyhow::Result<()> {
+    if !matches!(opened, Ok(Ok(_)))
+        && let Some(path) = &flags.prometheus
+    {
+        let written = atomic_write::write(path, b"# TYPE driml_up gauge\ndriml_up 0\n");
+        written.with_context(|| format!("writing {}", path.display()))?;
+    }
+    match opened? {
+        Ok(poller) if flags.once => once(poller, flags),
+        Ok(poller) => watch(poller, flags),
+        Err(over) => {
+            over.print(flags.json)?;
+            ensure!(
+                over.is_well || !flags.once,
+                "the run needs attention: it is not finished and no process of it runs"
+            );
+            Ok(())
+        }
+    }
+}
+
+fn once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
+    look(&mut poller, None, false, flags.json)?;
     poller.close();
-    if let Some(path) = &outputs.prometheus
+    if let Some(path) = &flags.prometheus
         && let Some(failed) = PrometheusFile::new(path).write(&poller.view)
     {
         bail!("{failed}");
     }
-    match needed(&poller.view) {
-        needed if needed.is_empty() => Ok(()),
-        needed => bail!("the run needs attention: {}", needed.join("; ")),
-    }
-}
-
-/// Writes into the file for Prometheus that the run does not answer.
-///
-/// # Errors
-/// The file cannot be written.
-pub fn write_down(path: &Path) -> anyhow::Result<()> {
-    let written = atomic_write::write(path, b"# TYPE driml_up gauge\ndriml_up 0\n");
-    written.with_context(|| format!("writing {}", path.display()))
+    let needed = needed(&poller.view);
+    let all = needed.join("; ");
+    ensure!(needed.is_empty(), "the run needs attention: {all}");
+    Ok(())
 }
 
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
@@ -114,25 +152,21 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
 }
 
 /// Shows and records a run until it is over, or until Ctrl-C, which leaves the run alone.
-///
-/// # Errors
-/// A folder that cannot be written to; replay servers that do not answer for as long as the run's processes wait for them, or that
-/// serve another run; [`Interrupted`].
-pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
+fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
+    let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
     poller.ask();
-    let mut file = outputs.prometheus.as_deref().map(PrometheusFile::new);
+    let mut file = flags.prometheus.as_deref().map(PrometheusFile::new);
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
         bail!(usage!("--prometheus: {failed}"));
     }
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
-    let is_unknown =
-        outputs.run_dir.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
+    let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
     if is_unknown || poller.view.recovering().next().is_some() {
         // What the run has done so far is not known before.
         wait_until_known(&mut poller, &interrupted)?;
     }
-    let mut watched = Watched::new(&poller, outputs)?;
+    let mut watched = Watched::new(&poller, folder.as_ref(), flags.tensorboard)?;
     let ended = loop {
         match watched.take(&mut poller) {
             Ok(false) => {}
@@ -158,7 +192,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
         console::line("the run continues without being watched");
         return Err(Interrupted.into());
     }
-    match &outputs.run_dir {
+    match &folder {
         Some(folder) => {
             console::print(&summary.describe(folder))?;
             summary.write(folder)?;
@@ -168,15 +202,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
     }
 }
 
-/// Whether the run in a folder can be asked.
-pub enum Live {
-    /// The endpoints of its replay servers.
-    At(Vec<String>),
-    /// No process can be asked.
-    Over(Box<Over>),
-}
-
-/// How a run stands that cannot be asked.
+/// How a run stands of which no process can be asked.
 #[derive(Serialize)]
 pub struct Over {
     /// Whether it is complete and its processes have ended.
@@ -188,7 +214,7 @@ pub struct Over {
     details: String,
     /// Whether it is finished, or will be without anybody's help.
     #[serde(skip)]
-    pub is_well: bool,
+    is_well: bool,
 }
 
 impl Over {
@@ -204,17 +230,17 @@ impl Over {
     }
 }
 
-/// Looks into the folder of a run.
+/// Looks into the folder of a run for the endpoints of its replay servers.
 ///
 /// # Errors
 /// It is not a run's, or one whose processes were started by hand.
-pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
+pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
     let config = config_of(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints());
     let endpoints = endpoints.unwrap_or_default();
     let mut lines = endpoints.lines();
     if lines.any(|it| reach::look(it).is_ok()) {
-        return Ok(Live::At(endpoints.lines().map(str::to_owned).collect()));
+        return Ok(Ok(endpoints.lines().map(str::to_owned).collect()));
     }
     let run = folder.display();
     // A launcher that runs there holds the lock.
@@ -248,7 +274,7 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
             "no process runs in {run}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT"
         );
     }
-    Ok(Live::Over(over))
+    Ok(Err(over))
 }
 
 #[cfg(test)]
@@ -269,8 +295,8 @@ mod tests {
         let endpoint = format!("unixsock-stream/{}", socket.display());
         std::fs::write(folder.endpoints(), &endpoint).unwrap();
         let found = || match endpoints_of(&folder).unwrap() {
-            Live::At(endpoints) => endpoints.join(" "),
-            Live::Over(over) => over.message,
+            Ok(endpoints) => endpoints.join(" "),
+            Err(over) => over.message,
         };
         let listener = UnixListener::bind(&socket).unwrap();
         assert_eq!(found(), endpoint);

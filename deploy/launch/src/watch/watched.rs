@@ -1,10 +1,7 @@
 //! A run that is watched, as far as its answers tell: what is shown of it, what is recorded, and when it is over.
 //! It asks for no more than the episodes that it records.
 
-use std::{
-    path::PathBuf,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use driml_machine::{error::usage, units::duration};
@@ -25,17 +22,6 @@ const FAREWELL_MAX: Duration = Duration::from_secs(5);
 /// Most seconds of a run's clock that are shown: ten years.
 const UP_MAX: f64 = 315_360_000.0;
 
-/// What is left of a run that is watched.
-#[derive(Clone, Debug, Default)]
-pub struct Outputs {
-    /// Where settings, metrics and summary go; none to only look.
-    pub run_dir: Option<RunFolder>,
-    /// Write TensorBoard's events there, too.
-    pub tensorboard: bool,
-    /// Where the metrics go in Prometheus' text format, at each answer.
-    pub prometheus: Option<PathBuf>,
-}
-
 pub(super) struct Watched {
     /// It shows the run from its beginning, as far as that is known.
     pub(super) display: Display,
@@ -43,11 +29,14 @@ pub(super) struct Watched {
 }
 
 impl Watched {
-    /// A run that has been asked once.
-    pub(super) fn new(poller: &Poller, outputs: &Outputs) -> anyhow::Result<Self> {
+    /// A run that has been asked once, recorded in `folder` if there is one, with TensorBoard's `events` on request.
+    pub(super) fn new(
+        poller: &Poller,
+        folder: Option<&RunFolder>,
+        events: bool,
+    ) -> anyhow::Result<Self> {
         let (config, view) = (&poller.config, &poller.view);
-        let folder = outputs.run_dir.as_ref();
-        let recorder = folder.map(|it| record(it, config, view, outputs.tensorboard));
+        let recorder = folder.map(|it| record(it, config, view, events));
         let recorder = recorder.transpose()?;
         let up_s = view.up_s().unwrap_or(0.0).min(UP_MAX);
         let up = Duration::try_from_secs_f64(up_s).unwrap_or_default();
@@ -142,11 +131,10 @@ fn record(
         check_same(folder, config)?;
         resumed = Some(resume_point(folder, view)?);
         if folder.is_locked() {
-            return Err(usage!(
+            bail!(usage!(
                 "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
                 folder.display()
-            )
-            .into());
+            ));
         }
     }
     let processes = process_names(config);

@@ -30,7 +30,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     let machine = Machine::this();
     let [f32, bf16] = Precision::ALL.map(describe_kernels);
     let kernels = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
-    [
+    let all = [
         ("cores", cores(&machine)),
         ("vectors", vectors(floats_at_once())),
         ("kernels", (State::Ok, kernels)),
@@ -38,9 +38,8 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
         ("shared memory", shared_memory(shared_memory::free_bytes())),
         ("locked memory", locked_memory(lockable_bytes())),
         ("disk", disk(runs)),
-    ]
-    .map(|(what, found)| Fact::new(what, found))
-    .into()
+    ];
+    all.map(|(what, found)| Fact::new(what, found)).into()
 }
 
 fn cores(machine: &Machine) -> Found {
@@ -95,20 +94,13 @@ fn memory(machine: &Machine) -> Found {
         gib(replay),
         (replay / FRAME_BYTES) as f64 / 1e6
     );
-    match free {
-        ..MEMORY_MIN => {
-            let least = gib(MEMORY_MIN);
-            (
-                State::Missing,
-                format!("{text}: a run needs {least} at least"),
-            )
-        }
-        MEMORY_MIN..MEMORY_ENOUGH => (
-            State::Note,
-            text + "; --set replay.compression=lz4 makes more fit",
-        ),
-        _ => (State::Ok, text),
-    }
+    let least = format!(": a run needs {} at least", gib(MEMORY_MIN));
+    let (state, advice) = match free {
+        ..MEMORY_MIN => (State::Missing, &*least),
+        MEMORY_MIN..MEMORY_ENOUGH => (State::Note, "; --set replay.compression=lz4 makes more fit"),
+        _ => (State::Ok, ""),
+    };
+    (state, text + advice)
 }
 
 fn shared_memory(free: Result<u64, String>) -> Found {

@@ -11,7 +11,7 @@ use std::path::Path;
 use anyhow::ensure;
 
 use self::fact::{Fact, State};
-use crate::device;
+use crate::device::{self, Gpu};
 
 /// What was found out, for the CPU and for CUDA.
 #[derive(Debug)]
@@ -26,14 +26,12 @@ pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
     cpu.push(Fact::new("Procgen", engine::found()));
     // Training on the CPU needs none.
-    let cuda: Vec<_> = match device::gpus() {
-        Ok(gpus) => gpus
-            .into_iter()
-            .map(|(name, found)| match found {
-                Ok(text) => Fact::new(name, (State::Ok, text)),
-                Err(why) => Fact::new(name, (State::Missing, why)),
-            })
-            .collect(),
+    let of_gpu = |(name, found): Gpu| match found {
+        Ok(text) => Fact::new(name, (State::Ok, text)),
+        Err(why) => Fact::new(name, (State::Missing, why)),
+    };
+    let cuda = match device::gpus() {
+        Ok(gpus) => gpus.into_iter().map(of_gpu).collect(),
         Err(why) => vec![Fact::new("cuda", (State::Note, why))],
     };
     Report {
@@ -64,8 +62,7 @@ impl Report {
     }
 
     fn all(&self) -> impl Iterator<Item = &Fact> {
-        let all = self.cpu.iter().chain(&self.cuda);
-        all.chain(&self.certificates)
+        self.cpu.iter().chain(&self.cuda).chain(&self.certificates)
     }
 
     /// Whether `--device cuda` has something to compute on.

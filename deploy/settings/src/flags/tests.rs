@@ -210,16 +210,13 @@ fn flags_come_before_set_and_both_before_the_machine() {
         envs: Some(2),
         ..frames(7_000, &["run.seed=6"])
     };
-    let config = source("paper", "chain", "c51")
-        .resolve(&flags, &MACHINE)
-        .unwrap();
+    let source = source("paper", "chain", "c51");
+    let config = source.resolve(&flags, &MACHINE).unwrap();
     let (run, local) = (&config.run, &config.local);
     let found = (config.frames(), run.seed, local.actors, config.actor.envs);
     assert_eq!(found, (7_000, 6, 3, 2));
     let too_many = frames(u64::MAX, &[]);
-    let said = source("paper", "chain", "c51")
-        .resolve(&too_many, &MACHINE)
-        .unwrap_err();
+    let said = source.resolve(&too_many, &MACHINE).unwrap_err();
     expect![
         "replay.transitions_max = 18446744073709551615: the largest number is 9223372036854775807"
     ]
@@ -236,9 +233,8 @@ fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
             ..frames(50_000_000, set)
         };
         let config = source("paper", "procgen:heist", "c51").resolve(&flags, &MACHINE);
-        config
-            .map(|it| it.replay.capacity_transitions)
-            .map_err(|e| e.to_string())
+        let capacity = config.map(|it| it.replay.capacity_transitions);
+        capacity.map_err(|e| e.to_string())
     };
     // Actors on other machines take none of its memory, and two shards have that of two machines.
     assert!(of(false, 64, 1, &[]).unwrap_err().contains("64 actors"));

@@ -115,8 +115,7 @@ impl Batch {
 
 fn loss(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rows = cases.of(&[2usize, 3, 17, 256], |rng| rng.random_range(1..12));
-    let bounds = [1e-30, 1e-3, 1.0, 20.0, 1e6, 1e15, 1e17, 1e30];
-    let bound = cases.each(&bounds);
+    let bound = cases.each(&[1e-30, 1e-3, 1.0, 20.0, 1e6, 1e15, 1e17, 1e30]);
     let equal = [0.0, f32::MAX].map(|x| vec![x; rows * rows]);
     let spread = [1.0, 1e4, 1e30].map(|scale| {
         let dot = |i: usize| ((i * 37 % 101) as f32 / 50.0 - 1.0) * scale;

@@ -19,7 +19,7 @@ use super::property::{Property, Settings};
 
 /// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
 pub(super) fn table(settings: &Settings) -> Vec<Property> {
-    [
+    let families = [
         c51::properties(),
         values::properties(),
         info_nce::properties(),
@@ -33,8 +33,6 @@ pub(super) fn table(settings: &Settings) -> Vec<Property> {
         sampling::properties(),
         replay::properties(),
         epsilon::properties(),
-    ]
-    .into_iter()
-    .flatten()
-    .collect()
+    ];
+    families.into_iter().flatten().collect()
 }

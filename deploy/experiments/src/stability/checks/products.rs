@@ -310,8 +310,7 @@ fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
         let shows = may_hide || !spoilt[own.clone()].iter().any(|y| y.is_finite());
         spoilt[own.clone()].copy_from_slice(&before[own.clone()]);
         let kept = [spoilt, after].iter().all(|it| bits(it) == bits(&before));
-        let input = format_args!("{bad} at {at} of {layer:?}");
-        cases.keeps(1, input, shows && kept)?;
+        cases.keeps(1, format_args!("{bad} at {at} of {layer:?}"), shows && kept)?;
     }
     Ok(())
 }

@@ -115,8 +115,7 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         true => one_of(&ends, &mut cases.rng),
         false => End::Running,
     };
-    let ends = (0..count).map(end);
-    let steps: Vec<_> = rewards.into_iter().zip(ends).collect();
+    let steps: Vec<_> = rewards.into_iter().zip((0..count).map(end)).collect();
 
     let rows = 16;
     let spec = RunSpec {

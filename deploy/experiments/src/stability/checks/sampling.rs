@@ -79,9 +79,8 @@ fn probability_of_a_step(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let listed = [0.0, -0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0];
     let mut all: Vec<Option<f32>> = listed.map(Some).to_vec();
     all.resize(all.len() + cases.settings.whole_draws as usize, None);
-    let a = cases
-        .each(&all)
-        .unwrap_or_else(|| probability(&mut cases.rng));
+    let listed = cases.each(&all);
+    let a = listed.unwrap_or_else(|| probability(&mut cases.rng));
     let affinity = affinity(1, vec![a])?;
     let mut every = EveryFloat(0);
     let draws = 1u32 << 24;
@@ -143,10 +142,8 @@ fn deviations(counts: &[u64], law: &[f64]) -> f64 {
     if degrees == 0.0 {
         return 0.0;
     }
-    let terms = cells
-        .iter()
-        .map(|(have, want)| (have - want).powi(2) / want);
-    let square = exact_sum(terms);
+    let term = |(have, want): &(f64, f64)| (have - want).powi(2) / want;
+    let square = exact_sum(cells.iter().map(term));
     let spread = 2.0 / (9.0 * degrees);
     (((square / degrees).cbrt() - (1.0 - spread)) / spread.sqrt()).max(0.0)
 }

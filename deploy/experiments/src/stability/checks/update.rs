@@ -181,15 +181,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gradient_that_is_not_a_number_shows_in_the_median() {
+    fn a_gradient_that_is_not_a_number_and_a_loss_of_0_have_an_error_too() {
+        assert_eq!(loss_error(1e-9, 0.0), 1e-9);
         assert_eq!(median(vec![0.3, 0.1, 0.2]), Some(0.2));
         assert_eq!(median(vec![]), None);
         let found = median(vec![0.3, f64::NAN, 0.2, 0.1]);
         assert!(found.is_some_and(f64::is_nan), "{found:?}");
-    }
-
-    #[test]
-    fn a_loss_of_0_has_an_error_too() {
-        assert_eq!(loss_error(1e-9, 0.0), 1e-9);
     }
 }

@@ -78,8 +78,7 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
         let scores = map.iter().enumerate();
         scores.map(move |(at, score)| (episode, at, rounded(*score)))
     });
-    let columns = "episode,location,score_nats";
-    session.csv("maps", columns, maps)
+    session.csv("maps", "episode,location,score_nats", maps)
 }
 
 /// Means of `LOSS_WINDOW` updates each, at their end.

@@ -104,8 +104,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
             (alpha, updates as u64, [mean, min, max].map(rounded))
         })
     });
-    let columns = "alpha,updates,tv_mean,tv_min,tv_max";
-    session.csv("curves", columns, curves)
+    session.csv("curves", "alpha,updates,tv_mean,tv_min,tv_max", curves)
 }
 
 fn values(results: &Results) -> Value {

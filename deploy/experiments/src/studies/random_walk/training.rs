@@ -255,11 +255,9 @@ mod tests {
         let chain = Chain::new(6, 0.3);
         let (t, rho) = (chain.transitions(), chain.stationary());
         // Any number may be added to a row; a pair that never comes has a score far below the others.
-        let scores = (0..36)
-            .map(|at| (t[at] / rho[at % 6]).max(1e-300).ln() + (at / 6) as f64)
-            .collect();
+        let score = |at: usize| (t[at] / rho[at % 6]).max(1e-300).ln() + (at / 6) as f64;
         let mut learnt = Learnt::default();
-        learnt.measure(3, &chain, scores);
+        learnt.measure(3, &chain, (0..36).map(score).collect());
         assert!(learnt.excess[0] < 1e-12 && learnt.tv[0] < 1e-12);
         for (at, ratio) in learnt.ratio.iter().enumerate() {
             assert!((ratio - t[at] / rho[at % 6]).abs() < 1e-9);

@@ -97,8 +97,7 @@ impl Results {
     }
 
     pub(super) fn traces(&self, part: usize, agent: &str) -> impl Iterator<Item = &Trace> {
-        let all = self.traces[part].iter();
-        all.filter(move |it| it.agent == agent)
+        self.traces[part].iter().filter(move |it| it.agent == agent)
     }
 
     /// Rank correlation of epsilon and a final loss, and of how many runs it is.

@@ -131,8 +131,7 @@ impl Dial {
             sets: vec![format!("{}={value}", self.name)],
             agent: None,
         });
-        let levels = values.chain(self.levels.iter().cloned());
-        levels.map(move |level| {
+        values.chain(self.levels.iter().cloned()).map(move |level| {
             let agent = level.agent.unwrap_or_else(|| self.agent.clone());
             let key = match level.sets.is_empty() {
                 true => agent.clone(),
@@ -364,10 +363,8 @@ coinrun|observation|input.height=64 input.width=64";
         let settings = of("--env mspacman --dials model.embedding_dim", None).unwrap();
         let asked: Vec<_> = settings.levels.iter().filter(|it| it.is_asked).collect();
         let timed = |point: &Point| {
-            (
-                settings.base_of(point).key.clone(),
-                settings.asks_for(point),
-            )
+            let base = settings.base_of(point).key.clone();
+            (base, settings.asks_for(point))
         };
         assert_eq!(timed(&asked[0].base), ("c51".into(), true));
         assert_eq!(timed(&asked[0].point), ("driml-fix".into(), true));

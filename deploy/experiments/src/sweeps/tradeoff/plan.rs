@@ -31,15 +31,13 @@ impl Budget {
     /// Takes a level with all its seeds and its base, if both fit. What costs nothing any more always fits. A level that does not fit
     /// leaves room to those after it.
     pub(super) fn takes(&mut self, base_and_level: &[Cost; 2]) -> bool {
-        let new = base_and_level
-            .iter()
-            .filter(|it| !self.paid.contains(&it.key));
+        let both = base_and_level.iter();
+        let new = both.clone().filter(|it| !self.paid.contains(&it.key));
         let more: f64 = new.map(|it| it.seconds).sum();
         let fits = more == 0.0 || self.seconds + more <= self.seconds_max;
         if fits {
             self.seconds += more;
-            self.paid
-                .extend(base_and_level.iter().map(|it| it.key.clone()));
+            self.paid.extend(both.map(|it| it.key.clone()));
         }
         fits
     }
@@ -85,11 +83,8 @@ mod tests {
                 })
             });
             let found: Vec<_> = costs.map(|it| budget.takes(&it)).collect();
-            assert_eq!(
-                (&found[..], budget.seconds),
-                (chosen, seconds),
-                "{seconds_max} s"
-            );
+            let found = (&found[..], budget.seconds);
+            assert_eq!(found, (chosen, seconds), "{seconds_max} s");
         }
     }
 

@@ -49,8 +49,7 @@ pub(super) fn summary(at: At, values: &[(String, Value)]) -> Vec<u8> {
                 const RGB: u64 = 3;
                 let [height, width] =
                     [(1, height), (2, width)].map(|(n, it)| number(n, *it as u64));
-                let image = [height, width, number(3, RGB), bytes(4, png)];
-                bytes(4, &image.concat())
+                bytes(4, &[height, width, number(3, RGB), bytes(4, png)].concat())
             }
         };
         bytes(1, &[bytes(1, name.as_bytes()), value].concat())
