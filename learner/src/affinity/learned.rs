@@ -55,7 +55,7 @@ impl LearnedSettings {
             eps,
             keep,
         } = *self;
-        let share = 0.0..=1f64.next_down();
+        let share = 0.0..=0.999_999;
         check_ranges(&[
             ("hidden", hidden as f64, 1.0..=HIDDEN_MAX),
             ("lr", lr, 1e-30..=1e38),
