@@ -76,8 +76,11 @@ impl StateFile {
         if let Ok(Version { format }) = serde_json::from_slice(text)
             && format != FORMAT
         {
-            let folder = folder.to_owned();
-            return Err(CheckpointError::OtherFormat { folder, format });
+            return Err(CheckpointError::OtherFormat {
+                folder: folder.to_owned(),
+                format,
+                ours: FORMAT,
+            });
         }
         let read = serde_json::from_slice(text).map_err(|e| e.to_string());
         let checked = read.and_then(|state: Self| state.check_valid().map(|()| state));

@@ -5,7 +5,6 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::contents::FORMAT;
 use crate::error::UpdateError;
 
 /// Why a checkpoint was not written or not read.
@@ -24,11 +23,14 @@ pub enum CheckpointError {
     )]
     Damaged { file: PathBuf, why: String },
     #[error(
-        "the checkpoint {} was written by another version of this program (format {format}, this one reads {}): use that version",
-        folder.display(),
-        FORMAT
+        "the checkpoint {} was written by another version of this program (format {format}, this one reads {ours}): use that version",
+        folder.display()
     )]
-    OtherFormat { folder: PathBuf, format: u32 },
+    OtherFormat {
+        folder: PathBuf,
+        format: u32,
+        ours: u32,
+    },
     #[error(
         "{folder} belongs to a run with specification {found}, this run's is {expected}: \
          resume with the settings it was made with, or choose another folder"
