@@ -5,6 +5,16 @@ use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use serde::{Deserialize, Serialize};
 
+/// What a world ended, in the words of the wire.
+const fn end_on_the_wire(end: StepEnd) -> End {
+    match end {
+        StepEnd::Running => End::Running,
+        StepEnd::LevelChange => End::LevelChange,
+        StepEnd::TimedOut => End::TimedOut,
+        StepEnd::Terminal => End::Terminal,
+    }
+}
+
 /// Which chunk of an actor's life it is, and how many transitions were before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkNumbers {
@@ -104,8 +114,7 @@ impl ChunkRecorder {
         for (stream, frame) in frames.chunks_exact(frame_bytes).enumerate() {
             let row = stream * header.steps as usize + self.filled_steps as usize;
             chunk.frame_mut(row).copy_from_slice(frame);
-            let end = End::from_byte(ends[stream] as u8);
-            let end = end.expect("the wire numbers ends as worlds do");
+            let end = end_on_the_wire(ends[stream]);
             chunk.set(row, actions[stream], rewards[stream], end);
         }
         self.filled_steps += 1;

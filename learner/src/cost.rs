@@ -178,7 +178,11 @@ mod tests {
         };
         let found = UpdateCost::of(&model(lambda.dim_heads(true)), &dim);
         assert_eq!(found, expected);
-        assert_eq!(plain.total(), plain.online + plain.head + plain.target);
+        let c51 = found.online + found.head + found.target + found.double_dqn;
+        assert_eq!(
+            found.total(),
+            c51 + found.states + found.heads + found.scores
+        );
     }
 
     #[test]

@@ -295,6 +295,8 @@ fn a_grid_makes_every_combination_once() {
     system.refuses(&unfit, "agent=c51").expect_said("lr=fast");
     let twice = format!("{call} --set learner.update.adam.lr=1");
     system.refuses(&twice, "is set twice");
+    let seeded = format!("{call} --set run.seed=7");
+    system.refuses(&seeded, "use --seeds and --frames");
     system.refuses(&format!("{call} --report"), "there is nothing to report");
 
     let printed = system.run_ok(&format!("{call} --jobs 2")).stdout;

@@ -33,7 +33,7 @@ pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
 /// A mean and the interval in which it lies with 95% confidence if values are normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Interval {
-    /// The mean.
+    /// Of the values, in their unit.
     pub mean: f64,
     /// None for a single value: it does not tell how far others would spread.
     pub ends: Option<(f64, f64)>,

@@ -40,7 +40,7 @@ pub struct ExactAffinity {
 impl ExactSettings {
     pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
         check_ranges(&[
-            ("decay", self.decay, f64::MIN_POSITIVE..=1.0),
+            ("decay", self.decay, 1e-6..=1.0),
             ("smoothing", self.smoothing, SMOOTHING),
         ])
     }

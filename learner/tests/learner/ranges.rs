@@ -48,7 +48,7 @@ fn what_float32_does_not_hold_is_refused_by_name() {
     }
 }
 
-/// Numbers of an affinity that cannot work, whatever estimates it, and what is said of them.
+/// Numbers of an affinity that cannot work, of either estimator, and their errors.
 const AFFINITY: &str = "
 exact = { decay = 0.0, smoothing = 1.0 }    : decay = 0.0
 exact = { decay = 1.1, smoothing = 1.0 }    : decay = 1.1

@@ -116,19 +116,11 @@ pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<(
         if !known.contains(&call) {
             let config = call.config();
             let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
-            for (is_other, key, flag) in [
-                (config.run.seed != 1, "run.seed", "--seeds"),
-                (
-                    config.frames() != plan.frames,
-                    "the number of frames",
-                    "--frames",
-                ),
-            ] {
-                ensure!(
-                    !is_other,
-                    usage!("--set changes {key} of {}: use {flag}", plan.name)
-                );
-            }
+            let is_its_own = config.run.seed == 1 && config.frames() == plan.frames;
+            ensure!(
+                is_its_own,
+                usage!("--set changes the run's seed or frames: use --seeds and --frames")
+            );
             config.world.install(&mut console::line)?;
             known.push(call);
         }

@@ -163,7 +163,7 @@ impl RunFolder {
     }
 
     /// Whether another launcher holds it, also for a user who may only read it.
-    pub fn is_locked(&self) -> bool {
+    pub(crate) fn is_locked(&self) -> bool {
         let file = File::open(self.lock_file());
         file.is_ok_and(|file| matches!(lock_file::try_lock(&file), Ok(false)))
     }

@@ -220,7 +220,7 @@ fn what_is_printed_into_the_protocol_is_named() {
     let config = config(declares(ONE) + "; echo ready");
     let sentence = "the byte 0x72 and not with `.`";
     fails(ExecWorld::new(&config, 1, 1), &[sentence]);
-    // What would be taken for the answer to the next step.
+    // A second answer, which the next step would read as its own.
     let twice = self::config(declares(ONE) + "; printf ..; read -r line");
     let mut world = ExecWorld::new(&twice, 1, 1).unwrap();
     let stepped = world.step(&[0], &mut [0.0], &mut [StepEnd::Running]);
