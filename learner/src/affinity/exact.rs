@@ -14,7 +14,7 @@ use super::{
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExactSettings {
-    /// Factor on all counts at each update, in (0, 1].
+    /// Factor on all counts at each update, 1e-300 to 1.
     pub decay: f64,
     /// Pairs added to each pair's count and to the count that it would have if actions did not depend on each other, from 1e-100
     /// to 1e100: how much evidence a ratio other than 1 takes.
@@ -40,7 +40,7 @@ pub struct ExactAffinity {
 impl ExactSettings {
     pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
         check_ranges(&[
-            ("decay", self.decay, 1e-6..=1.0),
+            ("decay", self.decay, 1e-300..=1.0),
             ("smoothing", self.smoothing, SMOOTHING),
         ])
     }

@@ -17,7 +17,7 @@ const ALWAYS: &str = "always the same action: an entry, beside 1 / actions";
 const COUNTS: &str = "2, 15, 60 actions, five uses of them; counts from 0, 2^24, 2^53, 1e299; decay 1, 0.999, 0.5, 1e-300; smoothing 1e-100, 1, 1e100";
 
 pub(super) fn properties(settings: &Settings) -> Vec<Property> {
-    let counts = "counts below 1e300; decay above 0 and at most 1; smoothing 1e-100 to 1e100";
+    let counts = "counts below 1e300; decay 1e-300 to 1; smoothing 1e-100 to 1e100";
     let updates = settings.affinity_updates;
     let updates = format!(
         "2, 15 actions, five uses of them, {updates} updates; 255 actions, a hundredth as many"
