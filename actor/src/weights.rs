@@ -10,7 +10,8 @@ use std::{
 use anyhow::anyhow;
 use driml_protocol::{
     Assembly, BufferPool, CodecError, LogLimiter, PIECE_BYTES, PendingReply, RunClient, Shutdown,
-    Weights, WeightsReply, WeightsRequest, WeightsVersion, fail_point, session::SessionError,
+    Silence, Weights, WeightsReply, WeightsRequest, WeightsVersion, fail_point, lock,
+    session::SessionError,
 };
 
 /// How long one piece may take to come.
@@ -61,7 +62,7 @@ impl NewestWeights {
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
-        self.shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.shared.0)
     }
 
     /// Takes the newest weights, if they came since the last call, and asks for newer ones; those that were announced are waited
@@ -121,21 +122,20 @@ pub(crate) fn first(
     wait_max: Duration,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Option<Weights>> {
-    let mut started = Instant::now();
+    let mut silence = Silence::with_tries_of(PIECE_TIMEOUT);
     let mut said = LogLimiter::default();
     loop {
         let pulled = pull(client, 0);
         let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
-        let mut is_recovering = false;
         if let Some(SessionError::Recovering(recovering)) = error {
-            (started, is_recovering) = (Instant::now(), true);
+            silence.answered();
             if recovering.progress.is_slow() && said.due().is_some() {
                 tracing::info!("waiting for weights for as long as it takes: {recovering}");
             }
         }
         match pulled {
             Ok(Some(weights)) => return Ok(Some(weights)),
-            pulled if !is_recovering && started.elapsed() > wait_max => {
+            pulled if silence.unanswered() > wait_max => {
                 let none = format!(
                     "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
                 );
@@ -147,7 +147,7 @@ pub(crate) fn first(
             Err(e) => tracing::debug!("no weights yet: {e}"),
             Ok(None) => {}
         }
-        if started.elapsed() > SILENT_MAX && said.due().is_some() {
+        if silence.length() > SILENT_MAX && said.due().is_some() {
             tracing::info!("waiting for the learner's first weights");
         }
         if shutdown.wait_timeout(PAUSE) {

@@ -29,7 +29,10 @@ fn entry(arg: &Arg) -> String {
         None => value.trim_start().to_owned(),
     };
     let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
-    let mut help = first_clause(&help).to_owned();
+    let clause = first_clause(&help);
+    let has_default = |text: &str| text.contains("[default");
+    assert_eq!(has_default(clause), has_default(&help), "{help}");
+    let mut help = clause.to_owned();
     let defaults = arg.get_default_values().iter();
     let defaults: Vec<_> = defaults.map(|it| it.to_string_lossy()).collect();
     if takes_values && !defaults.is_empty() {

@@ -20,7 +20,7 @@ use crate::{
         gradients::{Gradients, clip_factor},
         target,
     },
-    settings::LearnerSettings,
+    settings::UpdateSettings,
     tensors::{flat, states},
 };
 
@@ -55,7 +55,7 @@ impl Agent {
     /// Settings out of their ranges, or a model whose heads are not those that the auxiliary loss uses.
     pub fn new(
         model: ModelConfig,
-        settings: LearnerSettings,
+        settings: UpdateSettings,
         compute: &Compute,
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, UpdateError> {
@@ -76,7 +76,7 @@ impl Agent {
     /// As [`Agent::new`], and parameters that do not fit the model.
     pub fn from_parameters(
         model: ModelConfig,
-        settings: LearnerSettings,
+        settings: UpdateSettings,
         compute: &Compute,
         parameters: NetworkParameters,
     ) -> Result<Self, UpdateError> {
@@ -121,8 +121,8 @@ impl Agent {
             adam: Adam::new(settings.adam, &online, kernels)?,
             updates: 0,
             networks: Networks {
-                online: Network::with_kernels(&model, &online, kernels)?,
-                target: Network::with_kernels(&model.without_dim(), &target, kernels)?,
+                online: Network::new(&model, &online, kernels)?,
+                target: Network::new(&model.without_dim(), &target, kernels)?,
                 compute: compute.clone(),
                 deduplicate: false,
                 auxiliary,
@@ -158,7 +158,7 @@ impl Agent {
     }
 
     /// The settings of its updates.
-    pub const fn settings(&self) -> &LearnerSettings {
+    pub const fn settings(&self) -> &UpdateSettings {
         &self.networks.settings
     }
 

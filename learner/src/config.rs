@@ -17,7 +17,7 @@ use crate::{
     augment::AugmentSettings,
     auxiliary::positives::Positives,
     error::UpdateError,
-    settings::LearnerSettings,
+    settings::UpdateSettings,
 };
 
 /// The `[learner]` table: batches, publication, checkpoints, and what an update does.
@@ -43,7 +43,7 @@ pub struct Config {
     /// How long the replay server may be out of reach, milliseconds, before the learner saves and gives up.
     pub unreachable_max_ms: u64,
     /// Losses, optimiser and target network.
-    pub update: LearnerSettings,
+    pub update: UpdateSettings,
     /// What is done to the states that the auxiliary loss sees; nothing if it is not there.
     pub augment: Option<AugmentSettings>,
     /// How the action affinity A is estimated, if the horizon follows it.
@@ -146,8 +146,9 @@ impl Config {
     pub fn validate(&self) -> Result<(), ConfigError> {
         let within = |key: &str, value: u64, most: u64| {
             let (key, is_fine) = (format!("learner.{key}"), (1..=most).contains(&value));
-            check(is_fine, &key, value, || {
-                format!("it must lie between 1 and {most}")
+            check(is_fine, &key, value, || match most {
+                u64::MAX => "it must be at least 1".into(),
+                most => format!("it must lie between 1 and {most}"),
             })
         };
         let (publish, checkpoint) = (self.publish_period_updates, self.checkpoint_period_updates);

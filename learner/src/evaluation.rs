@@ -16,7 +16,7 @@ use crate::{
     },
     noise::UpdateNoise,
     optimiser::gradients::Gradients,
-    settings::LearnerSettings,
+    settings::UpdateSettings,
     tensors::{finite, flat, states},
 };
 
@@ -63,7 +63,7 @@ pub struct Evaluation {
 #[derive(Debug)]
 pub(crate) struct Networks {
     pub(crate) model: ModelConfig,
-    pub(crate) settings: LearnerSettings,
+    pub(crate) settings: UpdateSettings,
     pub(crate) compute: Compute,
     /// Whether equal states of a batch are computed once.
     pub(crate) deduplicate: bool,

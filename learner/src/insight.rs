@@ -9,7 +9,7 @@ use crate::{
     auxiliary::dim::{DIM, Vectors},
     error::UpdateError,
     losses::{c51::softmax, scores::Scores},
-    settings::LearnerSettings,
+    settings::UpdateSettings,
     tensors::{flat, states},
 };
 
@@ -42,7 +42,7 @@ impl Insight {
     /// The network with these parameters, learned with these settings; without DIM's heads it compares no features.
     pub fn new(
         model: &ModelConfig,
-        settings: &LearnerSettings,
+        settings: &UpdateSettings,
         parameters: &Parameters,
         compute: Compute,
     ) -> Result<Self, UpdateError> {
@@ -52,7 +52,7 @@ impl Insight {
             && model.dim.phi3;
         Ok(Self {
             model: model.clone(),
-            network: Network::with_kernels(model, parameters, compute.kernels)?,
+            network: Network::new(model, parameters, compute.kernels)?,
             compute,
             local_clip: is_local.then_some(settings.tanh_clip),
         })

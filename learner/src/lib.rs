@@ -3,7 +3,7 @@
 //! Start at [`Agent`]: the networks, their optimiser, and one update. It needs no other process:
 //!
 //! ```
-//! use driml_learner::{Agent, Batch, Compute, LearnerSettings};
+//! use driml_learner::{Agent, Batch, Compute, UpdateSettings};
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -14,7 +14,7 @@
 //! # const UPDATE: &str = "double_dqn = false\nauxiliary_loss = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
 //! #     lambda = { 3t3 = 0.0, 3t4 = 0.0, 4t3 = 0.0, 4t4 = 1.0 }\nmax_grad_norm = 10.0\ntarget_period_updates = 312\n\
 //! #     target_tau = 0.95\nadam = { lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8 }";
-//! let (model, settings): (_, LearnerSettings) = (toml::from_str(MODEL)?, toml::from_str(UPDATE)?);
+//! let (model, settings): (_, UpdateSettings) = (toml::from_str(MODEL)?, toml::from_str(UPDATE)?);
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let mut agent = Agent::new(model, settings, &Compute::CPU, rng)?;
 //! let report = agent.update(&Batch {
@@ -91,4 +91,4 @@ pub use noise::UpdateNoise;
 pub use optimiser::adam::AdamSettings;
 pub use progress::{Progress, ServedPart};
 pub use remote::run::{RunArgs, run};
-pub use settings::LearnerSettings;
+pub use settings::UpdateSettings;

@@ -25,7 +25,7 @@ const MAX_GRAD_NORM: RangeInclusive<f64> = 1e-6..=1e15;
 
 /// Everything that one update depends on beside the network's sizes. No field has a default.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LearnerSettings {
+pub struct UpdateSettings {
     /// Choose the action in s_{t+n} by the online network instead of the target network.
     pub double_dqn: bool,
     /// The auxiliary loss.
@@ -66,7 +66,7 @@ fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Erro
     }
 }
 
-impl LearnerSettings {
+impl UpdateSettings {
     /// Checks the ranges.
     pub fn validate(&self) -> Result<(), UpdateError> {
         check_range("tanh_clip", self.tanh_clip, TANH_CLIP)?;
@@ -103,7 +103,7 @@ impl LearnerSettings {
     }
 
     /// The heads that the online network needs in a world of `num_actions` actions; none where the settings cannot work, which
-    /// [`LearnerSettings::validate`] says.
+    /// [`UpdateSettings::validate`] says.
     pub fn dim_heads(&self, num_actions: usize) -> DimHeads {
         let action = self.condition_on_action && num_actions > 1;
         let loss = self.auxiliary();

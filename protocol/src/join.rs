@@ -1,7 +1,7 @@
 //! Joining a run: fetching its settings, and taking part in it as an actor or as the learner.
 //! It does not serve or leave the run; each process does that itself.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use zenoh::{Session, bytes::ZBytes};
 
@@ -127,7 +127,7 @@ pub fn take_part(
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
     let mut patience = Patience::default();
-    let mut taken_since = None;
+    let mut taken: Option<Silence> = None;
     loop {
         match client.ask(join, TRY_MAX) {
             Ok(JoinReply::Welcome(welcome)) => return Ok(Some(welcome)),
@@ -135,17 +135,18 @@ pub fn take_part(
                 let why = format!("the replay server refuses: {why}");
                 return Err(JoinError::Refused(why));
             }
-            Ok(JoinReply::Taken { why }) => match taken_since {
-                Some(since) if Instant::now() - since > TAKEN_MAX => {
-                    let seconds = TAKEN_MAX.as_secs();
-                    let why = format!("{why}, and has not ended within {seconds} s");
-                    return Err(JoinError::Refused(why));
+            Ok(JoinReply::Taken { why }) => match &mut taken {
+                Some(silence) => {
+                    if silence.unanswered() > TAKEN_MAX {
+                        let seconds = TAKEN_MAX.as_secs();
+                        let why = format!("{why}, and has not ended within {seconds} s");
+                        return Err(JoinError::Refused(why));
+                    }
                 }
-                Some(_) => {}
                 None => {
                     let max = TAKEN_MAX.as_secs();
                     tracing::warn!("{why}; waiting up to {max} s for its end");
-                    taken_since = Some(Instant::now());
+                    taken = Some(Silence::default());
                 }
             },
             Err(e) => patience.wait_after(e)?,

@@ -68,7 +68,7 @@ pub use process::{
     silence::Silence,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
-pub use run_spec::{FRAME_STACK_MAX, Horizon, POSITIVES_MAX, RunSpec, TimeoutRule};
+pub use run_spec::{FRAME_STACK_MAX, Horizon, RunSpec, TimeoutRule};
 pub use sampling::Sampling;
 pub use wire::{
     buffers::{Buffer, BufferPool},

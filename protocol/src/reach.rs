@@ -38,7 +38,6 @@ pub fn look(endpoint: &str) -> Result<(), Unreachable> {
     match endpoint.split_once('/') {
         Some(("unixsock-stream", path)) => look_at_socket(endpoint, path.into()),
         Some((protocol, address)) => {
-            let address = address.split('#').next().unwrap_or(address);
             let addresses = address.to_socket_addrs().map_err(|e| {
                 let why = e.to_string();
                 let why = why.rsplit(": ").next().unwrap_or(&why);

@@ -13,7 +13,7 @@ use crate::{
 const FIELDS: u16 = 1;
 
 /// Most positives a row can carry; a rule that asks for more is refused.
-pub const POSITIVES_MAX: usize = 32;
+const POSITIVES_MAX: usize = 32;
 
 /// Most frames that make one state.
 pub const FRAME_STACK_MAX: u32 = 16;

@@ -16,10 +16,10 @@ use driml_actor::DeliveryLimits;
 use driml_learner::remote::batch_source::Served;
 use driml_protocol::{
     Ack, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply,
-    Keyed, Keys, Leave, ReplayStatus, Request, RunSpec, Shutdown, codec, session,
+    Keyed, Keys, Leave, ReplayStatus, Request, RunSpec, ShardCounts, Shutdown, codec, session,
 };
 use driml_replay_server::{Config, Replay};
-use driml_tests::{TestSystem, check_nothing_lost, listen};
+use driml_tests::{TestSystem, check_nothing_lost, listen, wait_until};
 use zenoh::{
     Session, Wait,
     query::{Query, Queryable},
@@ -365,4 +365,45 @@ fn a_shard_that_fills_late_is_asked() {
         }
     }
     panic!("a shard that holds something is never drawn from");
+}
+
+/// Inserts of a shard that wait by an old count of the other's rows are let in by the next draw that asks it.
+#[test]
+fn a_shard_that_waits_hears_what_the_other_gave() {
+    let config = Config {
+        transitions_max: None,
+        ..config(2)
+    };
+    let slack = config.slack_transitions;
+    let mut shards: Vec<_> = (0..2)
+        .map(|shard| Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap())
+        .collect();
+    shards
+        .iter_mut()
+        .for_each(|replay| tiny_replay::join(replay, 0));
+    // Most batches are drawn from the first alone.
+    fill(&mut shards[0], 0..slack / 8);
+    fill(&mut shards[1], 0..1);
+    let mut served = serve(shards);
+    let held = slack + 8;
+    for _ in 0..held / u64::from(ROWS) {
+        served.learner.next().unwrap();
+    }
+    let insert = |others| {
+        let mut replay = served.replays[1].lock().unwrap();
+        if let Some(others) = others {
+            replay.set_other_shards(others).unwrap();
+        }
+        replay.insert(&tiny_replay::chunk(&batches_spec(), 0, 1, 8))
+    };
+    let actors_ahead = ShardCounts {
+        inserted: 2 * slack,
+        rows_sampled: 0,
+    };
+    let waits = insert(Some(actors_ahead));
+    assert!(matches!(waits, InsertReply::Wait { .. }), "{waits:?}");
+    wait_until("the shard's inserts wait no more", || {
+        matches!(insert(None), InsertReply::Stored { .. })
+    });
+    served.learner.end();
 }

@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_740),
-    ("actor", 11_110),
-    ("replay-server", 11_220),
-    ("learner", 23_930),
-    ("deploy", 31_240),
-    ("tests", 10_560),
+    ("protocol", 7_745),
+    ("actor", 11_100),
+    ("replay-server", 11_210),
+    ("learner", 23_900),
+    ("deploy", 31_210),
+    ("tests", 10_600),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -138,16 +138,6 @@ mod tests {
     }
 
     #[test]
-    fn oldest_channels_come_first() {
-        let shape = FrameShape::new(1, 2, 2);
-        let mut frames = FrameStack::new(shape, 2, 1).unwrap();
-        frames.push(&[1, 2, 3, 4], &[true]);
-        assert_eq!(frames.stacked(), [1, 2, 1, 2, 3, 4, 3, 4]);
-        frames.push(&[5, 6, 7, 8], &[false]);
-        assert_eq!(frames.stacked(), [1, 2, 5, 6, 3, 4, 7, 8]);
-    }
-
-    #[test]
     fn a_stack_of_none_is_an_error() {
         let shape = FrameShape::new(1, 1, 1);
         assert!(FrameStack::new(shape, 0, 1).is_err());

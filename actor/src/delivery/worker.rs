@@ -210,7 +210,7 @@ impl DeliveryWorker {
                 kept,
             }) => {
                 self.state.progress().inserted_total = inserted_total;
-                self.is_held(kept);
+                self.note_held(kept);
                 Ok(self.again())
             }
             // Judged while one before it waited; all of those are stored now.
@@ -266,7 +266,7 @@ impl DeliveryWorker {
     }
 
     /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
-    fn is_held(&mut self, kept: bool) {
+    fn note_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
         self.state.progress().is_held = true;
         self.outgoing[0].is_kept = kept;

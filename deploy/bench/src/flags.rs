@@ -63,7 +63,7 @@ pub struct BenchFlags {
     /// Threads for arithmetic
     #[arg(long, global = true, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub(crate) threads: u32,
-    /// Precision of products, for learner and policy; may be given several times [default: both]
+    /// Precision of products, for learner and policy [default: both]; may be given several times
     #[arg(long, global = true, value_name = "PRECISION")]
     pub(crate) precision: Vec<Precision>,
 }

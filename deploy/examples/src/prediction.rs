@@ -18,7 +18,7 @@ use serde::Deserialize;
 pub(crate) static PREDICTION: MenuItem = MenuItem {
     name: NAME,
     positives: Positives::One,
-    losses: &[NAME],
+    loss_names: &[NAME],
     make,
 };
 

@@ -64,8 +64,8 @@ pub(crate) struct Session {
 }
 
 impl Session {
-    /// Opens the folder, or makes it. `units` is the work of all pieces together; runs announce their own. For a report alone it makes
-    /// no folder, and writes down no settings, as they made nothing; runs that lie in one with their calls are enough.
+    /// Opens the folder, or makes it. `units` is the work of all pieces together; runs announce their own. A report alone
+    /// needs runs with their calls; it writes down no settings, as they made nothing.
     pub(crate) fn open(
         name: &str,
         flags: &ExperimentFlags,

@@ -22,17 +22,20 @@ pub enum ExperimentCommand {
     Stability(ExperimentFlags),
 }
 
+/// Seeds that a run may have, and up to which finished runs are looked for.
+pub(crate) const SEEDS_MAX: u32 = 1000;
+
 /// What every experiment takes.
 #[derive(Clone, Debug, Args)]
 pub struct ExperimentFlags {
     /// A test in seconds: shows only that the command works
     #[arg(long)]
     pub(crate) smoke: bool,
-    /// Folder for figures, data and page; a stopped experiment resumes there [default: experiments/NAME]
+    /// Folder for figures, data and page [default: experiments/NAME]; a stopped experiment resumes there
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Seeds 1 to N [default: from the experiment's settings]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(SEEDS_MAX)))]
     pub(crate) seeds: Option<u32>,
 }
 
@@ -87,7 +90,7 @@ pub struct ProcgenArgs {
     /// Greedy episodes per checkpoint, for the last three of a run [default: 100]; three times as many with averaged weights
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) episodes: Option<u32>,
-    /// Named settings; `driml presets` lists them [default: tuned]
+    /// Named settings [default: tuned]; `driml presets` lists them
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
 }
@@ -139,7 +142,7 @@ pub struct SweepArgs {
     #[arg(long = "set", value_name = "KEY=VALUE,..")]
     pub(crate) sets: Vec<String>,
     /// Seeds 1 to N per combination
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(SEEDS_MAX)))]
     pub(crate) seeds: u32,
     /// Runs at once; they share the cores
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]

@@ -161,7 +161,7 @@ impl Player {
     /// What the network that plays makes of the states it sees.
     pub fn viewer(&self) -> anyhow::Result<Viewer> {
         let mut model = self.config.model.clone();
-        if self.network.len() < model.parameter_shapes().len() {
+        if self.network.iter().count() < model.parameter_shapes().len() {
             model = model.without_dim();
         }
         let compute = Compute::cpu(self.config.actor.precision);

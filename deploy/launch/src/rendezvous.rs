@@ -16,7 +16,7 @@ use anyhow::Context;
 use driml_protocol::lock_file;
 use nix::unistd::{dup2_stdin, geteuid};
 
-use crate::endpoint::SOCKET_PATH_MAX;
+use crate::endpoint::{ADDRESS_ENDS, SOCKET_PATH_MAX};
 
 const PREFIX: &str = "driml-run-";
 /// The longest name of a socket behind the folder for temporary files.
@@ -76,10 +76,9 @@ impl Rendezvous {
 
 /// Where such folders are, beside other temporary files if these are in `folder`.
 fn place_under(folder: PathBuf) -> PathBuf {
-    match folder.as_os_str().len() + SOCKET.len() {
-        0..=SOCKET_PATH_MAX => folder,
-        _ => SHORT_PLACE.into(),
-    }
+    let path = folder.to_string_lossy();
+    let fits = path.len() + SOCKET.len() <= SOCKET_PATH_MAX && !path.contains(ADDRESS_ENDS);
+    if fits { folder } else { SHORT_PLACE.into() }
 }
 
 /// What a process does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
@@ -120,6 +119,13 @@ mod tests {
 
     fn folders(place: &Path) -> usize {
         fs::read_dir(place).unwrap().count()
+    }
+
+    #[test]
+    fn a_folder_that_no_endpoint_can_name_is_not_used() {
+        for (folder, place) in [("/tmp/a", "/tmp/a"), ("/tmp/a#b", "/tmp"), ("/a?", "/tmp")] {
+            assert_eq!(place_under(folder.into()), Path::new(place));
+        }
     }
 
     #[test]

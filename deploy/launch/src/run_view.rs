@@ -48,7 +48,7 @@ impl Plan {
             actors_planned: config.local.actors,
             // Without a ladder it is every actor's.
             epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
-            losses: config.learner.update.auxiliary_loss.losses(),
+            losses: config.learner.update.auxiliary_loss.loss_names(),
         }
     }
 }

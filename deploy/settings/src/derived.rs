@@ -2,7 +2,7 @@
 //! It makes no choice itself.
 
 use driml_envs::{ActionSet, WorldConfig, WorldName};
-use driml_learner::LearnerSettings;
+use driml_learner::UpdateSettings;
 use driml_machine::error::{Usage, usage};
 use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, ModelConfig, TorsoName};
 use driml_protocol::config::describe;
@@ -99,7 +99,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         put(table, &format!("world.{key}"), Value::String(value.into()));
     }
     let config: WorldConfig = table_at(table, "world")?;
-    let update: LearnerSettings = table_at(table, "learner.update")?;
+    let update: UpdateSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
     let frame = (shape.height, shape.width);
     let input = (
@@ -143,7 +143,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
 }
 
 /// Fills in the auxiliary loss's own layers, if it has any. Where the model or the loss cannot be, the checks that follow say why.
-fn loss_layers(table: &mut Table, update: &LearnerSettings) -> Result<(), Usage> {
+fn loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
     if let Ok(model) = table_at::<ModelConfig>(table, "model")
         && let Ok(loss) = update.auxiliary()
     {

@@ -27,14 +27,14 @@ pub const AGENT: &str = "driml-ada";
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
 pub struct RunFlags {
-    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them. "exec:COMMAND" is a process of yours, such as
-    /// driml_env.py around a Gymnasium environment [default: procgen:coinrun]
+    /// World, such as mspacman [default: procgen:coinrun]; `driml presets` lists them. "exec:COMMAND" is a process of yours, such as
+    /// driml_env.py around a Gymnasium environment
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
     /// Agent: c51, rainbow, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
     #[arg(long, value_name = "AGENT")]
     pub agent: Option<String>,
-    /// Named settings; `driml presets` lists them [default: tuned on Procgen, paper elsewhere]
+    /// Named settings [default: tuned on Procgen, paper elsewhere]; `driml presets` lists them
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Settings of another run, its config.toml, instead of world, agent and preset

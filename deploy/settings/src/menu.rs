@@ -1,4 +1,4 @@
-//! `driml presets`: what there is to start from, what the paper chose by game, and all settings of one game and agent, each
+//! `driml presets`: what there is to start from, what differs by game, and all settings of one game and agent, each
 //! with the source that its preset file gives. It resolves nothing itself.
 
 use std::collections::BTreeMap;
@@ -10,7 +10,7 @@ use toml::{Table, Value};
 use crate::{
     derived::{self, find},
     flags::{Flags, Source},
-    presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, stack},
+    presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, preset_or_default, stack},
 };
 
 /// Where a setting's source begins, if the setting leaves room.
@@ -33,13 +33,14 @@ pub fn menu() -> Result<String, Usage> {
     let presets: String = presets.map(line).collect();
     let agents: String = agents.map(line).collect();
     let mut text = format!("--preset\n{presets}\n--agent\n{agents}\n");
-    text += "what differs by world\n";
+    text += "what differs by world, with its default preset\n";
     text += &format!(
         "{:18}  {:9}  {:9}  {:11}  lambdas of DIM\n",
         "--env", "driml-fix", "augments", "driml-noact"
     );
     for world in WorldName::all() {
-        let of = |name: &str| layers(&PRESETS[0], world, agent(name)?);
+        let preset = preset_or_default(None, world)?;
+        let of = |name: &str| layers(preset, world, agent(name)?);
         let (fix, noact) = (of("driml-fix")?, of("driml-noact")?);
         let augments = find(&fix, "learner.augment").map_or("-", |_| "yes");
         let (world, fix_k, noact_k, lambdas) =

@@ -25,15 +25,6 @@ impl Kernels {
     /// This project's kernels in f32.
     pub const FUSED: Self = Self::Fused(Precision::F32);
 
-    /// The faster ones of those that a device has.
-    pub fn of(device: &Device) -> Self {
-        if device.is_cpu() {
-            Self::FUSED
-        } else {
-            Self::Candle
-        }
-    }
-
     pub(crate) fn conv_stack(
         self,
         images: &Tensor,
@@ -196,7 +187,7 @@ impl DeviceName {
                 let device = Device::new_cuda_with_stream(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;
                 Ok(Compute {
-                    kernels: Kernels::of(&device),
+                    kernels: Kernels::Candle,
                     device,
                 })
             }

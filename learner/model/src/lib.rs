@@ -9,7 +9,7 @@
 //!
 //! ```
 //! use candle_core::{Device, Tensor};
-//! use driml_model::{HeadConfig, ConvLayer, DimHeads, ModelConfig, Network, Parameters, TorsoName};
+//! use driml_model::{ConvLayer, DimHeads, HeadConfig, Kernels, ModelConfig, Network, Parameters, TorsoName};
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
 //! let no_heads = DimHeads { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
@@ -21,7 +21,7 @@
 //! };
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
-//! let network = Network::new(&config, &parameters)?;
+//! let network = Network::new(&config, &parameters, Kernels::FUSED)?;
 //! // Two states of 8 x 8 x 1 bytes, channels last.
 //! let states = Tensor::zeros((2, 8, 8, 1), candle_core::DType::U8, &Device::Cpu)?;
 //! let logits = network.logits(&network.features(&states)?.f4, None)?;

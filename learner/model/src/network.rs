@@ -70,17 +70,7 @@ pub struct Network {
 impl Network {
     /// The network of `config` on `parameters`, which may hold more than it needs (a target network's configuration
     /// with the online network's parameters).
-    pub fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
-        let device = parameters.device();
-        Self::with_kernels(config, parameters, Kernels::of(&device))
-    }
-
-    /// [`Network::new`] with these kernels, not the faster ones of the parameters' device.
-    pub fn with_kernels(
-        config: &ModelConfig,
-        parameters: &Parameters,
-        kernels: Kernels,
-    ) -> Result<Self> {
+    pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         let head = |exists: bool, name: &str| {
             let head = exists.then(|| Head::new(name, parameters, kernels));

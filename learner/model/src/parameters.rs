@@ -157,33 +157,12 @@ impl Parameters {
         self.0.iter().map(|(name, var)| (name.as_str(), var))
     }
 
-    /// The device that holds them.
-    pub fn device(&self) -> Device {
-        let first = self.0.values().next();
-        first.map_or(Device::Cpu, |var| var.device().clone())
-    }
-
-    /// Number of parameters (tensors, not scalars).
-    pub fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    /// Whether there is no parameter.
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
-    /// A deep copy, which shares nothing with this one.
-    pub fn copy(&self) -> Result<Self> {
-        self.copy_part(|_| true)
-    }
-
     /// A deep copy without the DIM heads: what [`ModelConfig::without_dim`] describes, for a target network.
     pub fn without_dim(&self) -> Result<Self> {
         self.copy_part(|name| !is_dim(name))
     }
 
-    /// A deep copy of the parameters whose names pass `part`.
+    /// A deep copy, which shares nothing with this one, of the parameters whose names pass `part`.
     pub fn copy_part(&self, part: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
         for (name, var) in self.iter().filter(|(name, _)| part(name)) {

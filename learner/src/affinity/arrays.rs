@@ -1,4 +1,4 @@
-//! Arrays of numbers that both estimates have: checks of a saved one, and the softmax of each row of a matrix.
+//! Checks of settings and saved arrays that both estimates have.
 
 use std::ops::RangeInclusive;
 
@@ -17,45 +17,31 @@ pub(super) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(
 }
 
 /// Checks the length of an array by name, and that its numbers are finite.
-pub(super) fn check_array<T: Copy + Into<f64>>(
-    name: &str,
-    array: &[T],
-    len: usize,
-) -> Result<(), AffinityError> {
+pub(super) fn check_array(name: &str, array: &[f64], len: usize) -> Result<(), AffinityError> {
     if array.len() != len {
         let found = array.len();
         return Err(AffinityError(format!(
             "{name} has {found} numbers, not {len}"
         )));
     }
-    match array.iter().position(|&value| !value.into().is_finite()) {
+    match array.iter().position(|value| !value.is_finite()) {
         Some(at) => Err(AffinityError(format!("{name} is not finite at index {at}"))),
         None => Ok(()),
     }
 }
 
 /// [`check_array`], and that every number is a probability.
-pub(super) fn check_probabilities<T: Copy + Into<f64>>(
+pub(super) fn check_probabilities(
     name: &str,
-    array: &[T],
+    array: &[f64],
     len: usize,
 ) -> Result<(), AffinityError> {
     check_array(name, array, len)?;
-    let probability = |&value: &T| (0.0..=1.0 + 1e-6).contains(&value.into());
+    let probability = |value: &f64| (0.0..=1.0 + 1e-6).contains(value);
     match array.iter().position(|value| !probability(value)) {
         Some(at) => Err(AffinityError(format!(
             "{name} is not a probability at index {at}"
         ))),
         None => Ok(()),
     }
-}
-
-pub(super) fn row_softmax(q: &[f64], m: usize) -> Vec<f64> {
-    let mut matrix = Vec::with_capacity(q.len());
-    for row in q.chunks_exact(m) {
-        let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let sum: f64 = row.iter().map(|q| (q - max).exp()).sum();
-        matrix.extend(row.iter().map(|q| (q - max).exp() / sum));
-    }
-    matrix
 }

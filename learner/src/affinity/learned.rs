@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities, check_ranges, row_softmax},
+    arrays::{AffinityError, check_array, check_probabilities, check_ranges},
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -18,13 +18,13 @@ pub struct LearnedSettings {
     pub hidden: usize,
     /// Adam's learning rate, from 1e-30 to 1e38: with it parameters and their products are finite in f64 for as long as a run lasts.
     pub lr: f64,
-    /// Adam's decay of the first moment, in [0, 1).
+    /// Adam's decay of the first moment, 0 to 0.999999.
     pub beta1: f64,
-    /// Adam's decay of the second moment, in [0, 1).
+    /// Adam's decay of the second moment, 0 to 0.999999.
     pub beta2: f64,
     /// Adam's addend outside the root, from 1e-30 to 1e30.
     pub eps: f64,
-    /// Share of the old A that each update keeps, in [0, 1): A <- keep * A + (1 - keep) * row softmax of q.
+    /// Share of the old A that each update keeps, 0 to 0.999999: A <- keep * A + (1 - keep) * row softmax of q.
     pub keep: f64,
 }
 
@@ -233,6 +233,17 @@ const fn parameter_count(m: usize, hidden: usize) -> usize {
 
 fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
+}
+
+/// The softmax of each row of a matrix with `m` columns.
+fn row_softmax(q: &[f64], m: usize) -> Vec<f64> {
+    let mut matrix = Vec::with_capacity(q.len());
+    for row in q.chunks_exact(m) {
+        let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let sum: f64 = row.iter().map(|q| (q - max).exp()).sum();
+        matrix.extend(row.iter().map(|q| (q - max).exp() / sum));
+    }
+    matrix
 }
 
 #[cfg(test)]

@@ -22,7 +22,7 @@ use crate::{
 pub const CPC: MenuItem = MenuItem {
     name: "cpc",
     positives: Positives::Several,
-    losses: &NAMES,
+    loss_names: &NAMES,
     make: |settings| {
         settings.check_no_own()?;
         settings.check_weighted()?;
@@ -122,11 +122,7 @@ fn of_offset(
     anchors: &[u32],
     candidates: Range<usize>,
 ) -> candle_core::Result<Vectors> {
-    let mut here = Vectors {
-        kernels: vectors.kernels,
-        psi: vectors.psi.clone(),
-        phi: vectors.phi.clone(),
-    };
+    let mut here = vectors.clone();
     for psi in here.psi.iter_mut().flatten() {
         if anchors.len() < rows {
             let indices = Tensor::from_slice(anchors, anchors.len(), psi.device())?;

@@ -26,7 +26,7 @@ use crate::{
 pub const CURL: MenuItem = MenuItem {
     name: "curl",
     positives: Positives::OtherView,
-    losses: &["curl"],
+    loss_names: &["curl"],
     make,
 };
 

@@ -20,7 +20,7 @@ use crate::{
 pub const DIM: MenuItem = MenuItem {
     name: "dim",
     positives: Positives::One,
-    losses: &NAMES,
+    loss_names: &NAMES,
     make: |settings| {
         settings.check_no_own()?;
         settings.check_weighted()?;
@@ -109,7 +109,7 @@ impl AuxiliaryLoss for Dim {
 
 /// What the heads make of anchors (psi) and candidates (phi), each of local features, [B, L, R], and of global ones, [B, R]; there
 /// if they are compared.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Vectors {
     /// What multiplies them.
     pub kernels: Kernels,
@@ -128,23 +128,17 @@ impl Vectors {
         action: &Tensor,
         wanted: [bool; 4],
     ) -> Result<Self, UpdateError> {
-        let [local_local, local_global, global_local, global_global] = wanted;
-        let psi3 = when(local_local || local_global, || {
-            network.psi3(features_t.local()?, action)
-        })?;
-        let phi3 = when(local_local || global_local, || {
-            network.phi3(features_k.local()?)
-        })?;
-        let psi4 = when(global_local || global_global, || {
-            network.psi4(&features_t.f4, action)
-        })?;
-        let phi4 = when(local_global || global_global, || {
-            network.phi4(&features_k.f4)
-        })?;
+        let heads = Lambda::heads_of(wanted, true);
+        let psi3 = heads
+            .psi3
+            .then(|| network.psi3(features_t.local()?, action));
+        let phi3 = heads.phi3.then(|| network.phi3(features_k.local()?));
+        let psi4 = heads.psi4.then(|| network.psi4(&features_t.f4, action));
+        let phi4 = heads.phi4.then(|| network.phi4(&features_k.f4));
         Ok(Self {
             kernels: network.kernels(),
-            psi: [psi3, psi4],
-            phi: [phi3, phi4],
+            psi: [psi3.transpose()?, psi4.transpose()?],
+            phi: [phi3.transpose()?, phi4.transpose()?],
         })
     }
 
@@ -168,8 +162,4 @@ pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Res
         dots: kernels.dot_products(psi, phi)?,
         width: psi.dims()[psi.rank() - 1],
     })
-}
-
-fn when<E>(wanted: bool, make: impl FnOnce() -> Result<Tensor, E>) -> Result<Option<Tensor>, E> {
-    if wanted { make().map(Some) } else { Ok(None) }
 }

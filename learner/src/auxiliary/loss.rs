@@ -26,7 +26,7 @@ pub struct MenuItem {
     /// What it compares s_t with.
     pub positives: Positives,
     /// The names of all losses that it may report, as the columns of a run's metrics have them.
-    pub losses: &'static [&'static str],
+    pub loss_names: &'static [&'static str],
     /// Makes it from settings; refuses those that are at odds with each other.
     pub make: fn(&AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError>,
 }

@@ -30,13 +30,13 @@ static CUSTOM: OnceLock<Vec<&'static MenuItem>> = OnceLock::new();
 /// Adds losses to the menu, before anything else is done: `learner.update.auxiliary_loss` takes their names from then on.
 ///
 /// # Panics
-/// If it was called before, or a name is in the menu already.
+/// If it was called before, or two losses of the menu would have the same name.
 pub fn register(items: Vec<&'static MenuItem>) {
-    for MenuItem { name, .. } in &items {
-        let is_known = MENU.iter().any(|known| known.name == *name);
+    for (at, MenuItem { name, .. }) in items.iter().enumerate() {
+        let is_known = |known: &&MenuItem| known.name == *name;
         assert!(
-            !is_known,
-            "the auxiliary loss {name} is driml's: choose another name"
+            !MENU.iter().chain(&items[..at]).any(is_known),
+            "two auxiliary losses are named {name}: choose another name"
         );
     }
     let first = CUSTOM.set(items);
@@ -75,8 +75,8 @@ impl AuxiliaryKind {
     }
 
     /// The names of all losses that may be reported, in order.
-    pub const fn losses(self) -> &'static [&'static str] {
-        self.0.losses
+    pub const fn loss_names(self) -> &'static [&'static str] {
+        self.0.loss_names
     }
 
     /// Makes the loss from settings.
@@ -132,9 +132,18 @@ impl From<AuxiliaryKind> for &'static str {
 
 #[cfg(test)]
 mod tests {
+    use super::{MenuItem, dim::DIM, register};
+
     #[test]
-    #[should_panic(expected = "the auxiliary loss dim is driml's: choose another name")]
+    #[should_panic(expected = "two auxiliary losses are named dim: choose another name")]
     fn a_name_of_the_menu_cannot_be_registered() {
-        super::register(vec![&super::dim::DIM]);
+        register(vec![&DIM]);
+    }
+
+    #[test]
+    #[should_panic(expected = "two auxiliary losses are named own: choose another name")]
+    fn a_name_cannot_be_registered_twice() {
+        const OWN: MenuItem = MenuItem { name: "own", ..DIM };
+        register(vec![&OWN, &OWN]);
     }
 }

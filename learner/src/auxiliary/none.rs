@@ -11,7 +11,7 @@ use crate::error::UpdateError;
 pub const NONE: MenuItem = MenuItem {
     name: "none",
     positives: Positives::None,
-    losses: &[],
+    loss_names: &[],
     make,
 };
 

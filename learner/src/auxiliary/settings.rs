@@ -56,7 +56,12 @@ impl Lambda {
 
     /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
     pub fn dim_heads(&self, action: bool) -> DimHeads {
-        let [local_local, local_global, global_local, global_global] = self.wanted();
+        Self::heads_of(self.wanted(), action)
+    }
+
+    /// The heads that the `wanted` pairs need.
+    pub(super) fn heads_of(wanted: [bool; 4], action: bool) -> DimHeads {
+        let [local_local, local_global, global_local, global_global] = wanted;
         let psi3 = local_local || local_global;
         let psi4 = global_local || global_global;
         DimHeads {

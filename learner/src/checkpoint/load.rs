@@ -19,14 +19,14 @@ use crate::{
     affinity::AffinityEstimator,
     agent::{Agent, NetworkParameters},
     progress::Progress,
-    settings::LearnerSettings,
+    settings::UpdateSettings,
 };
 
 /// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
 pub fn load_latest(
     folder: &Path,
     model: &ModelConfig,
-    settings: &LearnerSettings,
+    settings: &UpdateSettings,
     compute: &Compute,
     run_spec_hash: u64,
 ) -> Result<Option<LearnerState>, CheckpointError> {
@@ -43,7 +43,7 @@ pub fn load_latest(
 pub fn load(
     path: &Path,
     model: &ModelConfig,
-    settings: &LearnerSettings,
+    settings: &UpdateSettings,
     compute: &Compute,
     run_spec_hash: u64,
 ) -> Result<LearnerState, CheckpointError> {

@@ -20,7 +20,7 @@ use crate::{
     error::UpdateError,
     noise::UpdateNoise,
     optimiser::adam::AdamSettings,
-    settings::LearnerSettings,
+    settings::UpdateSettings,
     tensors::flat_f64,
 };
 
@@ -103,7 +103,7 @@ struct Sizes {
 /// One case: a batch, all parameters before the update, and every tensor that must come out.
 pub(super) struct Case {
     config: Config,
-    pub(super) settings: LearnerSettings,
+    pub(super) settings: UpdateSettings,
     inputs: OwnedBatch,
     tensors: Tensors,
     /// Names of expectations that were not asked for yet.
@@ -220,7 +220,7 @@ impl Case {
 }
 
 impl Config {
-    fn settings(&self) -> LearnerSettings {
+    fn settings(&self) -> UpdateSettings {
         let by_lambda = if self.lambda.wanted().contains(&true) {
             AuxiliaryKind::of(&DIM)
         } else {
@@ -232,7 +232,7 @@ impl Config {
             let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
             (auxiliary_loss.name().to_owned(), table.into())
         });
-        LearnerSettings {
+        UpdateSettings {
             double_dqn: self.double_dqn,
             auxiliary_loss,
             condition_on_action: self
@@ -254,7 +254,7 @@ impl Config {
 fn inputs(
     tensors: &Tensors,
     obs: &Observation,
-    settings: &LearnerSettings,
+    settings: &UpdateSettings,
 ) -> Result<OwnedBatch, ParityError> {
     let rows = tensors.get("input.action")?.elem_count();
     let state = [rows, obs.height, obs.width, obs.channels];

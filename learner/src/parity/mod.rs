@@ -302,7 +302,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     let (device, kernels) = (&compute.device, compute.kernels);
     let named = case.parameters("online.", &model);
     let parameters = Parameters::from_tensors(&model, named, device)?;
-    let online = Network::with_kernels(&model, &parameters, kernels)?;
+    let online = Network::new(&model, &parameters, kernels)?;
     let key = key_parameters(case, &model, compute)?;
     let key = key.map(|key| Encoder::new(&model, &key, kernels));
     let key = key.transpose()?;

@@ -319,6 +319,10 @@ impl Fetcher {
             );
             return Ok(Some(Fetched::Finished));
         }
+        if partial.parts.is_empty() {
+            // Nothing was given, so draw anew: a shard that was not asked may hold back inserts until it hears how far the run is.
+            partial.withdraw();
+        }
         Ok(is_over.then_some(Fetched::Finished))
     }
 

@@ -31,21 +31,21 @@ const RECOVERY_PAUSE: Duration = Duration::from_secs(2);
 /// How often a thread that has nothing to send looks whether it should end.
 const TICK: Duration = Duration::from_millis(200);
 
-/// The learner's publisher; dropping it closes them.
+/// The learner's publisher; dropping it ends the answers about its status, a shutdown its threads.
 pub(crate) struct Publisher {
     /// The number by which the replay server knows this learner.
     pub(crate) learner: u64,
     status: Arc<Mutex<LearnerStatus>>,
     fetched: Arc<AtomicBool>,
-    weights: Arc<Newest<Weights>>,
-    pub(crate) affinity: Arc<Newest<AffinityUpdate>>,
+    weights: Arc<Outbox<Weights>>,
+    pub(crate) affinity: Arc<Outbox<AffinityUpdate>>,
     /// Of an update's rows each, sent in order, each until every shard has said that it has it.
-    pub(crate) priorities: Arc<Newest<PriorityUpdate>>,
+    pub(crate) priorities: Arc<Outbox<PriorityUpdate>>,
     _queryables: Vec<Queryable<()>>,
 }
 
-/// Keeps the newest of its kind until they are sent, the oldest first.
-pub(crate) struct Newest<T> {
+/// A bounded queue of what is sent, the oldest first; in a full one the oldest gives way.
+pub(crate) struct Outbox<T> {
     waiting: Mutex<VecDeque<T>>,
     most: usize,
     filled: Condvar,
@@ -55,7 +55,7 @@ pub(crate) struct Newest<T> {
     pub(crate) arrived: AtomicU64,
 }
 
-impl<T> Newest<T> {
+impl<T> Outbox<T> {
     fn of(most: usize) -> Arc<Self> {
         Arc::new(Self {
             waiting: Mutex::default(),
@@ -96,7 +96,7 @@ impl<T> Newest<T> {
 }
 
 impl Publisher {
-    /// Declares the status in every session, and starts the threads that send weights and affinity as those of `learner`.
+    /// Declares the status in every session, and starts the threads that send weights, affinity and priorities as those of `learner`.
     pub(crate) fn open(
         clients: &[RunClient],
         spec_hash: u64,
@@ -124,9 +124,9 @@ impl Publisher {
             learner,
             status,
             fetched,
-            weights: Newest::of(1),
-            affinity: Newest::of(1),
-            priorities: Newest::of(PRIORITIES_MAX),
+            weights: Outbox::of(1),
+            affinity: Outbox::of(1),
+            priorities: Outbox::of(PRIORITIES_MAX),
             _queryables: queryables,
         };
         let to_all = |what, timeout| Sender {
@@ -200,7 +200,7 @@ impl Sender {
     /// Starts a thread that sends until the shutdown; `message` makes the bytes of what is sent.
     fn start<T: Send + 'static, R: Request<Reply = Ack>>(
         mut self,
-        newest: Arc<Newest<T>>,
+        newest: Arc<Outbox<T>>,
         message: impl Fn(&T) -> Result<Sealed<R>, CodecError> + Send + 'static,
     ) -> std::io::Result<()> {
         let name = format!("{}-sender", self.what);
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn what_waits_or_is_being_sent_is_not_sent() {
-        let newest = Newest::of(1);
+        let newest = Outbox::of(1);
         let idle = || newest.idle.load(Ordering::Relaxed);
         assert!(idle());
         newest.put(1);

@@ -255,6 +255,11 @@ impl PartialBatch {
         true
     }
 
+    /// Gives up a batch of which no part has come, so that the next one is drawn anew.
+    pub(super) fn withdraw(&mut self) {
+        self.portions.iter_mut().for_each(|it| it.pending = 0);
+    }
+
     /// What all shards but `this` will have counted once each has given its pending rows.
     pub(super) fn other_shards(&self, this: usize) -> ShardCounts {
         let others = self.portions.iter().enumerate();

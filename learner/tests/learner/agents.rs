@@ -2,7 +2,7 @@
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
 use driml_learner::{
-    Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, OwnedBatch, Positives, UpdateError,
+    Agent, AuxiliaryKind, Batch, Lambda, OwnedBatch, Positives, UpdateError, UpdateSettings,
     auxiliary::{curl::CURL as CURL_ITEM, loss::MenuItem},
 };
 use driml_model::{Compute, ModelConfig};
@@ -39,8 +39,8 @@ fn only(losses: &Losses) -> f32 {
     losses[0].1
 }
 
-pub(crate) fn of(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
-    let settings = LearnerSettings {
+pub(crate) fn of(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, UpdateSettings) {
+    let settings = UpdateSettings {
         auxiliary_loss: kind,
         condition_on_action: false,
         own: curl_table((kind == CURL).then_some(KEY_TAU)),
@@ -300,7 +300,7 @@ fn batches_that_an_agent_cannot_use_are_refused() {
 
 #[test]
 fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
-    let with = |kind, lambda, condition_on_action, own: &str| LearnerSettings {
+    let with = |kind, lambda, condition_on_action, own: &str| UpdateSettings {
         auxiliary_loss: kind,
         condition_on_action,
         own: own.parse().unwrap(),

@@ -1,7 +1,7 @@
 //! Settings that float64 holds and float32 does not are refused by name, before anything is learned with them.
 //! What is computed within the ranges is tested beside each routine.
 
-use driml_learner::{AffinityConfig, LearnerSettings};
+use driml_learner::{AffinityConfig, UpdateSettings};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -20,7 +20,7 @@ adam.eps      : 0.0 1e-46 1e-30 1e39           : 1e-15 1e-8 1.0
 ";
 
 /// Settings with one of them changed.
-fn with(name: &str, value: f64) -> LearnerSettings {
+fn with(name: &str, value: f64) -> UpdateSettings {
     let mut all = toml::Table::try_from(settings(ALL_DIM)).unwrap();
     let (table, key) = match name.split_once('.') {
         Some((table, key)) => (all[table].as_table_mut().unwrap(), key),

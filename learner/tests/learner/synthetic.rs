@@ -5,7 +5,7 @@ use std::{collections::HashMap, fmt::Display};
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnedSettings, LearnerSettings, OwnedBatch,
+    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnedSettings, OwnedBatch, UpdateSettings,
     auxiliary::{cpc, curl, dim},
     parity::deviation::REFERENCE,
 };
@@ -57,8 +57,8 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
     }
 }
 
-pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
-    LearnerSettings {
+pub(crate) fn settings(lambda: Lambda) -> UpdateSettings {
+    UpdateSettings {
         double_dqn: false,
         auxiliary_loss: if lambda == NO_DIM {
             AuxiliaryKind::NONE
@@ -84,7 +84,7 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
 
 pub(crate) fn made(
     model: ModelConfig,
-    settings: LearnerSettings,
+    settings: UpdateSettings,
     compute: &Compute,
     seed: u64,
 ) -> Agent {
@@ -101,7 +101,7 @@ pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
 }
 
 /// A learner whose head is made so.
-pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64) -> Agent {
+pub(crate) fn agent_with(head: HeadConfig, settings: UpdateSettings, seed: u64) -> Agent {
     let model = ModelConfig {
         head,
         ..model(settings.lambda)

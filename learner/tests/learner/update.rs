@@ -2,7 +2,7 @@
 //! It compares with no outside numbers: `parity` does, and at extreme inputs the property "whole update" of `driml experiment stability`.
 
 use candle_core::Device;
-use driml_learner::{LearnerSettings, UpdateNoise};
+use driml_learner::{UpdateNoise, UpdateSettings};
 use driml_model::{Compute, HeadConfig, Parameters};
 use driml_protocol::NO_ACTION;
 
@@ -154,7 +154,7 @@ fn learners_of_one_process_do_not_touch_each_other() {
 /// Every update has its own noise, and in it each of the three networks; it is a function of the seed and the number of the update.
 #[test]
 fn noise_is_drawn_anew_for_each_update_and_each_network() {
-    let settings = LearnerSettings {
+    let settings = UpdateSettings {
         double_dqn: true,
         ..settings(NO_DIM)
     };

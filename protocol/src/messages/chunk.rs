@@ -254,9 +254,9 @@ pub enum InsertReply {
         /// Whether the replay server keeps the chunk and will store it: then a [`ChunkPoll`] is enough, else it must be sent again.
         kept: bool,
     },
-    /// Not stored: chunks before it are missing; send from this sequence number on.
+    /// Not stored: chunks before it are missing. The sender repeats them from its first that was not acknowledged.
     OutOfOrder {
-        /// The sequence number that is expected.
+        /// The sequence number that is expected, for a person.
         expected: u64,
     },
     /// Not stored, and no longer wanted: the run has all the transitions it asked for.

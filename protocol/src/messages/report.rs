@@ -131,7 +131,7 @@ pub struct ProcessStatus {
     pub connected: bool,
     /// Seconds for which it has been connected, or gone.
     pub since_s: f64,
-    /// How often it has joined the run.
+    /// How often it has joined since this replay server started.
     pub lives: u32,
     /// Seconds since its last chunk, or request for a batch; none before the first.
     pub last_seen_s: Option<f64>,

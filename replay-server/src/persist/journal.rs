@@ -126,7 +126,7 @@ impl Journal {
     }
 
     pub(crate) fn flush(&mut self) {
-        self.is_ready();
+        self.write_pending();
         self.syncer.flush();
     }
 
@@ -152,7 +152,7 @@ impl Journal {
     }
 
     /// Writes what the disk has refused before; whether all of it is written now.
-    pub(crate) fn is_ready(&mut self) -> bool {
+    pub(crate) fn write_pending(&mut self) -> bool {
         let pending = std::mem::take(&mut self.pending);
         let is_written = pending.is_empty() || self.write(&pending, &[]);
         if !is_written {
@@ -167,7 +167,7 @@ impl Journal {
         let record = record::head(RecordKind::Note, self.ordinal, &body, 0);
         self.ordinal += 1;
         self.pending.extend_from_slice(&record);
-        self.is_ready();
+        self.write_pending();
     }
 
     /// Appends a chunk that is to be stored. `false`: the disk refuses, and it must not be. An error: it makes no message.
@@ -176,7 +176,7 @@ impl Journal {
         let head = head.ok_or("the chunk is larger than a message may be")?;
         let payload = packed.chunk.payload();
         let record = record::head(RecordKind::Chunk, self.ordinal, head, payload.len());
-        let is_written = self.is_ready() && self.write(&record, payload);
+        let is_written = self.write_pending() && self.write(&record, payload);
         self.ordinal += u64::from(is_written);
         Ok(is_written)
     }
@@ -265,7 +265,7 @@ impl Journal {
     /// Begins another segment with `snapshot`. If the disk refuses, the newest one grows.
     pub(super) fn rotate(&mut self, snapshot: &Snapshot) {
         // What waits to be written has its place before the end of the old one.
-        if !self.is_ready() {
+        if !self.write_pending() {
             return;
         }
         let number = self.newest().number + 1;

@@ -144,10 +144,10 @@ pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
 
 /// What is written, and what is reported of it.
 impl Replay {
-    /// Whether all notes are on disk; until then joins and `Leave`s get no answer.
-    pub(crate) fn is_ready(&mut self) -> bool {
+    /// Writes notes that the disk refused before; until all are written, joins and `Leave`s get no answer.
+    pub(crate) fn write_pending(&mut self) -> bool {
         let log = self.log.as_mut();
-        log.is_none_or(Journal::is_ready)
+        log.is_none_or(Journal::write_pending)
     }
 
     /// Whether the disk refused what was to be written last.

@@ -69,7 +69,7 @@ impl Service {
                 }),
                 Err(rejected) => rejected,
             };
-            if !state.replay.is_ready() {
+            if !state.replay.write_pending() {
                 return None;
             }
             if let JoinReply::Refused { why } = &reply {

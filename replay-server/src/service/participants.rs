@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn of_very_many_parts_only_the_newest_warnings_are_passed_on() {
+    fn of_very_many_processes_only_the_newest_warnings_are_passed_on() {
         let now = Instant::now();
         let mut participants = Participants::new(now);
         for actor in 0..200 {

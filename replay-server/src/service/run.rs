@@ -127,7 +127,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         reading: Reading::begin(args.ending.clone()),
         config_toml: args.config_toml.clone(),
     });
-    let answers = Answers::declare(&client, &admission, limits, &config.sampling);
+    let answers = Queries::declare(&client, &admission, limits, &config.sampling);
     let (queryables, mut threads) = answers.map_err(declaring)?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
@@ -253,14 +253,14 @@ type Queryables = Vec<Queryable<()>>;
 type Threads = Vec<JoinHandle<()>>;
 
 /// Everything that the replay server answers: each kind of message by separate threads.
-struct Answers<'a> {
+struct Queries<'a> {
     client: &'a RunClient,
     admission: &'a Arc<Admission>,
     queryables: Queryables,
     threads: Threads,
 }
 
-impl<'a> Answers<'a> {
+impl<'a> Queries<'a> {
     /// Declares all of it, where rows are drawn by `sampling`. Until the admission is open every query is answered with "retry". Dropping
     /// the queryables ends the answers, and with them the threads.
     fn declare(

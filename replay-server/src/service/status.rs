@@ -29,7 +29,7 @@ impl Service {
                 state.say("leave", &format!("a `Leave` was refused: {why}"));
             }
             // Also if it was refused: the actor ends.
-            state.replay.is_ready().then_some(Ack)
+            state.replay.write_pending().then_some(Ack)
         });
     }
 
@@ -134,7 +134,7 @@ impl Service {
         }
     }
 
-    /// Waits until the run is over or this process `ending`, and the other processes have left; or for a shutdown. With `stay` the end
+    /// Waits until the run is over or this process `ending`, and the other processes have left; or for a shutdown. With `keep_alive` the end
     /// of the run does not end it.
     pub(super) fn wait_until_over(&self, ending: &Shutdown, keep_alive: bool) {
         let mut waits: Option<(bool, Instant)> = None;

@@ -216,7 +216,7 @@ fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
 }
 
 #[test]
-fn a_claim_says_what_became_of_a_chunk() {
+fn a_poll_says_what_became_of_a_chunk() {
     let mut replay = small(&Config {
         transitions_max: Some(12),
         ..Config::unlimited(1000)

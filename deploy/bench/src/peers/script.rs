@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
+use driml_machine::process_env;
 use serde::Deserialize;
 
 use crate::{
@@ -127,8 +128,7 @@ impl Script {
 
 /// Runs this program for a component's figures. Its progress goes to stderr.
 pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
-    let program = std::env::current_exe().context("finding this program's own file")?;
-    let mut command = Command::new(program);
+    let mut command = Command::new(process_env::program());
     command.args(["bench", &component.name(), "--json", "-"]);
     command.args(["--threads", &flags.threads.to_string()]);
     command.args(flags.quick.then_some("--quick"));

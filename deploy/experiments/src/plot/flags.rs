@@ -11,8 +11,8 @@ pub struct PlotArgs {
     /// Run folders; runs that differ only in their seed become one line with a band, and other folders are skipped
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
-    /// Column of metrics.csv to plot; may be given several times. "return", "loss", "k" and "speed" stand for mean_return,
-    /// c51_kl, mean_k and frames_per_second [default: these, the auxiliary losses, and more]
+    /// Column of metrics.csv to plot [default: the main ones]; may be given several times. "return", "loss", "k" and "speed" stand for
+    /// mean_return, c51_kl, mean_k and frames_per_second
     #[arg(long, value_name = "COLUMN")]
     pub(crate) column: Vec<String>,
     /// Horizontal axis

@@ -184,29 +184,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_spread_has_a_range() {
-        let spread = Spread::of([1.0, 3.0]).unwrap();
-        assert_eq!((spread.mean, spread.min, spread.max), (2.0, 1.0, 3.0));
-        assert_eq!(Spread::of([]), None);
-    }
-
-    #[test]
-    fn an_interval_of_few_values_has_the_mean_as_often_as_it_says() {
-        let mut rng = ChaCha8Rng::seed_from_u64(5);
-        for count in [2, 3, 5, 10] {
-            let rounds = 4_000;
-            let has_it = (0..rounds).filter(|_| {
-                let values: Vec<f64> = (0..count).map(|_| 7.0 + 3.0 * normal(&mut rng)).collect();
-                let (low, high) = interval(&values).unwrap().ends.unwrap();
-                (low..=high).contains(&7.0)
-            });
-            let share = has_it.count() as f64 / f64::from(rounds);
-            // Three standard errors of 4,000 rounds are 0.010.
-            assert!((0.93..0.97).contains(&share), "{count} values: {share}");
-        }
-    }
-
-    #[test]
     fn a_difference_is_welchs() {
         // By hand: both of variance 1 and three values, so 4 degrees of freedom, and 2.776 * sqrt(2 / 3) = 2.267.
         let found = difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();

@@ -34,7 +34,7 @@ impl DimLearner {
     ) -> anyhow::Result<Self> {
         let parameters = Parameters::init(model, rng, &Device::Cpu)?;
         Ok(Self {
-            network: Network::new(model, &parameters)?,
+            network: Network::new(model, &parameters, Kernels::FUSED)?,
             adam: Adam::new(adam, &parameters, Kernels::FUSED)?,
             parameters,
             dim,

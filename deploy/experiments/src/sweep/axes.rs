@@ -1,11 +1,11 @@
 //! The axes of a sweep and its cells: every combination of the values that a command line names.
-//! What a setting means is for `driml local`, which takes each of them as it stands here.
+//! What a setting means is for `driml train`, which takes each of them as it stands here.
 
 use driml_machine::error::{Usage, usage};
 use serde::{Deserialize, Serialize};
 
 /// Most runs of a grid; more are a slip of the keyboard.
-const RUNS_MAX: usize = 10_000;
+pub(super) const RUNS_MAX: usize = 10_000;
 
 /// What is varied, or fixed if it has one value alone.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -7,14 +7,13 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    axes::{Axis, Cell, cells},
+    axes::{Axis, Cell, RUNS_MAX, cells},
     plan::{Call, Made, PlannedRun, install},
     queue,
-    runs::SEEDS_FOUND_MAX,
 };
 use crate::{
     cache::{Session, settings_of},
-    flags::{ExperimentFlags, SweepArgs},
+    flags::{ExperimentFlags, SEEDS_MAX, SweepArgs},
     plot::{self, flags::PlotArgs},
     stats::{Spread, interval},
 };
@@ -52,6 +51,8 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let (settings, seeds) = settings(args, kept)?;
     let axes = &settings.axes;
     let cells = cells(axes, args.seeds)?;
+    // Of that many cells no sweep has more.
+    let seeds = seeds.min((RUNS_MAX / cells.len()) as u32);
     let mut plans = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
         let config = settings.call(cell, 1).config();
@@ -62,7 +63,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         plans.extend((1..=seeds).map(|seed| {
             let name = format!("{}-seed{seed}", folder_name(axes, cell, at));
             let call = settings.call(cell, seed);
-            (at, PlannedRun::new(name, call, config.frames()))
+            (at, PlannedRun::new(&name, call, config.frames()))
         }));
     }
     plans.sort_by_key(|(_, plan)| plan.call.seed);
@@ -101,7 +102,7 @@ fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Setting
         frames: asked.frames.or(kept.frames),
         preset: asked.preset.or(kept.preset),
     };
-    Ok((settings, args.seeds.max(SEEDS_FOUND_MAX)))
+    Ok((settings, SEEDS_MAX))
 }
 
 /// Worlds and agents first, where there are several, then the settings as they were named.
@@ -171,9 +172,7 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
             _ => format!("-{key}={value}"),
         };
     }
-    let fits = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
-    let letters = name.chars().map(|it| if fits(it) { it } else { '-' });
-    letters.take(NAME_LETTERS).collect()
+    name.chars().take(NAME_LETTERS).collect()
 }
 
 /// What came out, a row a cell, with empty cells where a number is missing; the point of a run is its cell's number.
@@ -215,7 +214,7 @@ mod tests {
     fn a_report_need_not_repeat_what_the_folder_was_made_with() {
         let of = |line: &str, kept| settings(&parsed(line), kept).unwrap();
         let kept = || Some(of("--agent c51,curl --frames 320", None).0);
-        assert_eq!(of("--report", kept()), (kept().unwrap(), SEEDS_FOUND_MAX));
+        assert_eq!(of("--report", kept()), (kept().unwrap(), SEEDS_MAX));
         let asked = of("--report --agent c51 --seeds 2", kept());
         assert_eq!(asked, of("--agent c51 --seeds 2", None));
     }
@@ -231,8 +230,8 @@ mod tests {
         .map(|it| Axis::parse(it).unwrap());
         let cells = cells(&axes, 1).unwrap();
         let name = |at: usize| folder_name(&axes, &cells[at], at);
-        assert_eq!(name(0), "1-c51-lr=1e-4-horizon=-1--2-");
-        assert_eq!(name(7), "8-curl-lr=2.5e-4-horizon=x-y");
+        assert_eq!(name(0), "1-c51-lr=1e-4-horizon=[1, 2]");
+        assert_eq!(name(7), "8-curl-lr=2.5e-4-horizon=x y");
     }
 
     #[test]

@@ -73,9 +73,12 @@ pub(crate) struct PlannedRun {
 }
 
 impl PlannedRun {
-    pub(crate) const fn new(name: String, call: Call, frames: u64) -> Self {
+    /// One whose folder's name has a dash for each letter that does not belong there, such as those of a world's command.
+    pub(crate) fn new(name: &str, call: Call, frames: u64) -> Self {
+        let fits = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
+        let letters = name.chars().map(|it| if fits(it) { it } else { '-' });
         Self {
-            name,
+            name: letters.collect(),
             call,
             frames,
             episodes: None,

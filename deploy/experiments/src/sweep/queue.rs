@@ -51,7 +51,6 @@ pub(crate) fn make<P>(
         runs,
         jobs,
         memory_share: Machine::this().memory_bytes / u64::from(jobs),
-        commit: commit()?,
         waiting: VecDeque::new(),
         running: Vec::new(),
     };
@@ -78,7 +77,7 @@ pub(crate) fn make<P>(
     Ok(made)
 }
 
-/// The commit that this program was built from, as its `--version` says in brackets.
+/// The commit that this program's file was built from, as `--version` says in brackets: another build may have replaced it.
 fn commit() -> anyhow::Result<String> {
     let mut command = Command::new(process_env::program());
     let output = command.arg("--version").output();
@@ -94,8 +93,6 @@ struct Queue {
     jobs: u32,
     /// Bytes of memory for each of the runs at once.
     memory_share: u64,
-    /// Of this program.
-    commit: String,
     waiting: VecDeque<Job>,
     running: Vec<Running>,
 }
@@ -254,7 +251,7 @@ impl Queue {
                 aside.display()
             ));
         }
-        self.runs.write_call(plan, &self.commit, resumed)?;
+        self.runs.write_call(plan, &commit()?, resumed)?;
         let mut command = self.command(plan, resumed);
         command
             .stdin(Stdio::null())
@@ -383,14 +380,13 @@ mod tests {
     /// A queue in `root`, where the run of its only plan is finished.
     fn queue(root: &Path) -> (Queue, PlannedRun) {
         let runs = Runs::open(root).unwrap();
-        let plan = PlannedRun::new("run".into(), Call::default(), 10);
+        let plan = PlannedRun::new("run", Call::default(), 10);
         finish(&runs.folder(&plan));
         runs.write_call(&plan, "abc", false).unwrap();
         let queue = Queue {
             runs,
             jobs: 1,
             memory_share: 7,
-            commit: "def".into(),
             waiting: [Job::of(plan.clone())].into(),
             running: Vec::new(),
         };

@@ -12,8 +12,6 @@ use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far,
 use super::plan::{FinishedRun, PlannedRun};
 use crate::cache::RUNS;
 
-/// Seeds up to which finished runs are looked for.
-pub(crate) const SEEDS_FOUND_MAX: u32 = 64;
 /// Bytes at the end of a run's output that are shown if it fails.
 const LAST_WORDS_BYTES: usize = 1200;
 
@@ -155,7 +153,7 @@ pub(super) mod tests {
                 frames: Some(frames),
                 ..Call::default()
             };
-            PlannedRun::new("run".into(), call, frames)
+            PlannedRun::new("run", call, frames)
         };
         let folder = runs.folder(&plan(10));
         finish(&folder);

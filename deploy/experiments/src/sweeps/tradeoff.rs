@@ -28,7 +28,7 @@ use self::{
 };
 use crate::{
     cache::{self, Session},
-    flags::{TradeoffArgs, this_command},
+    flags::{SEEDS_MAX, TradeoffArgs, this_command},
     page::fill,
     plot::Run,
     stats::Spread,
@@ -36,7 +36,7 @@ use crate::{
         plan::{FinishedRun, Made, Planned, install},
         queue,
         results::Played,
-        runs::{Runs, SEEDS_FOUND_MAX},
+        runs::Runs,
     },
 };
 
@@ -220,7 +220,7 @@ impl Tradeoff<'_> {
         let mut wanted: Vec<Planned<Point>> = Vec::new();
         // Seed by seed, so that what was stopped has one seed of everything before it has two of anything. Further seeds that another
         // call made are on the page too.
-        for seed in 1..=self.settings.seeds_of(true).max(SEEDS_FOUND_MAX) {
+        for seed in 1..=SEEDS_MAX {
             for (of, &is_chosen) in self.settings.levels.iter().zip(chosen) {
                 for (point, is_base) in [(&of.base, true), (&of.point, false)] {
                     let run = self.settings.common.run(point, seed);

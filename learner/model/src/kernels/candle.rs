@@ -1,5 +1,5 @@
 //! The network's layers as compositions of candle's own operations, for devices that this project has no kernels for.
-//! Same arguments, results and gradients as in `conv` and `linear`; only shapes are checked there and not here.
+//! Same arguments, results and gradients as in `conv`, `linear`, `impala`, `grouped` and `dots`; only shapes are checked there and not here.
 //!
 //! candle's convolution has a naive backward pass on every device. A convolution here is a matrix product of patches with the
 //! kernel, so that its gradients are matrix products too.

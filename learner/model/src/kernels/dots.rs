@@ -37,7 +37,7 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
         bail!("dot products of {:?} and {:?}", psi.shape(), phi.shape());
     }
     let (rows, psi_locations, embedding_dim) = anchors;
-    let operation = Dots {
+    let operation = DotProducts {
         rows,
         embedding_dim,
         locations,
@@ -47,7 +47,7 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     apply_to_two(operation, [psi, phi], (locations, rows, rows))
 }
 
-struct Dots {
+struct DotProducts {
     rows: usize,
     embedding_dim: usize,
     locations: usize,
@@ -55,7 +55,7 @@ struct Dots {
     phi_locations: usize,
 }
 
-impl Dots {
+impl DotProducts {
     /// The vectors [B, R] of location `at` among `vectors` [B, locations, R].
     fn located<'a>(&self, vectors: &'a [f32], locations: usize, at: usize) -> Scalars<'a, f32> {
         if locations == 1 {
@@ -116,7 +116,7 @@ impl Dots {
     }
 }
 
-impl Operation<2> for Dots {
+impl Operation<2> for DotProducts {
     const NAME: &'static str = "dot-products";
 
     type Kept = ();

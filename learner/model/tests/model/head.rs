@@ -19,7 +19,7 @@ fn a_noisy_layer_starts_with_its_sigma() {
         assert!(found.iter().all(is_sigma));
     }
     let noise = HeadNoise::draw(&noisy, &mut rng(5));
-    let plain = Network::new(&small(), &parameters(&small(), 1)).unwrap();
+    let plain = Network::new(&small(), &parameters(&small(), 1), Kernels::FUSED).unwrap();
     let f4 = floats(&[6, 19], &mut rng(4));
     assert!(plain.logits(&f4, noise.as_ref()).is_err());
 }
@@ -35,7 +35,7 @@ fn values_over_a_support_far_from_0_are_those_near_it_moved() {
     let logits = floats(&[30, 5, 11], &mut rng(4));
     let parameters = parameters(&near, 1);
     let q_values = |config: &ModelConfig, kernels| {
-        let network = Network::with_kernels(config, &parameters, kernels).unwrap();
+        let network = Network::new(config, &parameters, kernels).unwrap();
         values(&network.q_values(&logits).unwrap())
     };
     let expected = q_values(&near, Kernels::FUSED);
@@ -91,7 +91,7 @@ fn a_loss_s_own_layer_is_linear_and_only_the_online_network_s() -> Result<()> {
         ..small()
     };
     let parameters = parameters(&config, 1);
-    let network = Network::new(&config, &parameters).unwrap();
+    let network = Network::new(&config, &parameters, Kernels::FUSED).unwrap();
     let features = network.features(&frames(&config, 4, &mut rng(5)));
     let f4 = features.unwrap().f4;
     let next = network.loss_layer("next", &f4).unwrap();

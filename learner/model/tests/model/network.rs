@@ -18,7 +18,7 @@ fn outputs_and_gradients(
     parameters: &Parameters,
     kernels: Kernels,
 ) -> Result<(Vec<Tensor>, Backward)> {
-    let network = Network::with_kernels(config, parameters, kernels).unwrap();
+    let network = Network::new(config, parameters, kernels).unwrap();
     let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
     let noise = HeadNoise::draw(config, &mut rng(3));
@@ -83,7 +83,7 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
         let head = streams * if noise.is_some() { 4 } else { 2 };
         let parameters = with_biases(&config);
         let kernels = Kernels::Fused(precision);
-        let network = Network::with_kernels(&config, &parameters, kernels).unwrap();
+        let network = Network::new(&config, &parameters, kernels).unwrap();
         let batch = frames(&config, 61, &mut rng(2));
         let run = || {
             let features = network.features(&batch).unwrap();
@@ -119,7 +119,7 @@ fn heads_that_are_left_out_are_not_there() {
     };
     let config = without(|dim| (dim.psi3, dim.phi4) = (false, false));
     assert!(!has(&config, "dim.psi3") && !has(&config, "dim.phi4"));
-    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
+    let network = Network::new(&config, &parameters(&config, 1), Kernels::FUSED).unwrap();
     let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
     let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
     let psi3 = network.psi3(features.local().unwrap(), &actions);
@@ -135,7 +135,7 @@ fn heads_that_are_left_out_are_not_there() {
 #[test]
 fn inputs_that_do_not_fit_are_errors() {
     let config = small();
-    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
+    let network = Network::new(&config, &parameters(&config, 1), Kernels::FUSED).unwrap();
     let batch = frames(&config, 2, &mut rng(6));
     let features = network.features(&batch).unwrap();
     let floats = batch.to_dtype(DType::F32);
@@ -210,7 +210,7 @@ fn configurations_that_cannot_work_are_errors() {
 fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
     let config = small();
     let (parameters, batch) = (with_biases(&config), frames(&config, 9, &mut rng(4)));
-    let network = Network::new(&config, &parameters).unwrap();
+    let network = Network::new(&config, &parameters, Kernels::FUSED).unwrap();
     // Every parameter twice, once through each half of the batch.
     let features = network.features(&batch).unwrap();
     let halves = [features.narrow(0, 4)?, features.narrow(4, 5)?];

@@ -1,7 +1,7 @@
 //! The policy against the network it must agree with.
 //! Loading broken weights is tested with the weights.
 
-use driml_model::{HeadConfig, HeadNoise, Network, PolicyNetwork, Precision, TorsoName};
+use driml_model::{HeadConfig, HeadNoise, Kernels, Network, PolicyNetwork, Precision, TorsoName};
 
 use crate::support::{
     bytes, frames, kinds, parameters, policy, pool, q_values, residual, rng, small, small_with,
@@ -12,7 +12,7 @@ use crate::support::{
 fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
     for config in kinds() {
         let parameters = parameters(&config, 3);
-        let network = Network::new(&config, &parameters).unwrap();
+        let network = Network::new(&config, &parameters, Kernels::FUSED).unwrap();
         let mut policy = policy(&config, &parameters, Precision::F32);
         for batch in [1, 2, 5, 33, 70] {
             let states = bytes(batch * config.frame_len(), &mut rng(batch as u64));

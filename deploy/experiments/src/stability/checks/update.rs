@@ -2,7 +2,7 @@
 
 use candle_core::Device;
 use driml_learner::{
-    Agent, Compute, LearnerSettings, NetworkParameters, OwnedBatch,
+    Agent, Compute, NetworkParameters, OwnedBatch, UpdateSettings,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
 use driml_machine::resources::Machine;
@@ -83,7 +83,7 @@ impl Setting {
             v_max: self.support.1,
             ..run.model
         };
-        let settings = LearnerSettings {
+        let settings = UpdateSettings {
             tanh_clip: self.tanh_clip,
             ..run.learner.update
         };

@@ -3,7 +3,8 @@
 
 use candle_core::{Device, Tensor};
 use driml_model::{
-    EXPECTED_RETURN_ERROR, ModelConfig, ModelError, Network, PolicyNetwork, Precision, StoredAs,
+    EXPECTED_RETURN_ERROR, Kernels, ModelConfig, ModelError, Network, PolicyNetwork, Precision,
+    StoredAs,
 };
 
 use crate::{small, stability::property::*};
@@ -44,7 +45,7 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         }
     }
     let config = small::config(atoms, 1, support);
-    let network = Network::new(&config, &small::parameters(&config, &[])?)?;
+    let network = Network::new(&config, &small::parameters(&config, &[])?, Kernels::FUSED)?;
     let batch = Tensor::from_slice(&logits, (1, 1, atoms), &Device::Cpu)?;
     let found = network.q_values(&batch)?.flatten_all()?.to_vec1::<f32>()?[0];
     let (low, high) = (f64::from(support.0), f64::from(support.1));

@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Tensor};
 use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
-use driml_learner::{LearnerSettings, auxiliary::dim::Dim};
+use driml_learner::{UpdateSettings, auxiliary::dim::Dim};
 use driml_model::{Features, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -40,7 +40,7 @@ pub(super) struct Settings {
 pub(super) struct Task {
     pub(super) world: IsingConfig,
     pub(super) model: ModelConfig,
-    pub(super) learner: LearnerSettings,
+    pub(super) learner: UpdateSettings,
     pub(super) settings: Settings,
 }
 

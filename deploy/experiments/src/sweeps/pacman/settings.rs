@@ -91,7 +91,7 @@ impl Settings {
             let name = format!("epsilon{epsilon}-seed{seed}");
             let set = [format!("world.epsilon={epsilon}")];
             let call = self.call(&of.agent, seed, of.frames, &set);
-            let plan = PlannedRun::new(name, call, of.frames);
+            let plan = PlannedRun::new(&name, call, of.frames);
             plans.push((Point::Epsilon(epsilon), plan));
         }
         for (part, part_name) in PART_NAMES.iter().enumerate() {
@@ -115,7 +115,7 @@ impl Settings {
                 let plan = PlannedRun {
                     episodes: Some(episodes),
                     units: episodes * EPISODE_FRAMES,
-                    ..PlannedRun::new(name, call, frames)
+                    ..PlannedRun::new(&name, call, frames)
                 };
                 plans.push((Point::Tasks(part, agent.clone()), plan));
             }

@@ -93,7 +93,7 @@ impl Settings {
                 agent: name.clone(),
             };
             let name = format!("{}-{name}-seed{seed}", point.game);
-            plans.push((point, PlannedRun::new(name, call, self.frames)));
+            plans.push((point, PlannedRun::new(&name, call, self.frames)));
         }
         plans
     }

@@ -98,8 +98,8 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<M
     let restored = restored.with_context(|| format!("{} has no checkpoint", folder.display()))?;
     let reference = restored.agent;
     let parameters = NetworkParameters {
-        online: reference.online().copy()?,
-        target: reference.target().copy()?,
+        online: reference.online().clone(),
+        target: reference.target().clone(),
         key: None,
     };
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?

@@ -250,7 +250,8 @@ impl Common {
             frames: Some(self.frames),
             sets: self.sets.iter().chain(&point.sets).cloned().collect(),
         };
-        PlannedRun::new(format!("{}-seed{seed}", point.key), call, self.frames)
+        let name = format!("{}-seed{seed}", point.key);
+        PlannedRun::new(&name, call, self.frames)
     }
 }
 
