@@ -57,6 +57,7 @@ done
 whole "$actors" 0 1024 || fail "--actors $actors: 0 to 1024 actors can have a certificate"
 whole "$days" 1 36500 || fail "--days $days: take 1 to 36500"
 names=${names#,}
+hosts=$names
 [ -n "$names" ] || names='DNS:localhost,IP:127.0.0.1,IP:::1'
 command -v openssl >/dev/null || fail "openssl is not there: install the package openssl"
 
@@ -101,6 +102,8 @@ certificate() {
     put "$1"
 }
 
+[ -z "$hosts" ] || [ ! -e replay-server.pem ] ||
+    printf 'warning: %s/replay-server.pem stays, for the hosts it was made for: to change them, remove it and its .key first\n' "$dir" >&2
 certificate replay-server serverAuth "subjectAltName=$names"
 certificate learner clientAuth ''
 certificate observer clientAuth ''

@@ -86,7 +86,7 @@ class Gymnasium:
         from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
         self.numpy = numpy
-        if inspect.signature(make).parameters:
+        if takes_copies(make):
             self.env = make(copies)
         else:
             vector = AsyncVectorEnv if workers else SyncVectorEnv
@@ -324,7 +324,7 @@ def offers_state(layer):
 
 
 def is_ale(layer):
-    return type(layer).__module__.startswith("ale_py.") and "ale" in vars(layer)
+    return type(layer).__module__.startswith("ale_py.") and hasattr(vars(layer).get("ale"), "act")
 
 
 def made_with():
@@ -332,21 +332,27 @@ def made_with():
     return {"python": platform.python_version()} | {name: sys.modules[name].__version__ for name in names}
 
 
+def takes_copies(make):
+    """Whether it gives a vector of as many copies as it is told."""
+    needed = lambda it: it.default is it.empty and it.kind in (it.POSITIONAL_ONLY, it.POSITIONAL_OR_KEYWORD)
+    return any(needed(it) or it.name in ("copies", "num_envs") for it in inspect.signature(make).parameters.values())
+
+
 def maker(args):
     """What makes the environment that the command line asks for."""
+    sys.path.append(os.getcwd())
+    imports = args.imports + ["ale_py"] * args.env.startswith("ALE/")
+    for module in imports:
+        importlib.import_module(module)
     if ":" in args.env:  # A function of one's own; `MODULE:ID` of Gymnasium is `--import MODULE ID` here.
         module, function = args.env.split(":", 1)
-        sys.path.insert(0, os.getcwd())
+        unused = [flag for flag in ("atari", "clip", "pixels", "size", "grey") if getattr(args, flag)] + ["kwargs"] * (args.kwargs != "{}")
+        if unused:
+            sys.exit(f"{args.env} makes its environment itself, and --{unused[0]} is for an id of Gymnasium: leave it out, and wrap the environment in {function}")
         return getattr(importlib.import_module(module), function)
     import gymnasium
     from gymnasium import wrappers
 
-    if args.env.startswith("ALE/"):
-        import ale_py
-
-        gymnasium.register_envs(ale_py)
-    for module in args.imports:
-        importlib.import_module(module)
     options = json.loads(args.kwargs)
     if args.atari:  # Every frame of the emulator is asked for, and four of them made one step here.
         options = {"frameskip": 1, "repeat_action_probability": 0.25} | options
@@ -354,6 +360,8 @@ def maker(args):
         options = {"render_mode": "rgb_array"} | options
 
     def make():
+        for module in imports:  # A worker may be an interpreter that has not imported them.
+            importlib.import_module(module)
         env = gymnasium.make(args.env, **options)
         if args.atari:
             # Dopamine's: 4 frames a step, the larger of the last two, 84 x 84 grey, a life is not an episode, sticky actions and so no no-ops.
@@ -373,7 +381,7 @@ def maker(args):
 
 def parser():
     parser = argparse.ArgumentParser(description="A Gymnasium environment as a world of driml.")
-    parser.add_argument("env", help="an id such as ALE/Pong-v5, or MODULE:FUNCTION: a function without arguments that gives an environment, or with one, the number of copies, that gives a vector environment")
+    parser.add_argument("env", help="an id such as ALE/Pong-v5, or MODULE:FUNCTION: a function without required arguments that gives an environment, or with one, the number of copies, that gives a vector environment")
     parser.add_argument("--atari", action="store_true", help="Dopamine's preprocessing")
     parser.add_argument("--clip", action="store_true", help="rewards are cut to -1..1, as Dopamine's agents do; returns are of those then")
     parser.add_argument("--pixels", action="store_true", help="frames are what the environment renders")

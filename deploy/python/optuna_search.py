@@ -19,7 +19,7 @@ except ModuleNotFoundError:
 
 
 def suggest(trial):
-    """The settings of a trial, as `driml train --set` takes them; `driml presets --game G --agent A` lists all."""
+    """The settings of a trial, as `driml train --set` takes them; `driml presets --env G --agent A` lists all."""
     return {
         "learner.update.adam.lr": trial.suggest_float("lr", 1e-5, 1e-2, log=True),
         "replay.replay_ratio": trial.suggest_categorical("replay_ratio", [4, 8, 16]),

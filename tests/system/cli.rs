@@ -68,7 +68,10 @@ fn files_and_runs_that_are_not_there() {
             "parity none.safetensors",
             "error: cannot read none.safetensors: No such file or directory (os error 2)\n",
         ),
-        ("actor --connect unixsock-stream/absent.sock", "error: "),
+        (
+            "actor --connect unixsock-stream/absent.sock",
+            "there is no such socket",
+        ),
         ("man /proc/none/man1", "writing pages into /proc/none/man1"),
         (
             "experiment random-walk --smoke --out odd",

@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_745),
-    ("actor", 11_100),
-    ("replay-server", 11_210),
-    ("learner", 23_900),
+    ("protocol", 7_750),
+    ("actor", 11_130),
+    ("replay-server", 11_220),
+    ("learner", 23_860),
     ("deploy", 31_210),
-    ("tests", 10_600),
+    ("tests", 10_635),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -126,6 +126,12 @@ fn strangers_at_a_replay_server() {
         ("not valid yet", &new, Some("learner")),
         ("a replay server's", &good, Some("replay-server")),
     ];
+    let learner = raw_tls("connect", &good, Some("learner"));
+    let accepted = open_raw(&[
+        ("connect/endpoints", format!("[{endpoint:?}]")),
+        ("transport/link/tls", learner),
+    ]);
+    assert!(accepted.is_ok(), "else what is below says nothing");
     // Each takes as long as it may to give up.
     at_once(attempts, |(name, certificates, role)| {
         let opened = open_raw(&[

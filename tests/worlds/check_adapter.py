@@ -3,7 +3,7 @@
 `check_adapter.py --games`: whether each of ALE's games goes on as it was saved, with Dopamine's preprocessing.
 """
 
-import os, random, sys
+import multiprocessing, os, random, sys
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../deploy/python"))
 import driml_env
@@ -199,6 +199,28 @@ def vector(mode, kind=SyncVectorEnv):
     return lambda copies: kind([Numbered] * copies, autoreset_mode=mode)
 
 
+def by_default(render_mode=None):
+    """As Gymnasium's own environments have it."""
+    return Numbered()
+
+
+def check_own_functions():
+    """What a function of one's own is called with, and what has no effect on it; in the current folder, as what `--import` names."""
+    check_episodes(driml_env.Gymnasium(by_default, 2))
+    named = lambda copies=1: SyncVectorEnv([Numbered] * copies, autoreset_mode=AutoresetMode.SAME_STEP)
+    check_episodes(driml_env.Gymnasium(named, 2))
+    os.chdir(os.path.dirname(os.path.abspath(__file__)))
+    args = driml_env.parser().parse_args(["check_adapter:by_default", "--import", "check_adapter", "--clip"])
+    try:
+        driml_env.maker(args)
+    except SystemExit as said:
+        assert "--clip is for an id of Gymnasium" in str(said), said
+    else:
+        raise AssertionError("--clip has no effect")
+    args.clip = False
+    check_episodes(driml_env.Gymnasium(driml_env.maker(args), 2))
+
+
 def with_spaces(**spaces):
     return lambda: type("Other", (Numbered,), spaces)()
 
@@ -211,6 +233,12 @@ if __name__ == "__main__":
     check_episodes(driml_env.Gymnasium(vector(AutoresetMode.SAME_STEP), 2))
     check_episodes(driml_env.Gymnasium(vector(AutoresetMode.DISABLED), 2))
     check_episodes(driml_env.Gymnasium(vector(AutoresetMode.SAME_STEP, AsyncVectorEnv), 2))
+    check_own_functions()
+    # Workers that are new interpreters have imported nothing, and ALE's own vectors have another emulator.
+    multiprocessing.set_start_method("forkserver", force=True)
+    driml_env.Gymnasium(ale("--atari"), 2, workers=True).reset([1, 2])
+    own = lambda copies: sys.modules["ale_py"].AtariVectorEnv("pong", copies, autoreset_mode=AutoresetMode.SAME_STEP)
+    check_not_saved("", own)
     check_refused("SAME_STEP", vector(AutoresetMode.NEXT_STEP))
     check_refused("has 3 copies where 2", lambda copies: SyncVectorEnv([Numbered] * 3, autoreset_mode=AutoresetMode.SAME_STEP))
     floats, nine = gymnasium.spaces.Box(0, 1, (4,), np.float32), gymnasium.spaces.Box(0, 1, (9,), np.float32)

@@ -98,6 +98,7 @@ mod tests {
             match check_private(path) {
                 Ok(()) => assert_eq!(mode & 0o022, 0, "{mode:o}"),
                 Err(error) => {
+                    assert_ne!(mode & 0o022, 0, "{mode:o}");
                     let text = error.to_string();
                     assert!(text.contains(&format!("are {mode:o}. Make")), "{text}");
                     assert!(text.contains("chmod -R go-w"), "{text}");

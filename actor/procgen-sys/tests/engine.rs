@@ -2,7 +2,7 @@
 //! The engine is fetched into the cache folder once; with `DRIML_OFFLINE=1` every test here is skipped.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use std::sync::OnceLock;
+use std::{io::Write, sync::OnceLock};
 
 use procgen_sys::{DistributionMode, Engine, Game, NUM_ACTIONS, Options, RESET, State, VecGame};
 
@@ -11,7 +11,12 @@ fn engine() -> Option<&'static Engine> {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
     if std::env::var_os("DRIML_OFFLINE").is_some_and(|it| !it.is_empty() && it != "0") {
         let test = std::thread::current();
-        println!("skipped: {} (DRIML_OFFLINE=1)", test.name().unwrap_or("?"));
+        // Past the test runner, which keeps the output of a test that passes.
+        let line = format!(
+            "skipped: {} (DRIML_OFFLINE=1)\n",
+            test.name().unwrap_or("?")
+        );
+        std::io::stderr().write_all(line.as_bytes()).unwrap();
         return None;
     }
     Some(ENGINE.get_or_init(|| Engine::install(&mut |line| println!("{line}")).unwrap()))

@@ -21,9 +21,10 @@ STEPS = 64
 def main():
     quick = "--quick" in sys.argv
     args = driml_env.parser().parse_args([arg for arg in sys.argv[1:] if arg != "--quick"])
-    env = driml_env.Gymnasium(driml_env.maker(args), ENVS, args.workers).env
+    world = driml_env.Gymnasium(driml_env.maker(args), ENVS, args.workers, args.channels)
+    env, first = world.env, world.first_action
     env.reset(seed=list(range(ENVS)))
-    actions = numpy.random.default_rng(1).integers(0, env.single_action_space.n, (STEPS, ENVS))
+    actions = numpy.random.default_rng(1).integers(first, first + len(world.actions), (STEPS, ENVS))
 
     def steps():
         for step in actions:

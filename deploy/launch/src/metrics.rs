@@ -103,7 +103,7 @@ columns! {
         "Mean Q value of the last update's states.",
         Value::Gauge(|it| learned(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
-        "Mean k of the rows served; of several positives the furthest.",
+        "Mean k of all rows served; of several positives the furthest.",
         Value::Gauge(|it| it.k.map(|it| it.mean));
     "sd_k", "environment steps", "k", "Standard deviation of k":
         "Standard deviation of k over the same rows.",

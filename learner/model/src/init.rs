@@ -173,5 +173,7 @@ mod tests {
         let mean = weight.iter().sum::<f32>() / weight.len() as f32;
         // Standard error of the mean of 65,536 entries of variance 1/1024.
         assert!(mean.abs() < 4.0 / 1024f32.sqrt() / 256.0, "{mean}");
+        let squares: f32 = weight.iter().map(|w| w * w).sum();
+        assert!((squares - 64.0).abs() < 1e-3, "64 unit rows: {squares}");
     }
 }

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::init::InitialLaw;
 
-/// The parameters of a linear layer: weight [out, in], but [in, out] where `heads::acting` makes it, and bias [out].
+/// The parameters of a linear layer: weight [out, in] and bias [out].
 #[derive(Clone, Debug)]
 pub(crate) struct Layer<T> {
     pub(crate) weight: T,

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::heads::acting::ActingHead;
+use crate::heads::acting::merged;
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::HeadLayer;
@@ -70,7 +70,7 @@ impl PolicyNetwork {
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         let weights = &mut self.weights;
         if let Some(noisy) = &weights.noisy {
-            weights.head = active_layer(self.precision, noisy.layer(noise));
+            weights.head = active_layer(self.precision, merged(noisy, noise));
         }
     }
 
@@ -155,7 +155,7 @@ struct Weights {
     torso: Box<dyn ActingTorso>,
     head: Box<dyn ActiveLayer>,
     /// What `head` is made of, with every noise anew; there if it is noisy.
-    noisy: Option<ActingHead>,
+    noisy: Option<Vec<HeadLayer<Vec<f32>>>>,
 }
 
 impl Weights {
@@ -171,11 +171,10 @@ impl Weights {
         let torso = config.torso();
         let Ok(of_torso) = TorsoParameters::of(&*torso, &mut take);
         let Ok(of_head) = HeadLayer::all(config, take);
-        let head = ActingHead::new(of_head);
         Ok(Self {
             torso: torso.acting(precision, of_torso),
-            head: active_layer(precision, head.layer(None)),
-            noisy: config.head.noisy_sigma.map(|_| head),
+            head: active_layer(precision, merged(&of_head, None)),
+            noisy: config.head.noisy_sigma.map(|_| of_head),
         })
     }
 }

@@ -206,7 +206,7 @@ mod tests {
         let mut assembly = Assembly::new(weights, file.len() as u64).unwrap();
         let (first, second) = file.split_at(PIECE_BYTES);
         let at = PIECE_BYTES as u64;
-        assert!(assembly.take(weights, at, second).is_err(), "not its turn");
+        assert!(assembly.take(weights, at, first).is_err(), "not its turn");
         assert!(assembly.take(weights, 0, &first[1..]).is_err(), "too short");
         let other = WeightsHeader {
             version: 4,

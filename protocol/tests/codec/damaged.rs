@@ -197,7 +197,12 @@ fn counts_that_do_not_fit_their_payload_are_refused() {
         states_n: most,
         ..header
     };
-    let none = BatchHeader { rows: 0, ..header };
+    let none = BatchHeader {
+        rows: 0,
+        states_k: 0,
+        states_n: 0,
+        ..header
+    };
     let mut all = vec![(none, Buffer::zeroed(0)), (most_of_all, payload.clone())];
     let batches: [fn(&mut BatchHeader); 6] = [
         |it| it.rows = 0,

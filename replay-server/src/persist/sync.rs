@@ -191,6 +191,8 @@ mod tests {
         let least = begun.elapsed().as_secs_f64();
         assert!(syncer.flushed_s() >= least);
         syncer.removed(1);
+        let asked = Instant::now();
         assert!(syncer.flushed().is_ok());
+        assert!(syncer.flushed_s() <= asked.elapsed().as_secs_f64());
     }
 }

@@ -85,12 +85,16 @@ fn actors_and_streams_are_bounded() {
     assert_eq!(replay.status().transitions_lost, 0);
     let last = insert(&mut replay, header(one_more - 1, 1, 1, 6));
     assert!(is_stored(&last), "the known ones continue");
-    let wide = ChunkHeader {
-        streams: STREAMS_MAX + 1,
-        steps: 1,
-        ..header(0, 1, 1, 6)
-    };
-    assert!(is_refused(&insert(&mut replay, wide)));
+    for (streams, is_fine) in [(STREAMS_MAX + 1, false), (STREAMS_MAX, true)] {
+        let mut replay = small(&Config::unlimited(1 << 15));
+        join(&mut replay, 0, 1);
+        let wide = ChunkHeader {
+            streams,
+            steps: 1,
+            ..header(0, 1, 0, 0)
+        };
+        assert_eq!(is_stored(&insert(&mut replay, wide)), is_fine, "{streams}");
+    }
 }
 
 #[test]

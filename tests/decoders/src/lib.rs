@@ -16,7 +16,7 @@ mod replay;
 mod segments;
 
 pub use messages::forged;
-pub use segments::{held, logs};
+pub use segments::{held, highest_ordinal, logs};
 
 /// One decoder: its name, and what is to be tried with some bytes.
 pub type Decoder = (&'static str, fn(&[u8]));

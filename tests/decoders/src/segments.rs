@@ -324,11 +324,20 @@ fn log(chunks: u64) -> Vec<u8> {
     bytes
 }
 
-/// Transitions that are held in a log as [`logs`] gives it, if all of it can be read.
-pub fn held(log: &[u8]) -> u64 {
+/// The first of [`logs`], whose first record has the highest number that there is.
+pub fn highest_ordinal() -> Vec<u8> {
+    let mut log = logs().swap_remove(0).1;
+    let segment = &mut log[4..];
+    segment[8..16].copy_from_slice(&(1u64 << 60).to_le_bytes());
+    mend(segment);
+    log
+}
+
+/// Transitions that are held in a log as [`logs`] gives it, or why it is refused.
+pub fn held(log: &[u8]) -> Result<u64, String> {
     let dir = folder();
     for (number, segment) in split(&log[2..]).iter().enumerate() {
         fs::write(path(dir.path(), usize::from(log[1]) + number), segment).unwrap();
     }
-    open(dir.path()).map_or(0, |replay| replay.status().transitions_held)
+    open(dir.path()).map(|replay| replay.status().transitions_held)
 }

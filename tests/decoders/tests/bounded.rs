@@ -9,7 +9,8 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_decoders::{ALL, forged, held, logs};
+use driml_decoders::{ALL, forged, held, highest_ordinal, logs};
+use driml_settings::config::RunConfig;
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
 
@@ -183,10 +184,24 @@ fn the_logs_among_the_seeds_can_be_read() {
         let stored = stored(&file, &log);
         let file = file.display();
         assert!(log.len() < BYTES_MAX, "{file}: too long");
-        let is_read = !stored.is_empty() && held(&stored) == held(&log) && held(&log) > 0;
+        let is_read = !stored.is_empty() && held(&stored) == held(&log) && held(&log) > Ok(0);
         assert!(
             is_read,
             "{file} cannot be read any more: UPDATE_CORPUS=1 writes it"
         );
+    }
+}
+
+#[test]
+fn a_log_with_the_highest_number_is_refused() {
+    let refused = held(&highest_ordinal()).unwrap_err();
+    assert!(refused.contains("which no replay reaches"), "{refused}");
+}
+
+/// The settings among the seeds are those of `driml presets --preset smoke`.
+#[test]
+fn the_settings_among_the_seeds_can_be_read() {
+    for seed in seeds("config") {
+        RunConfig::parse("a seed", str::from_utf8(&seed).unwrap()).unwrap();
     }
 }

@@ -75,6 +75,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
         leaving: false,
     };
     let weights = upload(hash, 1, 1 << 19, b"w");
+    let before = run.refused();
     send_at_once(
         one,
         [
@@ -92,9 +93,9 @@ fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
             Row::new("driml/**", [], SILENCE),
         ],
     );
+    assert_eq!(run.refused(), before, "nothing of it reached the server");
 
     // At its own keys, messages that speak for another.
-    let before = run.refused();
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
     let chunks = keys.of_actor::<ChunkHeader>(1);
     let said = "speaks for actor 0 at the key";

@@ -10,7 +10,6 @@ use crate::layers::Layer;
 
 pub(crate) struct Dense<S: Simd> {
     simd: S,
-    /// Of [in, out].
     weight: Panels<S::Element>,
     bias: Vec<f32>,
     inputs: usize,
@@ -22,7 +21,7 @@ pub(crate) trait ActiveLayer: Send + Sync {
     fn forward_active(&self, hidden: &[f32]) -> Buffer<f32>;
 }
 
-/// A layer of weight [in, out] for the fastest instruction set of this processor.
+/// The layer for the fastest instruction set of this processor.
 pub(crate) fn active_layer(
     precision: Precision,
     Layer { weight, bias }: Layer<Vec<f32>>,
@@ -40,10 +39,10 @@ impl<S: Simd> ActiveLayer for Dense<S> {
 }
 
 impl<S: Simd> Dense<S> {
-    /// `weight` [in, out], `bias` [out].
+    /// `weight` [out, in], `bias` [out].
     fn new(simd: S, weight: &[f32], bias: Vec<f32>) -> Self {
         let inputs = weight.len() / bias.len();
-        let weight = Matrix::new(weight, inputs, bias.len());
+        let weight = Matrix::new(weight, bias.len(), inputs).transposed();
         Self {
             simd,
             weight: Panels::pack(simd, weight, Threads::Caller),
@@ -57,12 +56,12 @@ impl<S: Simd> Dense<S> {
     pub(crate) fn of_maps(simd: S, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
         let inputs = weight.len() / bias.len();
         let locations = inputs / channels;
-        let mut inputs_first = Vec::with_capacity(weight.len());
-        for input in 0..inputs {
-            let column = input % channels * locations + input / channels;
-            inputs_first.extend(weight[column..].iter().step_by(inputs));
+        let mut by_location = Vec::with_capacity(weight.len());
+        for row in weight.chunks_exact(inputs) {
+            let column = |input| input % channels * locations + input / channels;
+            by_location.extend((0..inputs).map(|input| row[column(input)]));
         }
-        Self::new(simd, &inputs_first, bias)
+        Self::new(simd, &by_location, bias)
     }
 
     pub(crate) const fn inputs(&self) -> usize {

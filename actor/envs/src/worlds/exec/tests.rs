@@ -322,7 +322,7 @@ fn nothing_is_left_of_a_world_and_of_what_it_started() {
 
     // One that leads another group ends as well.
     let command = "exec timeout 600 sleep 590.5";
-    declaration(command, 200, 1000).unwrap_err();
+    fails(declaration(command, 200, 1000), &["start_timeout_ms=N"]);
     assert_eq!(alive("590.5"), [""; 0]);
 
     let command = format!("sh -c 'sleep 600; : {mark}' & exit 5");

@@ -148,6 +148,9 @@ mod tests {
             ghost.step(&chance(0.0, 0.0), agent, false, &mut rng);
         }
         assert_eq!((ghost.place, ghost.mode), (agent, Mode::Follow));
+        let far = MAZE.ghost_starts[2];
+        ghost.step(&chance(0.0, 1.0), far, false, &mut rng);
+        assert_eq!(ghost.mode, Mode::Wander);
     }
 
     #[test]

@@ -55,12 +55,16 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
 mod tests {
     use super::*;
 
+    fn rows_of<S: Simd>(_: S) -> usize {
+        S::rows_max(1)
+    }
+
     #[test]
     fn every_instruction_set_sums_the_tile_that_is_counted() {
         for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
-            let [once, thrice] =
-                [1, 3].map(|times| with_simd!(simd, simd => multiply(simd, times)));
-            assert_eq!(thrice, 3.0 * once);
+            let (thrice, rows) = with_simd!(simd, simd => (multiply(simd, 3), rows_of(simd)));
+            let products = 3 * rayon::current_num_threads() * rows * LANES * DEPTH;
+            assert_eq!(thrice, 2.0 * products as f64);
         }
     }
 }
