@@ -19,13 +19,14 @@ const RECIPES: [(&str, &str); 6] = [
 ];
 
 /// What a recipe's place holders become.
-const VALUES: [(&str, &str); 7] = [
+const VALUES: [(&str, &str); 8] = [
     ("${DRIML_ENV:-procgen:coinrun}", "procgen:coinrun"),
     ("${DRIML_AGENT:-driml-ada}", "driml-ada"),
     ("${DRIML_FRAMES:-120000}", "120000"),
     ("$actors", "4"),
     ("$DRIML_SETTINGS", ""),
     ("\"$@\"", ""),
+    ("\"${world[@]}\"", ""),
     ("%i", "7"),
 ];
 
