@@ -7,7 +7,7 @@
 pub enum UpdateError {
     #[error("this batch cannot be learned from: {0}")]
     Batch(String),
-    #[error("{0}: that cannot work; start from a preset")]
+    #[error("{0}; `driml presets` has settings that work")]
     Settings(String),
     /// Settings of the auxiliary loss that are at odds with each other.
     #[error("{0}")]

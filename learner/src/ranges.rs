@@ -21,5 +21,5 @@ pub(crate) fn check_range(
 pub(crate) fn outside(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
     let (least, most) = (range.start(), range.end());
     let is_inside = range.contains(&value);
-    (!is_inside).then(|| format!("{name} = {value:?} is not within {least:?} and {most:?}"))
+    (!is_inside).then(|| format!("{name} = {value:?} is not from {least:?} to {most:?}"))
 }

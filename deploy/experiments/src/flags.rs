@@ -4,7 +4,7 @@
 use std::{collections::BTreeSet, path::PathBuf};
 
 use clap::{Args, Subcommand};
-use driml_machine::{error::Usage, whole_number};
+use driml_machine::{error::Usage, shell::quoted, whole_number};
 use serde::de::DeserializeOwned;
 
 /// The paper's experiments.
@@ -189,19 +189,10 @@ pub(crate) fn this_command() -> String {
         if word == "--out" {
             args.next();
         } else if word != "--report" && !word.starts_with("--out=") {
-            words.push(quoted(word));
+            words.push(quoted(&word));
         }
     }
     words.join(" ")
-}
-
-/// The word as a shell takes it.
-fn quoted(word: String) -> String {
-    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.,=:/".contains(c);
-    match word.chars().all(plain) {
-        true => word,
-        false => format!("'{}'", word.replace('\'', r"'\''")),
-    }
 }
 
 #[cfg(test)]
@@ -220,16 +211,5 @@ pub(crate) mod tests {
     pub(crate) fn parsed<T: Args>(words: &str) -> T {
         let words = ["driml"].into_iter().chain(words.split_whitespace());
         CommandLine::parse_from(words).args
-    }
-
-    #[test]
-    fn a_command_can_be_pasted() {
-        for (word, expected) in [
-            ("--set=a.b=1", "--set=a.b=1"),
-            ("a=[1, 2]", "'a=[1, 2]'"),
-            ("a='b c'", r"'a='\''b c'\'''"),
-        ] {
-            assert_eq!(quoted(word.into()), expected);
-        }
     }
 }

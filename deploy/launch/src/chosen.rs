@@ -86,6 +86,6 @@ pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<
             "{run} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
             known.join(", ")
         ),
-        _ => usage!("{run} has no checkpoint yet: let the run continue"),
+        _ => usage!("{run} has no checkpoint yet: let the run continue, or start it again"),
     })
 }

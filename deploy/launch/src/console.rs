@@ -32,19 +32,24 @@ pub fn line(text: &str) {
 
 /// Writes a command's result to stdout; a closed pipe is not an error.
 pub fn print(text: &str) -> anyhow::Result<()> {
+    print_unless_closed(text).map(drop)
+}
+
+/// [`print`]; false if the pipe is closed.
+pub(crate) fn print_unless_closed(text: &str) -> anyhow::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(e) if !is_gone(&e) => Err(e).context("writing to stdout"),
-        _ => Ok(()),
+        written => Ok(written.is_ok()),
     }
 }
 
-/// [`print`] of a page that takes the place of the one before, on a terminal; elsewhere pages follow each other.
-pub(crate) fn print_page(text: &str) -> anyhow::Result<()> {
+/// [`print_unless_closed`] of a page that takes the place of the one before, on a terminal; elsewhere pages follow each other.
+pub(crate) fn print_page(text: &str) -> anyhow::Result<bool> {
     let on_terminal = io::stdout().is_terminal().then(Term::stdout);
     match on_terminal.map(|it| it.clear_screen()) {
         Some(Err(e)) if !is_gone(&e) => Err(e.into()),
-        _ => print(text),
+        _ => print_unless_closed(text),
     }
 }
 

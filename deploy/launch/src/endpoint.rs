@@ -2,8 +2,10 @@
 //! It keeps nothing open.
 
 use std::{
+    fs,
     io::ErrorKind,
     net::{TcpListener, ToSocketAddrs, UdpSocket},
+    os::unix::fs::FileTypeExt,
     time::{Duration, Instant},
 };
 
@@ -59,9 +61,18 @@ pub fn check_listening(endpoints: &[String], tls: bool, allow_insecure: bool) ->
     Ok(())
 }
 
-/// Refuses endpoints to listen on that another process has, before anything is made; zenoh would say so in its own words.
+/// Refuses endpoints to listen on that another process has, before anything is made; zenoh would say so in its own words. And a
+/// path that is taken, which zenoh would delete, whatever is there.
 pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
     for endpoint in endpoints {
+        let path = endpoint.strip_prefix("unixsock-stream/");
+        let there = path.and_then(|path| fs::symlink_metadata(path).ok());
+        if there.is_some_and(|it| !it.file_type().is_socket()) {
+            return Err(usage!(
+                "cannot listen on {endpoint}: what is there is not a socket. Choose another path, with --listen for this command and \
+                 --connect for all others"
+            ));
+        }
         let is_used = match endpoint.split_once('/') {
             Some(("tcp", address)) => is_taken(TcpListener::bind(address)),
             Some(("quic", address)) => is_taken(UdpSocket::bind(address)),
@@ -217,6 +228,10 @@ mod tests {
         }
         drop((tcp, udp, socket));
         assert!(check_unused(&endpoints).is_ok());
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, "a thesis").unwrap();
+        let said = check_unused(&endpoints).unwrap_err().0;
+        assert!(said.contains("what is there is not a socket"), "{said}");
     }
 
     #[test]

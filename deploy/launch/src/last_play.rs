@@ -42,7 +42,7 @@ pub(crate) fn play(
         console::line(&format!(
             "the run is finished, but playing its weights failed: {}; `driml evaluate {}` plays them again",
             console::describe(&e),
-            folder.display()
+            folder.quoted()
         ));
     }
 }

@@ -76,7 +76,10 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
 }
 
 fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
-    let exported = described(bytes).and_then(|it| it.get(EXPORTED).cloned());
+    let described = described(bytes);
+    let described =
+        described.map_err(|e| usage!("{name} is damaged, or not a safetensors file: {e}"))?;
+    let exported = described.and_then(|it| it.get(EXPORTED).cloned());
     let exported: Exported = exported
         .and_then(|it| serde_json::from_value(it).ok())
         .with_context(|| {
@@ -181,7 +184,9 @@ mod tests {
         ] {
             assert_eq!(said(all, game), why);
         }
-        assert!(said(&[("chain", &bytes[..99])], "chain").contains("is not an exported network"));
+        assert!(
+            said(&[("chain", &bytes[..99])], "chain").contains("is damaged, or not a safetensors")
+        );
 
         // Weights of one network beside the settings of another.
         let mut mixed = untrained("chain", "c51");

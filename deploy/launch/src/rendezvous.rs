@@ -37,8 +37,10 @@ impl Rendezvous {
     pub(crate) fn create() -> anyhow::Result<Self> {
         let place = place_under(std::env::temp_dir());
         sweep(&place);
-        Self::create_in(&place)
-            .with_context(|| format!("making a folder for the socket in {}", place.display()))
+        Self::create_in(&place).with_context(|| {
+            let place = place.display();
+            format!("making a folder for the socket in {place}: set TMPDIR to a folder that may be written")
+        })
     }
 
     fn create_in(place: &Path) -> io::Result<Self> {

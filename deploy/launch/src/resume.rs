@@ -58,7 +58,7 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::line(&format!(
             "`driml train --resume {}` resumes it",
-            folder.display()
+            folder.quoted()
         ));
     }
 }
@@ -236,7 +236,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     // The last chunk is stored whole, so that a run may have more frames than its plan.
     let is_shortened = config.frames() < frames.min(before.frames());
     if is_complete && (is_shortened || Summary::is_finished(folder)) {
-        let run = folder.display();
+        let run = folder.quoted();
         return Ok(Found::Nothing(format!(
             "nothing is left to do: the run in {run} has done {updates} updates and {frames} frames.\n\
              `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains on, up to N frames"

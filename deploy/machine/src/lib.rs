@@ -20,5 +20,6 @@ pub mod error;
 pub mod limits;
 pub mod process_env;
 pub mod resources;
+pub mod shell;
 pub mod units;
 pub mod whole_number;

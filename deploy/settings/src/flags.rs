@@ -81,8 +81,8 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             (Source::File(name.clone(), text), name)
         }
         None => {
-            let world = args.env.as_deref().unwrap_or(ENV).parse();
-            let world: WorldName = world.map_err(|e| usage!("--env: {e}"))?;
+            let world = presets::world(args.env.as_deref().unwrap_or(ENV));
+            let world = world.map_err(|e| usage!("--env: {e}"))?;
             let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
             let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
             let source = Source::Layers(preset, world, agent);

@@ -37,8 +37,8 @@ pub(crate) fn fit(
     let free = gib(machine.memory_bytes);
     if machine.memory_bytes <= beside {
         return Err(usage!(
-            "{actors} actors of {world} take about {}, and {free} are free: use fewer --actors, with more --envs each",
-            gib(actors_bytes)
+            "{actors} actors of {world} and a learner take about {}, and {free} are free: use fewer --actors, with more --envs each; in a sweep fewer --jobs",
+            gib(beside)
         ));
     }
     let room = Room {

@@ -18,7 +18,7 @@ pub(crate) struct InspectArgs {
     #[command(flatten)]
     pub(crate) settings: RunFlags,
     /// Use the settings of the run in this folder
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["RunFlags", "Flags"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["env", "agent", "preset", "config", "Flags"])]
     pub(crate) run: Option<PathBuf>,
     /// Print one line per world
     #[arg(long, conflicts_with_all = ["env", "config", "run"])]

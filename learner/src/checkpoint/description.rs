@@ -3,6 +3,7 @@
 
 use driml_model::{InputSize, ModelConfig, TorsoName};
 use driml_protocol::RunSpec;
+use safetensors::{SafeTensorError, SafeTensors};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -71,9 +72,13 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
 }
 
 /// The description in a safetensors file; none if it has none.
-pub fn described(safetensors: &[u8]) -> Option<Value> {
-    let (_, header) = safetensors::SafeTensors::read_metadata(safetensors).ok()?;
-    serde_json::from_str(header.metadata().as_ref()?.get(KEY)?).ok()
+///
+/// # Errors
+/// Not a whole safetensors file.
+pub fn described(safetensors: &[u8]) -> Result<Option<Value>, SafeTensorError> {
+    let (_, header) = SafeTensors::read_metadata(safetensors)?;
+    let text = header.metadata().as_ref().and_then(|it| it.get(KEY));
+    Ok(text.and_then(|it| serde_json::from_str(it).ok()))
 }
 
 /// The path of the first value that differs, under `name`, and both values.

@@ -97,7 +97,7 @@ pub fn load(
 
 /// Checks that the network `online` of the checkpoint at `path` has the sizes of `model`, as far as its description says.
 fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), CheckpointError> {
-    let described = description::described(online);
+    let described = description::described(online).ok().flatten();
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };

@@ -209,7 +209,10 @@ impl Check<'_> {
             let own = norm(expected.iter().copied());
             let tolerance = allowed.gradient * own + allowed.gradient_of_global * global_norm;
             worst.add("grad", name, apart, tolerance);
-            if let Some(angle) = allowed.angle.filter(|_| own >= 0.1 * global_norm) {
+            if let Some(angle) = allowed
+                .angle
+                .filter(|_| own > 0.0 && own >= 0.1 * global_norm)
+            {
                 let dot: f64 = got.iter().zip(&expected).map(|(a, b)| a * b).sum();
                 let cosine = dot / (own * norm(got.iter().copied()));
                 angles.add("1 - cosine", name, 1.0 - cosine, angle);

@@ -114,7 +114,7 @@ impl Run {
                 all.map(String::as_str).filter(|name| !WORDS.contains(name))
             };
             usage!(
-                "{} has no column {column:?}{}; it has {}",
+                "{} has no column of numbers {column:?}{}; it has {}",
                 self.folder.metrics().display(),
                 nearest(column, numbers()),
                 numbers().collect::<Vec<_>>().join(", ")

@@ -237,9 +237,9 @@ fn what_cannot_be_drawn_is_said() {
     for (args, expected) in [
         (
             root.args(&[&a], &["mean_retrun"]),
-            "has no column \"mean_retrun\" (did you mean \"mean_return\"?); it has seconds, frames, mean_return, mean_k",
+            "has no column of numbers \"mean_retrun\" (did you mean \"mean_return\"?); it has seconds, frames, mean_return, mean_k",
         ),
-        (root.args(&[&a], &["waiting"]), "has no column"),
+        (root.args(&[&a], &["waiting"]), "has no column of numbers"),
         (
             root.args(&[&empty], &["mean_return"]),
             "none of these runs has a value of \"mean_return\" yet",

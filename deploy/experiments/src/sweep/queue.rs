@@ -50,7 +50,7 @@ pub(crate) fn make<P>(
     let mut queue = Queue {
         runs,
         jobs,
-        memory_share: Machine::this().memory_bytes / u64::from(jobs),
+        memory_share: Machine::this().memory_bytes / u64::from(jobs).min(plans.len() as u64).max(1),
         waiting: VecDeque::new(),
         running: Vec::new(),
     };

@@ -140,7 +140,7 @@ pub fn run(
         format!(
             "the run is over and its checkpoint saved, but the summary could not be written: make room on the disk, then run \
              `driml train --resume {}`",
-            run_dir.display()
+            run_dir.quoted()
         )
     })?;
     if outcome == Outcome::Finished {

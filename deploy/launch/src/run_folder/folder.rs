@@ -8,7 +8,10 @@ use std::{
 
 use anyhow::Context;
 use driml_learner::checkpoint::{self, CheckpointError};
-use driml_machine::error::{Usage, usage};
+use driml_machine::{
+    error::{Usage, usage},
+    shell::quoted_path,
+};
 use driml_protocol::lock_file;
 use driml_settings::config::RunConfig;
 use nix::unistd::{AccessFlags, access};
@@ -77,6 +80,11 @@ impl RunFolder {
     /// Its path for a message.
     pub fn display(&self) -> std::path::Display<'_> {
         self.path.display()
+    }
+
+    /// Its path for a command that a person may paste.
+    pub fn quoted(&self) -> String {
+        quoted_path(&self.path)
     }
 
     /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command

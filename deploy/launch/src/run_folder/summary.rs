@@ -190,7 +190,7 @@ impl Summary {
 
     /// What the weights of a finished run earn, and what a person may do with them, a command a line.
     pub(crate) fn next_steps(&self, run_dir: &RunFolder, is_resumable: bool) -> String {
-        let run = run_dir.display();
+        let run = run_dir.quoted();
         let more = self.frames.saturating_mul(2);
         let film = "films it, and plays a random policy beside it";
         let mut next = vec![
@@ -242,7 +242,7 @@ impl Summary {
 
 /// The command that draws a run's curves, and what they are.
 pub(crate) fn plot(run_dir: &RunFolder) -> (String, &'static str) {
-    let command = format!("plot {} --out plot.png", run_dir.display());
+    let command = format!("plot {} --out plot.png", run_dir.quoted());
     (command, "return, losses, k and speed")
 }
 

@@ -72,12 +72,12 @@ pub fn look(
         {
             return over.print(as_json);
         }
-        match as_json {
-            true => console::print(&json(view)?)?,
+        let is_read = match as_json {
+            true => console::print_unless_closed(&json(view)?)?,
             false if again => console::print_page(&page(view))?,
-            false => console::print(&page(view))?,
-        }
-        if !again || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
+            false => console::print_unless_closed(&page(view))?,
+        };
+        if !again || !is_read || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
             return Ok(());
         }
     }
@@ -243,8 +243,10 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
         return Ok(Ok(endpoints.lines().map(str::to_owned).collect()));
     }
     let run = folder.display();
-    // A launcher that runs there holds the lock.
-    let is_locked = !endpoints.is_empty() && folder.is_locked();
+    // A launcher that runs there holds the lock, and so does a run in lockstep.
+    let is_locked = folder.is_locked();
+    let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
+    let so_far = progress(folder).map_or("nothing".into(), counts);
     let mut over = Box::new(Over {
         finished: !is_locked && Summary::is_finished(folder),
         message: "the run is over".into(),
@@ -252,7 +254,11 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
         details: String::new(),
         is_well: true,
     });
-    if is_locked {
+    if is_locked && endpoints.is_empty() {
+        over.message = format!(
+            "one process writes {run}, in lockstep or as `driml watch`, and cannot be asked: so far {so_far}, in metrics.csv"
+        );
+    } else if is_locked {
         let frames = progress(folder).map_or(0, |it| it.frames);
         let how = match frames >= config.frames() {
             true => "is stopping: all frames are stored and its replay server has exited",
@@ -263,10 +269,8 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
     } else if let Some(summary) = over.summary.as_ref().filter(|_| over.finished) {
         over.details = summary.describe(folder);
     } else {
-        let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
-        let so_far = progress(folder).map_or("nothing".into(), counts);
         let next = match resume::is_resumable(&config.world, folder) {
-            true => format!("`driml train --resume {run}` resumes it"),
+            true => format!("`driml train --resume {}` resumes it", folder.quoted()),
             false => "it has no checkpoint to resume from".into(),
         };
         over.is_well = false;
@@ -303,5 +307,10 @@ mod tests {
         drop(listener);
         let said = found();
         assert!(said.starts_with("no process runs in "), "{said}");
+        // As a run in lockstep.
+        std::fs::remove_file(folder.endpoints()).unwrap();
+        let _lock = folder.lock().unwrap();
+        let said = found();
+        assert!(said.starts_with("one process writes "), "{said}");
     }
 }

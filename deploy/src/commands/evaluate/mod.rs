@@ -26,7 +26,10 @@ use driml_launch::{
     stats::mean_and_deviation,
     view::TEMPLATE,
 };
-use driml_machine::error::{Interrupted, usage};
+use driml_machine::{
+    error::{Interrupted, usage},
+    shell::quoted_path,
+};
 use driml_protocol::Shutdown;
 
 use self::recording::{RecordArgs, Recording};
@@ -201,7 +204,7 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
         player.weights_name(),
         player.updates,
         bytes.len() / 1000,
-        path.display()
+        quoted_path(path)
     ))
 }
 
