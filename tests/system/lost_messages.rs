@@ -334,20 +334,25 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     }
 }
 
-/// A shard that held nothing when batches began, as its actors started late, is drawn from once it holds something, although the others
-/// never make the learner wait.
-#[test]
-fn a_shard_that_fills_late_is_asked() {
+/// Two empty shards of a run without an end, each with an actor.
+fn endless_shards() -> Vec<Replay> {
     let config = Config {
         transitions_max: None,
         ..config(2)
     };
-    let mut shards: Vec<_> = (0..2)
-        .map(|shard| Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap())
-        .collect();
-    shards
-        .iter_mut()
-        .for_each(|replay| tiny_replay::join(replay, 0));
+    let shard = |shard| {
+        let mut replay = Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap();
+        tiny_replay::join(&mut replay, 0);
+        replay
+    };
+    (0..2).map(shard).collect()
+}
+
+/// A shard that held nothing when batches began, as its actors started late, is drawn from once it holds something, although the others
+/// never make the learner wait.
+#[test]
+fn a_shard_that_fills_late_is_asked() {
+    let mut shards = endless_shards();
     fill(&mut shards[0], 0..8);
     let mut served = serve(shards);
     for batches in 0..1_000 {
@@ -370,17 +375,8 @@ fn a_shard_that_fills_late_is_asked() {
 /// Inserts of a shard that wait by an old count of the other's rows are let in by the next draw that asks it.
 #[test]
 fn a_shard_that_waits_hears_what_the_other_gave() {
-    let config = Config {
-        transitions_max: None,
-        ..config(2)
-    };
-    let slack = config.slack_transitions;
-    let mut shards: Vec<_> = (0..2)
-        .map(|shard| Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap())
-        .collect();
-    shards
-        .iter_mut()
-        .for_each(|replay| tiny_replay::join(replay, 0));
+    let slack = config(2).slack_transitions;
+    let mut shards = endless_shards();
     // Most batches are drawn from the first alone.
     fill(&mut shards[0], 0..slack / 8);
     fill(&mut shards[1], 0..1);
