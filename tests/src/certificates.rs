@@ -1,5 +1,5 @@
-//! Certificates for tests: made by `deploy/certs.sh`, and spoiled with openssl in the ways in which they can be wrong.
-//! It starts no process of the program.
+//! Certificates for tests: made by `deploy/certs.sh`, and made invalid with openssl in several ways.
+//! This module starts no process of the program under test.
 
 use std::{
     fs,
@@ -9,19 +9,19 @@ use std::{
 
 use crate::process::run;
 
-/// A folder for `--tls-dir`, with everything in it.
+/// A complete folder for `--tls-dir`.
 #[derive(Debug)]
 pub struct Certificates {
     folder: PathBuf,
 }
 
-/// From when to when a certificate is good, as openssl writes it: one that is so no longer, and one that is not before the year 2090.
+/// The validity period of an expired certificate: start and end, in openssl's format.
 pub const EXPIRED: [&str; 2] = ["20200101000000Z", "20200201000000Z"];
-/// See [`EXPIRED`].
+/// The validity period of a certificate that is not valid before the year 2090.
 pub const FUTURE: [&str; 2] = ["20900101000000Z", "20910101000000Z"];
 
 impl Certificates {
-    /// Calls `deploy/certs.sh` for a folder, which may be there; `args` are split at blanks.
+    /// Runs `deploy/certs.sh` for a folder, which may already exist; `args` are split at blanks.
     pub fn make(folder: PathBuf, args: &str) -> Self {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/certs.sh");
         run(Command::new(script)
@@ -34,17 +34,17 @@ impl Certificates {
         Self { folder }
     }
 
-    /// The folder.
+    /// Returns the folder's path.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// A file in it.
+    /// Returns the path of a file in the folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
 
-    /// The same files in another folder, to be spoiled there.
+    /// Copies the files to a new folder, where a test can make them invalid.
     pub fn copy(&self, to: PathBuf) -> Self {
         fs::create_dir(&to).unwrap();
         for entry in fs::read_dir(&self.folder).unwrap() {
@@ -54,7 +54,7 @@ impl Certificates {
         Self { folder: to }
     }
 
-    /// Puts the files of one role in the place of another's.
+    /// Replaces the certificate and key of `as_role` by those of `role`.
     pub fn pass_off(&self, role: &str, as_role: &str) {
         for ending in ["pem", "key"] {
             let file = |role| self.path(&format!("{role}.{ending}"));
@@ -62,7 +62,7 @@ impl Certificates {
         }
     }
 
-    /// These with the certificate of `role` signed anew, valid at another time.
+    /// Signs the certificate of `role` again, with another validity period.
     pub fn sign_again(self, role: &str, [start, end]: [&str; 2]) -> Self {
         let openssl = |args: String| {
             let mut command = Command::new("openssl");

@@ -1,5 +1,5 @@
-//! A client of a run over zenoh, as any process is one: asks, and sends whatever a test wants.
-//! It takes no part in the run and keeps nothing.
+//! A zenoh client of a run, like any process of the run: sends requests, and any message that a test needs.
+//! The client stores nothing, and has a role in the run only if a test joins it as an actor or the learner.
 
 use std::{net::UdpSocket, time::Duration};
 
@@ -15,29 +15,29 @@ use zenoh::{Session, Wait, qos::Priority};
 
 use crate::waiting::wait_for;
 
-/// The prefix of a run's keys unless a process is told otherwise.
+/// The default prefix of a run's keys.
 pub(crate) const NAMESPACE: &str = "driml";
 const ANSWER_MAX: Duration = Duration::from_secs(20);
 
-/// An open session and what the replay server said of its run.
+/// An open session, and the run's settings as the replay server sent them.
 #[derive(Debug)]
 pub struct Client {
-    /// The session, for whatever else a test wants to do with it.
+    /// The zenoh session, for any other use in a test.
     pub session: Session,
     /// The run's keys.
     pub keys: Keys,
-    /// What all processes of the run agree on.
+    /// The run spec, on which all processes of the run agree.
     pub spec: RunSpec,
     /// The run's resolved settings.
     pub config_toml: String,
 }
 
-/// A session with the process that listens at an endpoint, in one try.
+/// Opens a session with the process that listens at an endpoint, without retries.
 pub fn connect(endpoint: &str) -> Session {
     session::open(&Endpoints::to(vec![endpoint.to_owned()])).unwrap()
 }
 
-/// A session that listens at an endpoint, in the place of a replay server.
+/// Opens a session that listens at an endpoint, in place of a replay server.
 pub fn listen(endpoint: &str) -> Session {
     session::open(&Endpoints {
         listen: vec![endpoint.to_owned()],
@@ -46,13 +46,13 @@ pub fn listen(endpoint: &str) -> Session {
     .unwrap()
 }
 
-/// An unused endpoint of this machine for QUIC.
+/// Returns an unused QUIC endpoint on this machine.
 pub fn quic_endpoint() -> String {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     format!("quic/{}", socket.local_addr().unwrap())
 }
 
-/// How a learner joins that has learned nothing yet.
+/// Returns the join message of a learner that has made no update yet.
 pub fn new_learner(learner: u64) -> LearnerJoin {
     LearnerJoin {
         learner,
@@ -69,12 +69,12 @@ pub fn check_nothing_lost(replay: &ReplayStatus) {
 }
 
 impl Client {
-    /// A client of the run at an endpoint, once its replay server answers.
+    /// Connects to the run at an endpoint once its replay server answers.
     pub(crate) fn join(endpoint: &str, credentials: Option<&Credentials>) -> Self {
         let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
         let keys = Keys::new(NAMESPACE).unwrap();
         let bytes_max = session::MESSAGE_BYTES_MAX;
-        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+        // One attempt waits for some seconds; on a busy machine a process may need longer to start listening.
         let session = wait_for(&format!("a process that listens on {endpoint}"), || {
             session::open_as(&endpoints, &keys, credentials, bytes_max).ok()
         });
@@ -93,7 +93,7 @@ impl Client {
         }
     }
 
-    /// Sends bytes and gives the bytes of the answer.
+    /// Sends a request and returns the bytes of the reply.
     ///
     /// # Errors
     /// No process answered.
@@ -108,17 +108,17 @@ impl Client {
         .map(|answer| answer.to_bytes().into_owned())
     }
 
-    /// The session, keys and hash, as the processes of the run have them.
+    /// Returns the session, the keys and the spec's hash, as a process of the run holds them.
     pub fn run(&self) -> RunClient {
         RunClient::new(self.session.clone(), self.keys.clone(), self.spec.hash())
     }
 
-    /// The replay server's status; none if it did not answer.
+    /// Requests the replay server's status; `None` if the server does not answer.
     pub fn replay(&self) -> Option<ReplayStatus> {
         self.fetch()
     }
 
-    /// The learner's status; none if it is not there.
+    /// Requests the learner's status; `None` if no learner answers.
     pub fn learner(&self) -> Option<LearnerStatus> {
         self.fetch()
     }
@@ -130,7 +130,7 @@ impl Client {
         }
     }
 
-    /// Waits until the replay server's status is as wanted, and gives it.
+    /// Waits until the replay server's status satisfies `wanted`, and returns the status.
     pub fn wait_for_replay(
         &self,
         what: &str,
@@ -139,13 +139,13 @@ impl Client {
         wait_for(what, || self.replay().filter(&wanted))
     }
 
-    /// Waits until the replay server has stored more than so many transitions.
+    /// Waits until the replay server has stored more than `transitions` transitions.
     pub fn wait_for_transitions(&self, transitions: u64) -> ReplayStatus {
         let what = format!("more than {transitions} transitions");
         self.wait_for_replay(&what, |replay| replay.transitions_inserted > transitions)
     }
 
-    /// Waits until the learner's status is as wanted, and gives it.
+    /// Waits until the learner's status satisfies `wanted`, and returns the status.
     pub fn wait_for_learner(
         &self,
         what: &str,
@@ -154,18 +154,18 @@ impl Client {
         wait_for(what, || self.learner().filter(&wanted))
     }
 
-    /// Waits until the learner has made more than so many updates.
+    /// Waits until the learner has made more than `updates` updates.
     pub fn wait_for_updates(&self, updates: u64) -> LearnerStatus {
         let what = format!("more than {updates} updates");
         self.wait_for_learner(&what, |learner| learner.updates > updates)
     }
 
-    /// Waits until the learner has made its last update, and gives its status.
+    /// Waits until the learner has made its last update, and returns its status.
     pub fn wait_for_the_last_update(&self) -> LearnerStatus {
         self.wait_for_learner("the learner's last update", |learner| learner.finished)
     }
 
-    /// The replay server's status, of which [`check_nothing_lost`] holds.
+    /// Requests the replay server's status, checks it with [`check_nothing_lost`], and returns it.
     #[track_caller]
     pub fn check_nothing_lost(&self) -> ReplayStatus {
         let replay = self.replay().unwrap();
@@ -173,25 +173,25 @@ impl Client {
         replay
     }
 
-    /// Takes part as an actor; its chunks are of this `incarnation`.
+    /// Joins the run as an actor whose chunks carry this `incarnation`.
     pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
         let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
         join::take_part(&self.run(), &join, &never).unwrap();
     }
 
-    /// Takes part as the learner, which has learned nothing yet.
+    /// Joins the run as a learner that has made no update yet.
     pub fn join_as_learner(&self, learner: u64) {
         let never = Shutdown::default();
         join::take_part(&self.run(), &new_learner(learner), &never).unwrap();
     }
 
-    /// A chunk's bytes as a process of the run would send them.
+    /// Encodes a chunk as a process of the run would send it.
     pub fn seal(&self, chunk: &Chunk) -> Vec<u8> {
         codec::encode(self.spec.hash(), &chunk.header, chunk.payload()).unwrap()
     }
 
-    /// Sends a chunk as an actor would.
+    /// Sends a chunk as an actor would, and returns the reply.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
         let key = self.keys.of_actor::<ChunkHeader>(chunk.header.actor);
         let reply = self.ask(&key, self.seal(chunk));
@@ -202,7 +202,7 @@ impl Client {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        // Its router may be gone already, which is not the test's fault.
+        // The process at the other end may have exited already, which is not a fault of the test.
         let _ = self.session.close().wait();
     }
 }

@@ -1,6 +1,6 @@
-//! A whole system under test: a folder, processes, a client, and a deadline on each wait.
-//! It knows nothing of any one test, sleeps only between two looks at a condition, and leaves no process behind.
-//! A wrong answer, or none before the deadline, is a panic that says what there is.
+//! Runs a whole system under test: a folder, its processes, a client, and a deadline on each wait.
+//! The harness knows no single test, sleeps only between two checks of a condition, and leaves no process behind.
+//! It panics with what it found if an answer is wrong or misses the deadline.
 
 #![allow(
     clippy::unwrap_used,

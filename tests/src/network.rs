@@ -1,5 +1,5 @@
-//! Several machines on one: network namespaces with addresses, each linked to a router in the middle.
-//! It needs the right to make them, and changes nothing of the host's own network.
+//! Several simulated machines on one host: network namespaces with addresses, each linked to a router in the middle.
+//! Making them needs privileges. The host's own network does not change.
 
 use std::{
     process::Command,
@@ -8,14 +8,14 @@ use std::{
 
 use crate::skipped::skip;
 
-/// Namespaces joined by a router. Dropping it removes them; what runs in one is to have ended before.
+/// Namespaces joined by a router. Dropping the network removes them; processes in them must have ended before.
 #[derive(Debug)]
 pub struct Network {
     name: String,
     machines: Vec<String>,
 }
 
-/// Runs `ip` with these words.
+/// Runs `ip` with these arguments.
 fn ip(words: &str) -> Result<(), String> {
     let said = Command::new("ip").args(words.split_whitespace()).output();
     let said = said.map_err(|e| format!("{words}: {e}"))?;
@@ -29,12 +29,12 @@ fn ip(words: &str) -> Result<(), String> {
 }
 
 impl Network {
-    /// A network of these machines; none, and the test is skipped by name, where this process may not make one.
+    /// Creates a network of these machines. If that fails, returns `None` and reports the test as skipped.
     pub fn new(machines: &[&str]) -> Option<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let network = Self {
-            // Short, as the name of a device may have 15 characters.
+            // Short, because a device's name is limited to 15 characters.
             name: format!("d{}n{count}", std::process::id()),
             machines: machines.iter().map(|&it| it.to_owned()).collect(),
         };
@@ -91,17 +91,17 @@ impl Network {
         format!("10.77.{}.2", self.number(machine))
     }
 
-    /// The words before a command that is to run on a machine, or on the `router`, from which every machine can be reached.
+    /// Returns the prefix that runs a command on a machine, or on the `router`, which can reach every machine.
     pub fn on(&self, machine: &str) -> String {
         format!("ip netns exec {}", self.namespace(machine))
     }
 
-    /// Pulls a machine's cable: what is in flight is lost, without an error on either side.
+    /// Disconnects a machine: packets in flight are lost, and neither side gets an error.
     pub fn cut(&self, machine: &str) {
         self.set(machine, "down");
     }
 
-    /// Puts it back.
+    /// Reconnects a machine.
     pub fn mend(&self, machine: &str) {
         self.set(machine, "up");
     }
@@ -111,7 +111,7 @@ impl Network {
         ip(&format!("-n {router} link set {device} {state}")).unwrap();
     }
 
-    /// Lets no more than so many kbit/s through to a machine and from it; false where the kernel cannot.
+    /// Limits a machine's link to `kbit` kbit/s in each direction. Returns false if the kernel does not support it.
     pub fn narrow(&self, machine: &str, kbit: u32) -> bool {
         let inner = format!("{}i{}", self.name, self.number(machine));
         let ends = [
@@ -131,7 +131,7 @@ impl Drop for Network {
     fn drop(&mut self) {
         let machines = self.machines.iter().map(|it| self.namespace(it));
         for namespace in machines.chain([self.namespace("router")]) {
-            // One that was not made yet does not matter.
+            // A namespace may not exist if `build` failed.
             let _ = ip(&format!("netns del {namespace}"));
         }
     }

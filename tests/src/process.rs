@@ -1,5 +1,5 @@
-//! One process: its output as it comes, signals to it, and its end within the deadline.
-//! It does not know what the process is.
+//! One process: its output so far, signals to it, and its exit within the deadline.
+//! This module does not know the role of the process.
 
 use std::{
     io::{BufRead, BufReader, Read},
@@ -16,7 +16,7 @@ use nix::{
 
 use crate::waiting::{wait_for, wait_until};
 
-/// A started process. Dropping it kills it.
+/// A started process. Dropping the value kills the process.
 #[derive(Debug)]
 pub struct Process {
     name: String,
@@ -25,12 +25,12 @@ pub struct Process {
     stderr: Output,
 }
 
-/// How a process ended, and all it said.
+/// How a process ended, and all its output.
 #[derive(Clone, Debug)]
 pub struct Ended {
-    /// Its exit code; none if a signal ended it.
+    /// The exit code; `None` if a signal ended the process.
     pub code: Option<i32>,
-    /// The signal that ended it.
+    /// The signal that ended the process, if any.
     pub signal: Option<i32>,
     /// All of its standard output.
     pub stdout: String,
@@ -38,7 +38,7 @@ pub struct Ended {
     pub stderr: String,
 }
 
-/// What was read from one pipe so far, and the thread that reads on.
+/// The text read from one pipe so far, and the thread that keeps reading.
 #[derive(Debug)]
 struct Output {
     text: Arc<Mutex<String>>,
@@ -65,7 +65,7 @@ impl Output {
     }
 }
 
-/// Checks that a text has all of these words.
+/// Checks that a text contains every string in `all`.
 #[track_caller]
 pub fn check_has(text: &str, all: &[&str]) {
     for words in all {
@@ -73,7 +73,7 @@ pub fn check_has(text: &str, all: &[&str]) {
     }
 }
 
-/// What a command prints that is not the program.
+/// Runs a command other than the program under test, which must succeed, and returns its standard output.
 pub(crate) fn run(command: &mut Command) -> String {
     let output = command.output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
@@ -82,7 +82,7 @@ pub(crate) fn run(command: &mut Command) -> String {
 }
 
 impl Process {
-    /// Starts a command that a test has put together; `name` is for messages.
+    /// Starts a command that a test has built; `name` identifies the process in messages.
     pub fn start(name: String, mut command: Command) -> Self {
         command
             .stdin(Stdio::null())
@@ -101,12 +101,12 @@ impl Process {
         }
     }
 
-    /// Sends a signal. It has not been waited for, so its number is still its own.
+    /// Sends a signal. The process has not been waited for, so no other process can have its ID.
     pub fn signal(&self, signal: Signal) {
         kill(Pid::from_raw(self.pid()), signal).unwrap();
     }
 
-    /// Its number.
+    /// Returns the process ID.
     pub fn pid(&self) -> i32 {
         self.child.id() as i32
     }
@@ -119,7 +119,7 @@ impl Process {
     /// Waits until standard error holds `words`.
     pub fn wait_for_stderr(&mut self, words: &str) {
         wait_until(&format!("{}: {words:?} on stderr", self.name), || {
-            // In this order: what it said just before its end is not missed.
+            // Check for the end first, so that output written just before the end is not missed.
             let ended =
                 self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
             let said = self.stderr.so_far();
@@ -133,16 +133,16 @@ impl Process {
         });
     }
 
-    /// Whether it is still running.
+    /// Whether the process is still running.
     pub fn is_running(&mut self) -> bool {
         self.child.try_wait().unwrap().is_none()
     }
 
-    /// Waits for its end; at the deadline it is killed.
+    /// Waits until the process ends. At the deadline, panics and thereby kills the process.
     pub fn wait(mut self) -> Ended {
         let what = format!("the end of {}", self.name);
         let status = wait_for(&what, || self.child.try_wait().unwrap());
-        // Its pipes close with it, as it has no child that holds them.
+        // The pipes close when the process ends, because no child of the process holds them.
         wait_until(&format!("the last output of {}", self.name), || {
             self.stdout.reader.is_finished() && self.stderr.reader.is_finished()
         });
@@ -154,37 +154,37 @@ impl Process {
         }
     }
 
-    /// Waits for its end, which must be a success.
+    /// Waits until the process ends and checks that it succeeded.
     #[track_caller]
     pub fn wait_ok(self) -> Ended {
         self.wait().expect_code(0)
     }
 
-    /// Waits for its end, which must be an error with `words` on standard error.
+    /// Waits until the process ends and checks that it failed with `words` on standard error.
     #[track_caller]
     pub fn fails(self, words: &str) -> Ended {
         self.wait().expect_error(words)
     }
 
-    /// Kills it and waits for its end.
+    /// Kills the process and waits until it ends.
     pub fn kill(self) {
         self.signal(Signal::SIGKILL);
         assert_eq!(self.wait().signal, Some(Signal::SIGKILL as i32));
     }
 
-    /// Sends it what Ctrl-C does and waits for its end.
+    /// Sends SIGINT, as Ctrl-C does, and waits until the process ends.
     pub fn interrupt(self) -> Ended {
         self.signal(Signal::SIGINT);
         self.wait()
     }
 
-    /// Asks it to stop and waits for its end.
+    /// Sends SIGTERM and waits until the process ends.
     pub fn stop(self) -> Ended {
         self.signal(Signal::SIGTERM);
         self.wait()
     }
 
-    /// Asks it to stop and waits for its end, which must be a success.
+    /// Sends SIGTERM, waits until the process ends, and checks that it succeeded.
     #[track_caller]
     pub fn stop_ok(self) -> Ended {
         self.stop().expect_code(0)
@@ -222,27 +222,27 @@ impl Ended {
         self
     }
 
-    /// Checks that it ended with an error, exit code 1, and `words` on standard error.
+    /// Checks for exit code 1 and `words` on standard error.
     #[track_caller]
     pub fn expect_error(self, words: &str) -> Self {
         self.expect_code(1).expect_said(words)
     }
 
-    /// Standard output, as JSON.
+    /// Parses standard output as JSON.
     #[track_caller]
     pub fn json(&self) -> serde_json::Value {
         let said = serde_json::from_str(&self.stdout);
         said.unwrap_or_else(|e| panic!("{e}: {}", self.stdout))
     }
 
-    /// Checks that standard error holds `words`.
+    /// Checks that standard error contains `words`.
     #[track_caller]
     pub fn expect_said(self, words: &str) -> Self {
         check_has(&self.stderr, &[words]);
         self
     }
 
-    /// Checks that standard output holds `words`.
+    /// Checks that standard output contains `words`.
     #[track_caller]
     pub fn expect_printed(self, words: &str) -> Self {
         check_has(&self.stdout, &[words]);

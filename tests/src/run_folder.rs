@@ -1,5 +1,5 @@
-//! What a run left behind: summary, metrics, checkpoints, logs.
-//! It reads and checks what every run promises; what one run should have reached is for its test.
+//! The files that a run leaves behind: summary, metrics, checkpoints, logs.
+//! This module reads the files and checks what holds for every run. Each test checks the results of its own run.
 
 use std::{
     fs,
@@ -36,7 +36,7 @@ pub struct RunFolder {
     path: PathBuf,
 }
 
-/// Updates that a checkpoint's folder says it has.
+/// Returns the number of updates in the name of a checkpoint's folder.
 pub fn updates_of(checkpoint: &Path) -> u64 {
     let name = checkpoint.file_name().unwrap().to_str().unwrap();
     let updates = name.strip_prefix("checkpoint-").unwrap();
@@ -48,7 +48,7 @@ impl RunFolder {
         Self { path }
     }
 
-    /// Where it lies.
+    /// Returns the folder's path.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -63,7 +63,7 @@ impl RunFolder {
         self.text("config.toml").parse().unwrap()
     }
 
-    /// One whole number of the settings, by its dotted path.
+    /// Returns a numeric setting by its dotted path.
     pub fn setting(&self, path: &str) -> f64 {
         let config = toml::Value::Table(self.config());
         let value = path.split('.').fold(&config, |table, key| &table[key]);
@@ -72,17 +72,17 @@ impl RunFolder {
             .unwrap_or_else(|| value.as_integer().unwrap() as f64)
     }
 
-    /// `summary.json`.
+    /// Reads `summary.json`.
     pub fn summary(&self) -> Summary {
         serde_json::from_str(&self.text("summary.json")).unwrap()
     }
 
-    /// The whole rows of a table so far; none before it is there.
+    /// Reads the complete rows of a table so far; none if the file does not exist yet.
     pub fn table(&self, name: &str) -> Table {
         Table::read(&self.path.join(name)).unwrap()
     }
 
-    /// Waits until the metrics have a row with more than so many updates.
+    /// Waits until `metrics.csv` has a row with more than `updates` updates.
     pub fn wait_for_updates(&self, updates: u64) {
         wait_until(&format!("a row with more than {updates} updates"), || {
             self.table("metrics.csv").last::<u64>("updates") > Some(updates)
@@ -98,7 +98,7 @@ impl RunFolder {
         table.rows.iter().map(|row| row[at].to_owned()).collect()
     }
 
-    /// One column of `metrics.csv` that has no empty cell.
+    /// Returns one column of `metrics.csv` as numbers; no cell may be empty.
     #[track_caller]
     pub fn numbers(&self, name: &str) -> Vec<f64> {
         let cells = self.column(name);
@@ -157,14 +157,14 @@ impl RunFolder {
         self.checkpoints().pop().expect("there is a checkpoint")
     }
 
-    /// Updates of the newest checkpoint.
+    /// Returns the number of updates in the newest checkpoint.
     pub fn saved_updates(&self) -> u64 {
         updates_of(&self.newest_checkpoint())
     }
 
-    /// SHA-256 of the newest checkpoint's weights as actors get them: torso and head alone, as a safetensors file.
+    /// Returns the SHA-256 of the newest checkpoint's weights as actors receive them: only torso and head, as a safetensors file.
     ///
-    /// Computed from the file's own tensors, by the safetensors library alone.
+    /// Uses only the tensors in the file and the safetensors library, no code under test.
     pub fn checkpoint_sha256(&self) -> String {
         let bytes = fs::read(self.newest_checkpoint().join("online.safetensors")).unwrap();
         let tensors = SafeTensors::deserialize(&bytes).unwrap();
@@ -173,7 +173,7 @@ impl RunFolder {
         format!("{:x}", Sha256::digest(file))
     }
 
-    /// Checks what holds of every run that ended in order, and gives its summary.
+    /// Checks what holds for every run that shut down in order, and returns its summary.
     #[track_caller]
     pub fn check(&self, outcome: Outcome) -> Summary {
         let summary = self.summary();
@@ -182,7 +182,7 @@ impl RunFolder {
         check_nothing_lost(replay);
         assert_eq!(replay.messages_refused, 0, "{said}");
         assert_eq!(summary.frames, replay.transitions_inserted, "{said}");
-        // A replay that was kept knows of the k of all the run.
+        // A replay that was kept on disk has counted k over the whole run.
         let before = match self.path.join("replay").is_dir() {
             true => 0,
             false => summary.resumed_after_updates,
@@ -190,7 +190,7 @@ impl RunFolder {
         let rows_before = before * self.setting("learner.batch_size") as u64;
         let known = rows_before + replay.k_histogram.iter().sum::<u64>();
         let served = replay.rows_sampled + replay.rows_unlearned;
-        // A server that was killed has forgotten the k of what it served since its last snapshot.
+        // A killed server has lost its counts of k since its last snapshot.
         let may_lack = summary.resumed_after_updates > 0 || summary.replay_servers_restarted > 0;
         assert!(known == served || may_lack && known < served, "{said}");
         let is_timed = summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0;
@@ -205,7 +205,7 @@ impl RunFolder {
             assert_eq!(last, count.to_string(), "{column}");
         }
 
-        // The newest checkpoint has the last weights.
+        // The newest checkpoint holds the final weights.
         assert_eq!(self.checkpoint_sha256(), summary.weights_sha256);
         let kept = self.checkpoints().len();
         let allowed = 1..=self.setting("learner.checkpoints_kept") as usize;
@@ -213,7 +213,7 @@ impl RunFolder {
         summary
     }
 
-    /// Checks, beyond [`Self::check`], what holds of a run that went to its end.
+    /// Checks, in addition to [`Self::check`], what holds for a run that finished.
     #[track_caller]
     pub fn check_finished(&self) -> Summary {
         let summary = self.check(Outcome::Finished);
@@ -231,7 +231,7 @@ impl RunFolder {
         let ratio = self.setting("replay.replay_ratio");
         let allowed = ratio * (summary.frames - warmup) as f64 / rows as f64;
         assert_eq!(summary.updates, allowed as u64, "{said}");
-        // One set of weights before the first update, one for what came after the last publication; a resumed run skips the
+        // One version is published before the first update, and one for updates after the last full period. A resumed run skips the
         // versions that may have been published since its checkpoint.
         let publications = summary.updates / period;
         let most = match summary.resumed_after_updates {

@@ -1,18 +1,18 @@
-//! Tests that are skipped for want of something, each by name.
-//! It looks for nothing but what the environment says.
+//! Reports tests that are skipped because something is missing, each by name.
+//! This module checks only commands and the environment.
 
 use std::{io::Write, process::Command, thread};
 
-/// Says on stderr that the test of this thread is skipped, and why.
+/// Reports on stderr that the test of this thread is skipped, and why.
 ///
-/// The line does not go through `eprintln!`, whose output the test runner keeps to itself when a test passes.
+/// Does not use `eprintln!`, because the test runner hides its output when a test passes.
 pub fn skip(why: &str) {
     let test = thread::current();
     let name = test.name().unwrap_or("a test");
     note(&format!("skipped: {name} ({why})"));
 }
 
-/// Whether a command that a test needs succeeds; else the test is to be skipped, and a line on stderr names it.
+/// Returns whether a command that a test needs succeeds. If not, reports the test as skipped; the caller must then return.
 pub fn succeeds(command: &mut Command) -> bool {
     let why = match command.output() {
         Ok(output) if output.status.success() => return true,
@@ -23,14 +23,14 @@ pub fn succeeds(command: &mut Command) -> bool {
     false
 }
 
-/// Says a line on stderr, past the test runner.
+/// Writes a line to stderr that the test runner does not capture.
 pub fn note(line: &str) {
     std::io::stderr()
         .write_all(format!("{line}\n").as_bytes())
         .expect("stderr is there while tests run");
 }
 
-/// Whether a test that needs Procgen's engine, which may have to be fetched, is to be skipped; a line on stderr then names it.
+/// Returns whether `DRIML_OFFLINE` skips a test that may have to download Procgen's engine. If so, reports the test as skipped.
 pub fn skipped_offline() -> bool {
     let offline = std::env::var_os("DRIML_OFFLINE");
     let is_offline = offline.is_some_and(|value| !value.is_empty() && value != "0");

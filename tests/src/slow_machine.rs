@@ -1,5 +1,5 @@
-//! A process that gets little of the processor, as on a slow machine: it is stopped most of the time.
-//! What it does is its own; it only takes longer.
+//! Simulates a slow machine for one process by stopping the process most of the time.
+//! The process behaves as usual and only takes longer.
 
 use std::{
     thread::{self, JoinHandle},
@@ -12,11 +12,11 @@ use nix::{
     unistd::Pid,
 };
 
-/// For how long it runs, and stands still, in turn.
+/// The durations for which the process runs and is stopped, in turn.
 const RUNS: Duration = Duration::from_millis(2);
 const STANDS: Duration = Duration::from_millis(98);
 
-/// A process is slow until this is dropped.
+/// Keeps a process slow until this value is dropped.
 #[derive(Debug)]
 pub struct SlowMachine {
     done: Shutdown,
@@ -24,7 +24,7 @@ pub struct SlowMachine {
 }
 
 impl SlowMachine {
-    /// Slows the process of this number down; one that has ended meanwhile is ignored.
+    /// Slows down the process with this ID. Ignores a process that has already ended.
     pub fn for_process(pid: i32) -> Self {
         let done = Shutdown::default();
         let until = done.clone();

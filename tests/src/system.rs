@@ -1,5 +1,5 @@
-//! One system: its folder, its mark, and every process that carries the mark.
-//! It starts processes and finds them; what they say is for `process` and `client`.
+//! One system under test: its folder, its mark, and every process that carries the mark.
+//! This module starts and finds processes; `process` and `client` read what they output.
 
 use std::{
     fs,
@@ -26,39 +26,39 @@ use crate::{
     waiting::{wait_for, wait_until},
 };
 
-/// The variable that marks each process of a system. Children inherit it, so that those of a killed launcher are found too.
+/// The environment variable that marks each process of a system. Children inherit it, so the harness also finds those of a killed launcher.
 const MARK: &str = "DRIML_TEST_SYSTEM";
 
-/// A folder and the processes that were started in it. Dropping it kills those that are left.
+/// A folder and the processes started in it. Dropping the system kills every process that is left.
 #[derive(Debug)]
 pub struct TestSystem {
     program: String,
     folder: tempfile::TempDir,
     mark: String,
-    /// Where its processes meet: a unix socket unless a test asks for another, so that no port can be taken.
+    /// The endpoint that connects the processes: by default a unix socket, which needs no free port.
     endpoint: String,
-    /// The flag of processes that talk over TLS.
+    /// The flag that makes processes use TLS; empty without TLS.
     tls: &'static str,
-    /// After how many updates learners that are started wait; none do after [`NEVER`].
+    /// The number of updates after which newly started learners pause; with [`NEVER`] they do not pause.
     held_at: AtomicU64,
 }
 
-/// No learner makes so many updates.
+/// More updates than any learner makes.
 const NEVER: u64 = u64::MAX;
-/// The file that learners which are held wait for.
+/// The file whose creation releases held learners.
 const GO: &str = "go";
 
-/// A process of a system that is still there.
+/// A process of a system that is still running.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Survivor {
-    /// Its number.
+    /// The process ID.
     pub pid: i32,
-    /// Its arguments after the program's name.
+    /// The arguments after the program's name.
     pub args: Vec<String>,
 }
 
 impl TestSystem {
-    /// A new system, in a fresh folder; `program` is the binary under test.
+    /// Creates a system in a new temporary folder; `program` is the path of the binary under test.
     pub fn new(program: &str) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
@@ -77,14 +77,14 @@ impl TestSystem {
         }
     }
 
-    /// This system, whose processes meet at another endpoint.
+    /// Returns this system with another endpoint for its processes.
     pub fn at(mut self, endpoint: String) -> Self {
         self.endpoint = endpoint;
         self
     }
 
-    /// This system, whose processes talk over TLS with certificates in its folder `tls`, of three actors; none where there is no
-    /// openssl, and then the test is skipped by name.
+    /// Returns this system with TLS, and certificates for three actors in its folder `tls`. Returns `None` if openssl is missing, and
+    /// reports the test as skipped.
     pub fn over_tls(mut self) -> Option<Self> {
         if !succeeds(Command::new("openssl").arg("version")) {
             return None;
@@ -94,19 +94,19 @@ impl TestSystem {
         Some(self.at(quic_endpoint()))
     }
 
-    /// The certificates of a system over TLS.
+    /// Returns the certificates of a system that uses TLS.
     pub fn certificates(&self) -> Certificates {
         Certificates::at(self.path("tls"))
     }
 
-    /// Learners that are started from now on stand still after so many updates, and report no more, until [`Self::let_go`]: their run is
-    /// not over before a test has seen and done what it has to, however slow the test is.
+    /// Makes learners that start from now on pause after `updates` updates, and report no more, until [`Self::let_go`]. The run thus cannot
+    /// end before a slow test has finished its checks.
     pub fn hold_at(&self, updates: u64) {
         assert!(!self.path(GO).exists(), "learners were let go before");
         self.held_at.store(updates, Ordering::Relaxed);
     }
 
-    /// Releases the learners that are held, and holds no more.
+    /// Releases the held learners; learners that start later are not held.
     pub fn let_go(&self) {
         fs::write(self.path(GO), "").unwrap();
     }
@@ -122,19 +122,19 @@ impl TestSystem {
         fs::read_to_string(self.path(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
     }
 
-    /// The names of what lies in a folder of the system's.
+    /// Returns the names of the entries of a folder in the system's folder.
     pub fn names(&self, folder: &str) -> Vec<String> {
         let entries = fs::read_dir(self.path(folder)).unwrap();
         let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
         names.collect()
     }
 
-    /// A run folder in the system's folder, whether or not it is there yet.
+    /// Returns the run folder `name` in the system's folder; it need not exist yet.
     pub fn run_folder(&self, name: &str) -> RunFolder {
         RunFolder::new(self.path(name))
     }
 
-    /// Checks that no process is left, and that the run in the folder `run` came to this; gives its summary.
+    /// Checks that no process is left and that the run in the folder `run` has this outcome. Returns the run's summary.
     #[track_caller]
     pub fn check_over(&self, outcome: Outcome) -> Summary {
         assert_eq!(self.survivors(), []);
@@ -143,40 +143,40 @@ impl TestSystem {
         summary
     }
 
-    /// The endpoint at which this system's processes meet.
+    /// Returns the endpoint that connects this system's processes.
     pub fn endpoint(&self) -> &str {
         &self.endpoint
     }
 
-    /// The endpoint of a unix socket in the system's folder.
+    /// Returns the endpoint of a unix socket in the system's folder.
     pub fn socket(&self, name: &str) -> String {
         format!("unixsock-stream/{}", self.path(name).display())
     }
 
-    /// The call of a run in the folder `run` whose processes meet at this system's endpoint.
+    /// Returns the arguments of a `local` run in the folder `run` at this system's endpoint.
     pub fn local(&self, flags: &str) -> String {
         self.listening(&format!("local {flags} --run-dir run"))
     }
 
-    /// The call of a command that listens at this system's endpoint.
+    /// Returns the arguments of a command that listens at this system's endpoint.
     pub fn listening(&self, command: &str) -> String {
         format!("{command} --listen {}{}", self.endpoint, self.tls)
     }
 
-    /// The call of a command that connects to this system's replay server.
+    /// Returns the arguments of a command that connects to this system's replay server.
     pub fn connected(&self, command: &str) -> String {
         format!("{command} --connect {}{}", self.endpoint, self.tls)
     }
 
-    /// Starts the program in the system's folder, with these arguments as in a shell: quotes are around those that have blanks.
+    /// Starts the program in the system's folder. `args` is split as in a shell: quote arguments that contain blanks.
     ///
-    /// Or a whole line in which the word `DRIML` is the program: after words that put it on another machine, or `env` with variables, which
-    /// all processes of a run inherit.
+    /// `args` may also be a whole command line in which the word `DRIML` stands for the program, for example after `ip netns exec` or `env`
+    /// with variables. All processes of a run inherit such variables.
     pub fn start(&self, args: &str) -> Process {
         Process::start(args.to_owned(), self.command(args))
     }
 
-    /// How [`Self::start`] does it, for tests that start the program in their own way.
+    /// Returns the command that [`Self::start`] starts, for tests that start it in another way.
     pub fn command(&self, args: &str) -> Command {
         let mut line = shlex::split(args).expect("quotes are closed");
         match line.iter().position(|word| word == "DRIML") {
@@ -197,37 +197,37 @@ impl TestSystem {
         command
     }
 
-    /// Runs the program to its end.
+    /// Runs the program until it exits.
     pub fn run(&self, args: &str) -> Ended {
         self.start(args).wait()
     }
 
-    /// Runs the program to its end, which must be a success.
+    /// Runs the program and checks that it succeeds.
     #[track_caller]
     pub fn run_ok(&self, args: &str) -> Ended {
         self.run(args).expect_code(0)
     }
 
-    /// Runs `local` into the run folder `run_dir` to its end, and gives its summary after [`RunFolder::check_finished`].
+    /// Runs `local` with the run folder `run_dir` until it exits. Returns the summary, checked by [`RunFolder::check_finished`].
     #[track_caller]
     pub fn train(&self, flags: &str, run_dir: &str) -> Summary {
         self.run_ok(&format!("local {flags} --run-dir {run_dir}"));
         self.run_folder(run_dir).check_finished()
     }
 
-    /// Runs the program to its end, which must be an error with `words` on standard error.
+    /// Runs the program and checks that it fails with `words` on standard error.
     #[track_caller]
     pub fn fails(&self, args: &str, words: &str) -> Ended {
         self.run(args).expect_error(words)
     }
 
-    /// Runs the program to its end, which must be that of a wrong configuration, with `words` on standard error.
+    /// Runs the program and checks that it rejects its configuration (exit code 64) with `words` on standard error.
     #[track_caller]
     pub fn refuses(&self, args: &str, words: &str) -> Ended {
         self.run(args).expect_code(64).expect_said(words)
     }
 
-    /// Checks a table of calls: a line is a call, ` => `, and the words with which it is refused as [`Self::refuses`] says.
+    /// Checks a table of calls with [`Self::refuses`]. Each line holds a call, ` => `, and the words that standard error must contain.
     #[track_caller]
     pub fn refuses_each(&self, table: &str) {
         for line in table.trim().lines() {
@@ -236,19 +236,19 @@ impl TestSystem {
         }
     }
 
-    /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
+    /// Starts a process that would otherwise wait for signals forever. The process exits when this test process ends, however that happens.
     pub fn start_process(&self, args: &str) -> Process {
         let parent = std::process::id();
         self.start(&format!("{args} --exit-with-parent {parent}"))
     }
 
-    /// The call of a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
-    /// asked, as the learner does.
+    /// Returns the arguments of a replay server at this system's endpoint, with the settings in `flags`. Like the learner, the server keeps
+    /// answering requests after the run is over.
     pub fn replay_server(&self, flags: &str) -> String {
         self.listening(&format!("replay-server --keep-alive {flags}"))
     }
 
-    /// Starts such a replay server; over TLS it listens then.
+    /// Starts such a replay server. With TLS, waits until the server listens.
     pub fn start_replay_server(&self, flags: &str) -> Process {
         let mut server = self.start_process(&self.replay_server(flags));
         if !self.tls.is_empty() {
@@ -267,25 +267,25 @@ impl TestSystem {
         self.start_process(&self.connected(&format!("actor --id {id}")))
     }
 
-    /// A client of the run at this system's endpoint, once its replay server answers; over TLS, one that only looks.
+    /// Connects a client to the run at this system's endpoint once its replay server answers. With TLS, the client is an observer.
     pub fn connect(&self) -> Client {
         self.connect_as(Role::Observer)
     }
 
-    /// The same, over TLS with the certificate of `role`.
+    /// Connects like [`Self::connect`], but with TLS uses the certificate of `role`.
     pub fn connect_as(&self, role: Role) -> Client {
         let read = || Credentials::read(&self.path("tls"), role).unwrap();
         let credentials = (!self.tls.is_empty()).then(read);
         Client::join(&self.endpoint, credentials.as_ref())
     }
 
-    /// A process's connection to the run with this spec, without any question to its replay server.
+    /// Returns a process's connection to the run with this `spec`, without a request to the replay server.
     pub fn run_client(&self, spec: &RunSpec) -> RunClient {
         let keys = Keys::new(NAMESPACE).unwrap();
         RunClient::new(connect(&self.endpoint), keys, spec.hash())
     }
 
-    /// Every process of this system that still runs, children of ended ones included.
+    /// Returns every process of this system that still runs, including children of processes that have ended.
     pub fn survivors(&self) -> Vec<Survivor> {
         let mark = format!("{MARK}={}", self.mark);
         let processes = fs::read_dir("/proc").unwrap().flatten();
@@ -297,7 +297,7 @@ impl TestSystem {
         };
         let survivor = |entry: fs::DirEntry| {
             let pid = entry.file_name().to_str()?.parse().ok()?;
-            // One that has ended and was not waited for has no environment any more.
+            // A process that has ended but was not waited for (a zombie) has no environment any more.
             carries_mark(&entry.path()).then_some(())?;
             let words = fs::read(entry.path().join("cmdline")).unwrap_or_default();
             let words = words
@@ -312,20 +312,20 @@ impl TestSystem {
         processes.filter_map(survivor).collect()
     }
 
-    /// The process with this `role` (`learner`, `actor`, `replay-server`), once it is there.
+    /// Waits for a process with this `role` (`learner`, `actor`, `replay-server`) and returns it.
     pub fn find_process(&self, role: &str) -> Survivor {
         wait_for(&format!("a process {role}"), || self.find_process_now(role))
     }
 
-    /// The first process with this `role`, if there is one now.
+    /// Returns the first process with this `role` that runs now, if any.
     pub fn find_process_now(&self, role: &str) -> Option<Survivor> {
         let is_process = |it: &Survivor| it.args.first().is_some_and(|first| first == role);
         self.survivors().into_iter().find(is_process)
     }
 
-    /// Kills every process that the program has started here, launchers first.
+    /// Kills every process of this system, launchers first.
     pub fn kill_all(&self) {
-        // A child that a dying launcher started while the list was made is in the next list.
+        // A dying launcher may start a child while the list is made; the next list contains that child.
         for _ in 0..10 {
             let mut left = self.survivors();
             if left.is_empty() {
@@ -338,14 +338,14 @@ impl TestSystem {
         }
     }
 
-    /// Waits until no process that the program has started here is left.
+    /// Waits until no process of this system is left.
     pub fn wait_until_all_have_ended(&self) {
         wait_until("the end of all processes", || self.survivors().is_empty());
     }
 }
 
 impl Survivor {
-    /// A number of the process's status in `/proc`, such as `VmRSS`.
+    /// Returns a number from `/proc/PID/status`, such as `VmRSS`.
     pub fn status(&self, name: &str) -> u64 {
         let text = fs::read_to_string(format!("/proc/{}/status", self.pid)).unwrap();
         let mut lines = text.lines();
@@ -354,7 +354,7 @@ impl Survivor {
         number.unwrap().parse().unwrap()
     }
 
-    /// Sends a signal; a process that has ended meanwhile is ignored.
+    /// Sends a signal. Ignores a process that has already ended.
     pub fn signal(&self, signal: Signal) {
         let _ = kill(Pid::from_raw(self.pid), signal);
     }

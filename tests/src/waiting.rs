@@ -1,17 +1,17 @@
-//! Waiting for what other processes do: by looking, with a deadline; and for several at the same time.
+//! Waits for other processes by polling, with a deadline; and does several such waits at the same time.
 
 use std::{
     thread,
     time::{Duration, Instant},
 };
 
-/// How long any one wait may take. The longest are for experiments of many runs: three minutes where four other processes want the
-/// same two cores. A CI job's limit is above it.
+/// The time-out of each wait. The longest waits are for experiments of many runs: three minutes if four other processes share the same two
+/// cores. The time-out of a CI job is longer.
 const DEADLINE: Duration = Duration::from_secs(600);
-/// Between two looks at a condition: as long as a look takes, as one may start a process, within these limits.
+/// Limits of the pause between two checks of a condition. The pause is as long as a check, because a check may start a process.
 const LOOK_AGAIN: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(200)];
 
-/// Waits until `look` gives something.
+/// Waits until `look` returns a value, and returns it. Panics at the deadline.
 pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let started = Instant::now();
     loop {
@@ -27,12 +27,12 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Waits until something holds.
+/// Waits until `holds` returns true. Panics at the deadline.
 pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     wait_for(what, || holds().then_some(()));
 }
 
-/// Does this for all items at the same time, where most of it is waiting.
+/// Calls `work` for all items at the same time, one thread each. Meant for work that mostly waits.
 pub fn at_once<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(T) + Sync) {
     let work = &work;
     thread::scope(|scope| {
