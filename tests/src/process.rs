@@ -184,7 +184,7 @@ impl Process {
         self.wait()
     }
 
-    /// Sends SIGTERM, waits until the process ends, and checks that it succeeded.
+    /// Asks it to stop and waits for its end, which must be a success.
     #[track_caller]
     pub fn stop_ok(self) -> Ended {
         self.stop().expect_code(0)

@@ -1,5 +1,5 @@
-//! Processes started by hand in terminals: joined by an endpoint alone, ended by signals.
-//! The launcher has no part in it.
+//! Processes started by hand in terminals: they share only an endpoint, and signals end them.
+//! These runs have no launcher.
 
 use std::fs;
 
@@ -9,7 +9,7 @@ use nix::sys::signal::Signal::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::{LONG, SHORT, closed_terminal::skipped_under_nohup, system};
 
-/// A run by hand: its processes find each other, and end in order.
+/// Starts a run by hand, and checks that its processes find each other and exit in order.
 fn finds_each_other_and_ends_in_order(system: &TestSystem) {
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
@@ -31,7 +31,7 @@ fn finds_each_other_and_ends_in_order(system: &TestSystem) {
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
     learner.stop_ok().expect_said("finished after 540 updates");
-    // Its folder is as good as a launched run's for an evaluation.
+    // The learner's run folder can be evaluated like that of a launched run.
     system.run_ok("evaluate --run run --episodes 5");
     drop(client);
     server
@@ -78,7 +78,7 @@ fn processes_end_by_themselves_when_the_run_is_over() {
     }
 }
 
-/// By any signal that a shell, a service manager or a closed ssh session sends.
+/// Tests each signal that a shell, a service manager or a closed ssh session sends.
 #[test]
 fn processes_that_are_told_to_stop_lose_nothing() {
     for signal in [SIGTERM, SIGINT, SIGHUP] {
@@ -108,7 +108,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
             learner.is_running() && server.is_running(),
             "they do not depend on actors"
         );
-        // The learner uses up what the replay ratio allows, then waits; told to stop, it saves.
+        // The learner makes the updates that the replay ratio allows, then waits. On a signal it saves a checkpoint.
         client.wait_for_replay("a waiting learner", |replay| {
             replay.waiting == Waiting::LearnerWaitsForActors
         });
@@ -122,7 +122,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
 #[test]
 fn an_actor_killed_and_started_again_continues() {
     let system = system();
-    // The first actor cannot finish it before it is killed.
+    // Hold the learner, so that the first actor cannot finish the run before it is killed.
     system.hold_at(100);
     let flags = "--env chain --preset smoke --frames 4008 --set replay.warmup_transitions=2000";
     let _server = system.start_replay_server(&format!(
@@ -140,14 +140,14 @@ fn an_actor_killed_and_started_again_continues() {
     let again = system.start_actor(3);
     again.wait_ok();
     client.wait_for_the_last_update();
-    // A killed actor sends no `Leave`: what it had and did not deliver was never announced, and is in no count.
+    // A killed actor sends no `Leave`: its undelivered transitions were never announced and appear in no count.
     let replay = client.check_nothing_lost();
     assert!(replay.transitions_inserted >= 4_008 && replay.finished);
     assert_eq!(replay.messages_refused, 0);
     learner.stop_ok();
 }
 
-/// However it is started, a process has the environment that candle and the C library read; what the user has set stays.
+/// A process started by hand also sets the environment variables that candle and the C library read. Variables set by the user stay.
 #[test]
 fn a_process_by_hand_settles_its_environment() {
     let system = system();

@@ -1,5 +1,5 @@
-//! No files of a crate form a circle: each can be read knowing only those that it names, and they never lead back to it.
-//! It reads the sources' tokens, those within macros' brackets too; it does not know what the compiler makes of macros' results.
+//! The files of a crate must not depend on each other in a circle: no file names another that leads back to the first.
+//! The test reads the tokens of the sources, including those inside macro calls, but does not expand macros.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -10,13 +10,13 @@ use std::{
 use proc_macro2::{Delimiter, TokenStream, TokenTree};
 use walkdir::WalkDir;
 
-/// A module's path from the crate's root, which is empty itself; a path in code from there ends in an item's name or in a module's.
+/// A module's path from the crate's root, whose own path is empty. A path found in code may also end in an item's name.
 type ModulePath = Vec<String>;
 
-/// A file, and another that its code names.
+/// A file, and another file that its code names.
 type Arrow = (PathBuf, PathBuf);
 
-/// The module that a file is, by its path from the crate's sources.
+/// Returns the module path of a file, given its path in the crate's sources.
 fn module_of(file: &Path) -> ModulePath {
     let names = file.with_extension("");
     let names = names.iter().map(|name| name.to_str().unwrap().to_owned());
@@ -25,13 +25,13 @@ fn module_of(file: &Path) -> ModulePath {
     module
 }
 
-/// Which files of the crate whose sources lie in `folder` name which others. A module is a file, but for modules of tests.
+/// Returns which files of the crate with its sources in `folder` name which others. Each module is a file, except modules of tests.
 fn arrows(folder: &Path) -> BTreeSet<Arrow> {
     let mut files = BTreeMap::<ModulePath, PathBuf>::new();
     for entry in WalkDir::new(folder).sort_by_file_name() {
         let file = entry.unwrap().into_path();
         if file.extension().is_some_and(|it| it == "rs") {
-            // That a program's root is its library's too changes nothing.
+            // If a crate has `lib.rs` and `main.rs`, both are the root module; `lib.rs` is the one kept.
             let module = module_of(file.strip_prefix(folder).unwrap());
             files.entry(module).or_insert(file);
         }
@@ -48,7 +48,7 @@ fn arrows(folder: &Path) -> BTreeSet<Arrow> {
                 Some("crate") => vec![],
                 Some("self" | "super") => module.clone(),
                 Some(first) if is_child(first.to_owned()) => module.clone(),
-                // It does not lead into this crate.
+                // The path does not lead into this crate.
                 _ => continue,
             };
             for segment in path {
@@ -69,7 +69,7 @@ fn arrows(folder: &Path) -> BTreeSet<Arrow> {
     arrows
 }
 
-/// Tokens without the items that are compiled for tests alone.
+/// Returns the tokens without the items under `#[cfg(test)]`.
 fn without_tests(tokens: TokenStream) -> Vec<TokenTree> {
     let mut kept = Vec::new();
     let mut tokens = tokens.into_iter();
@@ -80,7 +80,7 @@ fn without_tests(tokens: TokenStream) -> Vec<TokenTree> {
             kept.push(token);
             continue;
         }
-        // The item goes to its end.
+        // Skip the item to its end.
         for token in tokens.by_ref() {
             match token {
                 TokenTree::Punct(end) if end.as_char() == ';' => break,
@@ -92,7 +92,7 @@ fn without_tests(tokens: TokenStream) -> Vec<TokenTree> {
     kept
 }
 
-/// Notes all paths as code has them; `before` is the one that they continue, as those in the braces of a `use` do.
+/// Adds all paths in `tokens` to `found`. `before` is the prefix of paths inside the braces of a `use`.
 fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePath>) {
     let mut rest = tokens;
     while let [first, after @ ..] = rest {
@@ -106,7 +106,7 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
             _ => continue,
         };
         if word == "as" && !before.is_empty() {
-            // Another name for what was just noted.
+            // An alias of the path that was just added.
             rest = rest.get(1..).unwrap_or_default();
             continue;
         }
@@ -126,7 +126,7 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
                     note_paths(&without_tests(group.stream()), &path, found);
                     path.clear();
                 }
-                // All of it, or the types that it is given.
+                // A glob import, or the `<` of type arguments.
                 _ => {}
             }
             is_whole = true;
@@ -138,7 +138,7 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
     }
 }
 
-/// The arrows of circles, and between circles. All others go, round by round: no arrow leads to their beginning, or from their end.
+/// Returns the arrows in and between circles. Removes, round by round, arrows whose start no arrow enters or whose end no arrow leaves.
 fn circles(mut arrows: BTreeSet<Arrow>) -> BTreeSet<Arrow> {
     loop {
         let (from, to): (BTreeSet<_>, BTreeSet<_>) = arrows.iter().cloned().unzip();

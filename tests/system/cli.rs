@@ -1,5 +1,5 @@
-//! The program as a user calls it wrongly: each call is answered by a sentence that says what to do, and the right code.
-//! No run is started here.
+//! Wrong calls of the program: each exits with the right code and a sentence that says what to do.
+//! These tests start no run.
 
 use std::{fs, os::unix::process::CommandExt};
 
@@ -8,7 +8,7 @@ use expect_test::expect_file;
 
 use crate::system;
 
-/// A row of the file is a call; the answer stands below it.
+/// Each line of the file that starts with `$` is a call; the expected output stands below it.
 #[test]
 fn calls_that_cannot_work_are_answered_with_what_to_do() {
     let system = system();
@@ -18,7 +18,7 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
     fs::write(system.path("odd.toml"), "[run]\nworld = \"chain\"\n").unwrap();
     let said = |call: &str| {
         let mut command = system.command(call);
-        // Usage has the name by which the program was called.
+        // The usage text contains the name by which the program was called.
         command.arg0("driml");
         command.envs([("RANK_OF_A_TEST", "x3"), ("OTHER_RANK_OF_A_TEST", "17")]);
         let ended = Process::start(call.into(), command).wait();
@@ -50,11 +50,11 @@ fn a_call_that_asks_for_help_or_leaves_the_command_out_prints_it() {
     }
 }
 
-/// These can only be known at run time: exit code 1.
+/// The program finds these errors only at run time, and exits with code 1.
 #[test]
 fn files_and_runs_that_are_not_there() {
     let system = system();
-    // A safetensors file whose header is announced with 100 bytes, cut off after 10.
+    // A safetensors file that announces a header of 100 bytes and is cut off after 10.
     let mut cut = 100u64.to_le_bytes().to_vec();
     cut.extend(b"{\"input.fr");
     fs::write(system.path("cut.safetensors"), cut).unwrap();
@@ -85,7 +85,7 @@ fn files_and_runs_that_are_not_there() {
 #[test]
 fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let system = system();
-    // How many figures, and how many of them are of arithmetic.
+    // The number of figures, and how many of them measure arithmetic.
     for (bench, count, of_arithmetic) in [
         ("policy", 12, 0),
         ("learner --growth --precision bf16", 26, 13),

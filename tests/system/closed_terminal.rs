@@ -1,5 +1,5 @@
-//! A terminal or pipe that is closed in the middle of a run: the run drains, saves and ends as after Ctrl-C.
-//! And one that is stopped, and resumes. Ctrl-C is in `resume` and `failures`, hangups of single processes are in `by_hand`.
+//! A terminal or pipe is closed during a run: the run drains, saves and exits as after Ctrl-C. Another run is suspended and continued.
+//! Ctrl-C is in `resume` and `failures`, hangups of single processes are in `by_hand`.
 
 use std::{
     fs::{File, OpenOptions},
@@ -22,7 +22,7 @@ use nix::{
 
 use crate::{LONG, PROCESSES, launched, system};
 
-/// A terminal whose window a test can close. Until then what is written there is read, as a window does it.
+/// A terminal whose window a test can close. Until then a thread reads the terminal's output, as a window does.
 struct Window {
     closed: Shutdown,
     shown: Arc<Mutex<Vec<u8>>>,
@@ -30,9 +30,9 @@ struct Window {
 }
 
 impl Window {
-    /// A window, and the terminal in it for a process to write to.
+    /// Opens a window. Returns the window, and the terminal that a process writes to.
     fn open() -> (Self, File) {
-        // Not `openpty`: what it opens is inherited by every process that any test starts meanwhile.
+        // Not `openpty`: every process that any test starts meanwhile would inherit its files.
         let flags = OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC;
         let mut master = posix_openpt(flags).unwrap();
         grantpt(&master).unwrap();
@@ -64,7 +64,7 @@ impl Window {
         (window, terminal)
     }
 
-    /// What was shown so far.
+    /// Returns the output so far.
     fn shown(&self) -> String {
         String::from_utf8_lossy(&self.shown.lock().unwrap()).into_owned()
     }
@@ -75,14 +75,14 @@ impl Window {
     }
 }
 
-/// A run of this call that writes all that it says to `out` and `err`.
+/// Starts the program with the arguments `run`, with standard output and standard error redirected to `out` and `err`.
 fn start(system: &TestSystem, run: &str, out: impl Into<Stdio>, err: impl Into<Stdio>) -> Child {
     let mut command = system.command(run);
     command.stdin(Stdio::null()).stdout(out).stderr(err);
     command.spawn().unwrap()
 }
 
-/// The launcher ends as after an interrupt: everything is saved, no process runs.
+/// Checks that the launcher exits as after an interrupt: everything is saved, and no process is left.
 fn check_saved(system: &TestSystem, mut launcher: Child) {
     let ended = wait_for("the launcher's end", || launcher.try_wait().unwrap());
     assert_eq!(ended.code(), Some(130), "{ended}");
@@ -131,7 +131,7 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     check_saved(&system, launcher);
 }
 
-/// Under `nohup` all processes of a test ignore hangups. It does not ask the program, which may be wrong.
+/// Returns whether hangups are ignored, as under `nohup`, and then reports the test as skipped. Asks the kernel, not the program.
 pub(crate) fn skipped_under_nohup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let mask = status.lines().find_map(|it| it.strip_prefix("SigIgn:"));
@@ -150,7 +150,7 @@ fn a_hangup_ends_a_launched_run_once() {
     }
     let system = system();
     let process = launched(&system, 100);
-    // The kernel and a shell may each send one.
+    // The kernel and a shell may each send a hangup.
     process.signal(Signal::SIGHUP);
     process.signal(Signal::SIGHUP);
     process.wait().expect_code(130);
@@ -158,7 +158,7 @@ fn a_hangup_ends_a_launched_run_once() {
     system.run_folder("run").check(Outcome::Interrupted);
 }
 
-/// `nohup driml local ... &`, and the terminal is closed.
+/// As with `nohup driml local ... &`, whose terminal is then closed.
 #[test]
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
@@ -177,7 +177,7 @@ fn a_run_that_is_to_ignore_hangups_does() {
     system.run_folder("run").check(Outcome::Interrupted);
 }
 
-/// Ctrl-Z, and `fg` after longer than the launcher waits for an answer.
+/// As with Ctrl-Z, and `fg` after more time than the launcher waits for a reply.
 #[test]
 #[ignore = "three minutes: cargo nextest run --workspace --run-ignored only -E 'test(stopped_for_long)'"]
 fn a_run_that_was_stopped_for_long_resumes() {

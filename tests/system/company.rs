@@ -1,4 +1,4 @@
-//! Many processes at once: actors at a closed limiter, two processes with one role.
+//! Many processes at once: actors that wait at a closed limiter, and two processes with the same role.
 //! One server with one actor is in `by_hand`; dying processes are in `failures`.
 
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use driml_tests::{Outcome, wait_until};
 
 use crate::{LONG, chain, synthetic::SyntheticActor, system, tiny_replay};
 
-/// The learner is so slow, by a replay ratio of 64, that every actor waits nearly all of the time.
+/// A replay ratio of 64 makes the learner so slow that every actor waits nearly all of the time.
 #[test]
 fn twenty_four_actors_wait_for_one_learner() {
     let system = system();
@@ -17,7 +17,7 @@ fn twenty_four_actors_wait_for_one_learner() {
         "--agent c51 {} --actors 24 --set replay.replay_ratio=64",
         chain(2_400)
     );
-    // However fast the machine is, the run is not over before the last actor waits.
+    // Hold the learner, so that even on a fast machine the run does not end before the last actor waits.
     system.hold_at(100);
     let process = system.start(&system.local(&flags));
     system
@@ -30,7 +30,7 @@ fn twenty_four_actors_wait_for_one_learner() {
     assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
 }
 
-/// Ctrl-C while all wait: what they have is let in.
+/// After Ctrl-C while all actors wait, the replay server stores what they still have.
 #[test]
 fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     let system = system();
@@ -46,8 +46,8 @@ fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     assert_eq!(system.survivors(), []);
 }
 
-/// A limiter that never opens, as where the learner is gone, and time-outs that are long past before the test is: an actor that
-/// waits knows that it waits.
+/// The limiter never opens, as without a learner, and the test lasts longer than the time-out for an unreachable server. Actors that wait
+/// at the limiter do not time out.
 #[test]
 fn an_actor_waits_for_as_long_as_it_must() {
     let system = system();
@@ -66,7 +66,7 @@ fn an_actor_waits_for_as_long_as_it_must() {
     };
     let actors: Vec<_> = (0..16).map(synthetic).collect();
     let produced: u64 = std::thread::scope(|scope| {
-        // Each sends as fast as it may, then delivers what it has, although nothing makes room.
+        // Each actor sends as fast as it may, then delivers the rest, although nothing makes room.
         let run = |mut actor: SyntheticActor| {
             while !stop.is_set() {
                 actor.send(0);
@@ -78,7 +78,7 @@ fn an_actor_waits_for_as_long_as_it_must() {
             .map(|actor| scope.spawn(move || run(actor)));
         let runs: Vec<_> = runs.collect();
         let before = client.wait_for_replay("16 that wait", |replay| replay.actors_waiting == 16);
-        // The warm-up, what may run ahead of a learner, and the chunk that overshoots.
+        // The warm-up, the slack by which actors may run ahead of the learner, and the chunk that overshoots.
         assert!(before.transitions_inserted <= 200 + 256 + 32, "{before:#?}");
         let started = Instant::now();
         wait_until("twice the time that an actor bears silence", || {
@@ -112,7 +112,7 @@ fn of_two_processes_with_one_role_the_second_waits_for_the_first_one_s_end() {
     second.wait_for_stderr(
         "another process is actor 3 of this run: give each actor another number (--id)",
     );
-    // The first one still plays.
+    // The first actor still plays.
     let before = client.replay().unwrap();
     client.wait_for_transitions(before.transitions_inserted);
     actor.stop_ok().expect_said("leaves: ");

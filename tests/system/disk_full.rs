@@ -1,5 +1,5 @@
-//! Run folders and replays on disks that are full or read-only: the run continues, logs it once, and ends with the first error.
-//! The disk is a small one in memory, which takes root's rights to mount; without them a line says what is skipped.
+//! Run folders and replays on disks that are full or read-only: the run continues, logs the error once, and exits with the first error.
+//! The disk is a small one in memory. Mounting it needs root; without root the tests are skipped by name.
 
 use std::{
     fs::{self, File},
@@ -12,13 +12,13 @@ use driml_tests::{Outcome, Process, TestSystem, check_has, succeeds, wait_for, w
 
 use crate::{LONG, SHORT, system};
 
-/// A small disk. Dropping it takes it away.
+/// A small disk. Dropping the value unmounts it.
 struct Disk {
     folder: PathBuf,
 }
 
 impl Disk {
-    /// One of so many KiB at `folder`; none, and a line that the test is skipped, if it cannot be mounted.
+    /// Mounts a disk of `kib` KiB at `folder`. If that fails, returns `None` and reports the test as skipped.
     fn mount(folder: PathBuf, kib: u32) -> Option<Self> {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
@@ -39,17 +39,17 @@ impl Drop for Disk {
     }
 }
 
-/// Takes all room that there is, with a file.
+/// Writes a file until the disk is full.
 pub(crate) fn fill(file: impl AsRef<Path>) {
     let mut file = File::create(file).unwrap();
     while file.write_all(&[0; 4096]).is_ok() {}
 }
 
-/// Updates between two checkpoints of a run that ends before the first.
+/// A checkpoint period that no run reaches, in updates.
 pub(crate) const NEVER: u32 = 100_000_000;
 
-/// Tests a run on a disk that is full, which has learned something, saves a checkpoint after so many updates, and has logged `words`; the
-/// third argument is the file that fills the disk. No process is left then, and no half of a file.
+/// Calls `test` with a run that has made updates and has logged `words` because its disk is full; the path is that of the file that fills
+/// the disk. The run saves a checkpoint every `checkpoint_period` updates. Then checks that no process and no temporary file is left.
 fn with_full_disk(
     checkpoint_period: u32,
     words: &str,
@@ -77,7 +77,7 @@ fn with_full_disk(
 
 const NOT_WRITTEN: &str = "cannot be written: No space left";
 
-/// How often `words` were said.
+/// Returns how often `words` occur in `said`.
 fn times(said: &str, words: &str) -> usize {
     said.matches(words).count()
 }
@@ -96,7 +96,7 @@ fn a_run_continues_while_the_disk_is_full() {
         assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
         assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
         run.check(Outcome::Interrupted);
-        // No second is missing.
+        // Times increase strictly, and frames never decrease.
         let [seconds, frames] = ["seconds", "frames"].map(|name| run.numbers(name));
         assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
         assert!(frames.is_sorted(), "{frames:?}");
@@ -107,7 +107,7 @@ fn a_run_continues_while_the_disk_is_full() {
 fn the_first_error_is_the_one_shown() {
     with_full_disk(NEVER, NOT_WRITTEN, |_, process, filler| {
         let ended = process.interrupt().expect_code(1);
-        // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
+        // The run fails because the checkpoint could not be saved. The error about the summary is only logged before.
         let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
         let last = &ended.stderr[errors..];
         assert!(last.contains("learner exited with code 1"), "{ended:#?}");
@@ -146,10 +146,10 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
     });
 }
 
-/// Batches that may have been on their way to a learner that ended.
+/// The number of batches that may have been in flight to a learner when it exited.
 const IN_FLIGHT: u64 = 8;
 
-/// While the disk is full nothing is stored or served; then everything continues, and nothing was lost.
+/// While the disk is full, the replay server stores and serves nothing. Then everything continues, and nothing was lost.
 #[test]
 fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let system = system();
@@ -190,7 +190,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let server = system.start_replay_server(&flags);
     let after = wait_for("the server", || client.replay());
     assert_eq!(after.transitions_inserted, before.transitions_inserted);
-    // Whatever was served while the disk was full was learned.
+    // The learner's checkpoint contains all served batches except those in flight.
     let learner = system.start_learner("run");
     let rows = "rows that the learner's checkpoint has";
     let after = client.wait_for_replay(rows, |replay| {

@@ -1,5 +1,5 @@
-//! A run whose arithmetic leaves the finite numbers: it fails, says so, and leaves only checkpoints that can be resumed.
-//! What an update refuses is the learner's own test.
+//! A run whose arithmetic leaves the finite numbers: it fails, reports why, and leaves only checkpoints that can be resumed.
+//! The learner's own tests check which updates it rejects.
 
 use std::fs;
 
@@ -8,7 +8,7 @@ use safetensors::SafeTensors;
 
 use crate::{SHORT, system};
 
-/// Every number in the checkpoints' files of tensors.
+/// Checks that every number in the tensor files of the checkpoints is finite.
 fn check_finite(run: &RunFolder) {
     if !run.path().join("checkpoints").exists() {
         return;
@@ -34,7 +34,7 @@ fn parameters_that_are_not_finite_are_neither_saved_nor_acted_with() {
     let at_once =
         "--set learner.checkpoint_period_updates=1 --set learner.publish_period_updates=1";
     for (lr, said) in [
-        // The first step is too large for a number; those of the second are so large that the loss after the first is not one.
+        // With 1e38 the first step is too large for a number. With 1e37 the step is finite, but the next loss is not.
         ("1e38", "a step of Adam with lr = 1e38 is not finite"),
         ("1e37", "is not finite; the update is not taken"),
     ] {

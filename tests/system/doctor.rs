@@ -1,5 +1,5 @@
 //! `driml doctor` on whatever machine runs these tests.
-//! How each fact is judged is tested beside it.
+//! The judgement of each fact is tested beside its code.
 
 use crate::system;
 

@@ -1,5 +1,5 @@
-//! A replay that is kept on disk, and processes that are killed and started again: every transition once, every update of the plan, nothing
-//! said twice. What comes back of a log, whole or damaged, is tested beside the code; here are real processes and real disks.
+//! A replay that is kept on disk, and processes that are killed and restarted: every transition is stored once, every planned update made,
+//! nothing reported twice. Reading of logs, intact or damaged, is tested beside the code; these tests use real processes and disks.
 
 use std::collections::BTreeSet;
 
@@ -17,7 +17,7 @@ use crate::{
     system,
 };
 
-/// Ends a process of a launched run, and waits for its successor, or the end of the run.
+/// Sends a signal to a process of a launched run, then waits for its successor or the end of the run.
 fn end_one(system: &TestSystem, role: &str, signal: Signal) {
     let dead = system.find_process(role);
     let of_its_role = |all: &[Survivor]| {
@@ -32,15 +32,15 @@ fn end_one(system: &TestSystem, role: &str, signal: Signal) {
     });
 }
 
-/// A process of a launched run that ends, once so many updates are learned.
+/// A process to end in a launched run: the number of updates to wait for, the role, and the signal.
 type End = (u64, &'static str, Signal);
 
 const fn killed_server(updates: u64) -> End {
     (updates, "replay-server", Signal::SIGKILL)
 }
 
-/// Runs so many frames with two actors, of which processes end and are started again: every transition is there once, and every update
-/// of the plan is made. The learner is held at `hold_at` updates until all have ended.
+/// Makes a run of `frames` frames with two actors and ends the processes in `ends`, which the launcher restarts. Checks that every
+/// transition is stored once and every planned update is made. The learner is held at `hold_at` updates until all have ended.
 fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (TestSystem, Ended) {
     let system = system();
     system.hold_at(hold_at);
@@ -49,7 +49,7 @@ fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (Tes
     for (updates, role, signal) in ends {
         run.wait_for_updates(*updates);
         if *role == "actor" {
-            // The one before has joined.
+            // Wait until the actors that started before have joined.
             let client = system.connect();
             client.wait_for_replay("both actors", |replay| replay.actors == 2);
         }
@@ -70,12 +70,12 @@ fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (Tes
     (system, ended)
 }
 
-/// Updates that the settings of `SHORT` and `LONG` plan for so many frames.
+/// Returns the number of updates that the settings of `SHORT` and `LONG` plan for `frames` frames.
 const fn planned(frames: u64) -> u64 {
     (frames - WARMUP) * 8 / ROWS as u64
 }
 
-/// A server of numbered transitions, and servers of two shards in a launched run, killed at moments that follow from the seed.
+/// Kills a server of numbered transitions, and the servers of two shards in a launched run, at moments drawn from the seed.
 #[test]
 #[ignore = "an hour: cargo nextest run --workspace --run-ignored only -E 'test(fifty_seeds)'"]
 fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
@@ -89,8 +89,8 @@ fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
     }
 }
 
-/// Its rows are drawn by priority: transitions come back with the highest one each, and losses of rows that were drawn before are not
-/// mistaken for those of others.
+/// The run draws rows by priority. After a restart, transitions since the last checkpoint have the highest priority, and losses of rows
+/// that were drawn before the restart are not applied to other rows.
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
     let flags = format!("--durable --agent driml-ada {PRIORITISED}");
@@ -107,10 +107,10 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     assert!(said::<3>(&log, SET)[0] > 0, "{log}");
 }
 
-/// What the dead one had not delivered is gone with it, and in no count; all else is as planned.
+/// The transitions that a dead actor had not delivered are lost and appear in no count. Everything else is as planned.
 #[test]
 fn a_dead_actor_is_started_again() {
-    // Held there, it has room for 1,400 transitions and the slack, and the limiter is closed.
+    // Held at 600 updates, the run has room for 1,400 transitions and the slack; then the limiter is closed.
     let ends = [
         (150, "actor", Signal::SIGKILL),
         (400, "actor", Signal::SIGTERM),
@@ -127,7 +127,7 @@ fn a_dead_actor_is_started_again() {
     assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }
 
-/// Updates at which the learner of two shards is held until all kills are done.
+/// The number of updates at which the learner of two shards is held until all kills are done.
 const SHARDS_HOLD: u64 = 2_000;
 
 #[test]
@@ -163,8 +163,8 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     );
 }
 
-/// The processes were started by hand; the server is started again, with the same flags. An actor that starts then has weights although
-/// the learner, which waits for transitions, publishes none.
+/// Processes started by hand continue when the server restarts with the same flags. New actors then get weights, although the learner waits
+/// for transitions and publishes none.
 #[test]
 fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let system = system();
@@ -199,7 +199,7 @@ fn a_resumed_run_continues_with_its_replay() {
     let system = system();
     let process = launched_with(&system, "--durable --agent driml-ada", 1_000);
     let client = system.connect();
-    // All at once, as when the machine stops; but the actor first, so that nothing is made after the last look.
+    // Kill all at once, as when the machine stops. Suspend the actor first, so that it adds nothing after the status is read.
     system.find_process("actor").signal(Signal::SIGSTOP);
     let before = client.replay().unwrap();
     drop(client);
@@ -209,21 +209,21 @@ fn a_resumed_run_continues_with_its_replay() {
     let frames = before.transitions_inserted + 2_000;
     system.run_ok(&format!("local --resume run --frames {frames}"));
     let run = system.run_folder("run");
-    // Each episode once, among others.
+    // Among others, this checks that each episode is recorded once.
     let summary = run.check_finished();
-    // It does not fill anew: no frame was made twice, no episode is counted twice.
+    // The replay is not filled again: no frame is made twice, and no episode is counted twice.
     let planned = frames..frames + 64;
     assert!(planned.contains(&summary.frames), "{summary:#?}");
     assert!(summary.episodes > before.episodes, "{summary:#?}");
     assert_eq!(summary.mean_return_of, 100, "{summary:#?}");
     let log = run.log("replay-server");
     check_has(&log, &["continues with the replay in run/replay"]);
-    // The log may know of updates that no checkpoint holds.
+    // The replay's log may contain updates that no checkpoint holds.
     let warns = |line: &&str| line.contains("WARN") && !line.contains("to be learned again");
     assert_eq!(log.lines().find(warns), None, "{log}");
 }
 
-/// Its processes still end while the next launcher starts: the replay server, which waits for a frozen actor, holds replay and endpoint.
+/// The old processes still exit while the next launcher starts: the replay server waits for a frozen actor, and holds replay and endpoint.
 #[test]
 fn a_run_whose_launcher_was_killed_continues() {
     let system = system();
@@ -234,7 +234,7 @@ fn a_run_whose_launcher_was_killed_continues() {
     let frames = client.replay().unwrap().transitions_inserted + 2_000;
     drop(client);
     process.kill();
-    // Which of them is the last to end depends on how busy the machine is.
+    // Which process exits last depends on how busy the machine is.
     let resume = system.listening(&format!("local --resume run --frames {frames}"));
     system.run_ok(&resume).expect_said(": waiting");
     actor.signal(Signal::SIGKILL);

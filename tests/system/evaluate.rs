@@ -1,5 +1,5 @@
-//! `driml evaluate`: what it prints and films, and what it says of folders, checkpoints and films that cannot be.
-//! Whether an agent has learned is in `lockstep`.
+//! `driml evaluate`: its output and films, and its errors for unusable folders, checkpoints and films.
+//! Whether an agent learns is tested in `lockstep`.
 
 use std::fs;
 
@@ -8,7 +8,7 @@ use driml_tests::{TestSystem, check_has, updates_of, wait_until};
 
 use crate::{SHORT, system};
 
-/// A system with a run in `run`.
+/// Creates a system with a finished run in the folder `run`.
 fn with_run(flags: &str) -> TestSystem {
     let system = system();
     let run = format!("{SHORT} --agent driml-fix {flags} --run-dir run");
@@ -16,7 +16,7 @@ fn with_run(flags: &str) -> TestSystem {
     system
 }
 
-/// All with one run, which the last of them damages.
+/// All checks share one run, which the last check damages.
 #[test]
 fn a_run_is_evaluated() {
     let system = with_run("");
@@ -40,7 +40,7 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
             "{line}"
         );
     }
-    // The chain has no levels to hold back.
+    // The chain world has no levels to hold out.
     system.refuses("evaluate --run run --levels unseen", "use --levels train");
 
     // The same seed plays the same episodes.
@@ -63,7 +63,7 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
         // The table has six decimals.
         assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-6);
     }
-    // A call that fails leaves what was there.
+    // A call that fails leaves existing files unchanged.
     system.refuses(
         "evaluate run --levels unseen --returns returns.csv",
         "use --levels train",
@@ -72,7 +72,7 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
     let nowhere = "--returns none/returns.csv";
     system.fails(&format!("evaluate run {nowhere}"), nowhere);
 
-    // Any checkpoint that is there is played.
+    // Any existing checkpoint can be played.
     let kept = system.run_folder("run").checkpoints();
     let oldest = updates_of(&kept[0]);
     assert!(oldest < 540);
@@ -150,7 +150,7 @@ fn a_finished_run_says_what_its_weights_earn() {
     }
 }
 
-/// Checkpoints of a run of processes, and of one in lockstep, are played during the run; the best is kept.
+/// Plays checkpoints while a run of several processes, and one in lockstep, continue. The best checkpoint is kept.
 #[test]
 fn it_plays_checkpoints_while_the_run_continues() {
     let system = system();
@@ -168,7 +168,7 @@ fn it_plays_checkpoints_while_the_run_continues() {
         );
         let rows = table.rows.iter().map(|row| {
             let number = |name| table.value::<f64>(row, name);
-            // Before the first row of metrics the run's frames are not known.
+            // Before the first row of metrics the frames of the run are unknown.
             let frames = number("frames").unwrap_or_default();
             [
                 number("updates").unwrap(),
@@ -186,7 +186,7 @@ fn it_plays_checkpoints_while_the_run_continues() {
         );
         let most = rows.iter().map(|row| row[2]).fold(f64::MIN, f64::max);
         let best = rows.iter().find(|row| row[2] == most).unwrap();
-        // Played again with the same seed, the best earns the same.
+        // Played again with the same seed, the best checkpoint gets the same return.
         let again = system.run_ok(&format!(
             "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
         ));
@@ -220,7 +220,7 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     system.run_folder("run").check_finished();
 }
 
-/// A checkpoint is compared with the best over as many episodes as that was played for, or more.
+/// A checkpoint is compared with the best one over at least as many episodes as the best was played for.
 fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &TestSystem) {
     system.refuses(
         "evaluate run --checkpoint best",
@@ -234,7 +234,7 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &
     keep(&format!("--episodes 1 --checkpoint {updates}")).expect_printed(
         "; the best stays: it was played for 3 episodes, and fewer do not compare\n",
     );
-    // Over more episodes the best is played again, as it was played for fewer.
+    // For a comparison over more episodes, the best checkpoint is played again.
     keep(&format!("--episodes 5 --checkpoint {updates}"));
     let table = system.run_folder("run").table("evaluations.csv");
     let count = |row, name| table.value::<u64>(row, name).unwrap();
@@ -244,7 +244,7 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &
         .collect();
     assert_eq!(rows, [(540, 3), (updates, 1), (540, 5), (updates, 5)]);
 
-    // The episodes that choose are never those of a report.
+    // The episodes that select the best checkpoint are never those of a report.
     system.refuses_each(&format!(
         "
         evaluate run --keep --seed 0 => '--keep' cannot be used with
@@ -285,7 +285,7 @@ fn a_film_changes_nothing_that_is_played() {
     assert!(fs::read(system.path("play.gif")).unwrap() == bytes);
 }
 
-/// An evaluation plays the weights that actors of the run get, rounded as these are, unless it is told otherwise.
+/// By default an evaluation plays the weights that the run's actors receive, rounded to the actors' precision.
 #[test]
 fn it_plays_in_the_precision_of_the_run() {
     let system = system();
@@ -317,7 +317,7 @@ fn a_folder_that_is_no_run_s() {
     system.refuses("evaluate --run empty", "config.toml that driml wrote");
 }
 
-/// That every file's damage is found is the learner's own test. Films that cannot be are refused before anything is played.
+/// The learner's own tests check that damage to any file is found. Impossible films are rejected before anything is played.
 fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
     system: &TestSystem,
 ) {

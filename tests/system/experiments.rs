@@ -1,5 +1,5 @@
-//! The experiments from end to end, in their smoke length: every file there, the same every time, resumed and refused.
-//! What their numbers mean at full length is on the pages in `deploy/experiments/results/`.
+//! The experiments from end to end at smoke length: all files exist and are reproducible, and calls resume or are rejected.
+//! The pages in `deploy/experiments/results/` explain the numbers at full length.
 
 use std::{collections::BTreeMap, fs, path::Path};
 
@@ -7,7 +7,7 @@ use driml_tests::{Outcome, check_has};
 
 use crate::system;
 
-/// Every file of a folder but the page, which has the time it took.
+/// Returns every file of a folder except the page, which contains the time it took.
 fn data(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let entries = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap());
     let files = entries.filter(|entry| entry.file_type().unwrap().is_file());
@@ -25,12 +25,12 @@ fn names(files: &BTreeMap<String, Vec<u8>>) -> String {
     names.join(" ")
 }
 
-/// Lines of a CSV file without its header.
+/// Returns the number of lines of a CSV file without its header.
 fn rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
     String::from_utf8_lossy(&files[name]).lines().count() - 1
 }
 
-/// The parts of a page, and the files beside it.
+/// Checks the sections of a page and the files beside it. Returns the page.
 fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     let of_all = [
@@ -61,7 +61,7 @@ fn check(name: &str, files: &str) {
     check_page(&folder, &["**Time.**", "**Expected.**"], files);
     let first = data(&folder);
 
-    // Elsewhere: the same bytes. Again, with one piece lost: that one is made anew, to the same bytes.
+    // Another folder gets the same bytes. If one piece is lost, the next call makes that piece again, with the same bytes.
     system.run_ok(&format!("{call} --out other"));
     assert_eq!(data(&system.path("other")), first);
     let mut pieces = system.names(&format!("experiments/{name}/pieces"));
@@ -70,7 +70,7 @@ fn check(name: &str, files: &str) {
     system.run_ok(&call);
     assert_eq!(data(&folder), first);
 
-    // More seeds are more pieces of the same grid; the full length is another grid.
+    // More seeds add pieces to the same grid; the full length is another grid.
     system.run_ok(&format!("{call} --seeds 3"));
     system.refuses(&format!("experiment {name}"), "made with other settings");
 }
@@ -91,18 +91,18 @@ fn ising() {
     );
 }
 
-/// Every routine keeps what it promises here too, in whatever build this is, or the command would have failed.
+/// The command fails if a routine breaks a promise in this build.
 #[test]
 fn stability() {
     check("stability", "promises.csv worst.png worst.svg");
 }
 
-/// Through real processes, so no two runs are alike; but what is finished stays as it was.
+/// Real processes make each run different, but finished runs stay unchanged.
 #[test]
 fn procgen_without_the_engine() {
     let system = system();
     let call = "experiment procgen --smoke";
-    // What is rejected leaves the folder to the corrected call.
+    // A rejected call leaves the folder free for the corrected call.
     system.refuses(&format!("{call} --set learner.batchsize=1"), "no setting");
     system.run_ok(call);
     let folder = system.path("experiments/procgen");
@@ -127,8 +127,8 @@ fn procgen_without_the_engine() {
     system.run_ok(call);
     assert_eq!(data(&folder), first);
 
-    // A run that failed before its first checkpoint is moved aside and made anew, and played anew; the others stay. What was played before
-    // is made recognisable.
+    // A run that failed before its first checkpoint is moved aside, made again and played again; the others stay. The earlier evaluations
+    // get the return 777, so that they can be recognised.
     let pieces = folder.join("pieces");
     for name in ["chain-c51-seed1-greedy", "chain-c51-seed2-greedy"] {
         let path = pieces.join(format!("{name}.json"));
@@ -142,7 +142,7 @@ fn procgen_without_the_engine() {
     let failed = text.replace(": \"finished\"", ": \"failed\"");
     fs::write(summary("chain-c51-seed2"), failed).unwrap();
     fs::remove_dir_all(folder.join("runs/chain-c51-seed2/checkpoints")).unwrap();
-    // Runs of programs that did not note their commit are adopted.
+    // Runs without a recorded commit are adopted.
     fs::remove_file(folder.join("runs/chain-c51-seed1.commit")).unwrap();
     system
         .run_ok(call)
@@ -157,18 +157,18 @@ fn procgen_without_the_engine() {
         found.unwrap()
     };
     assert!(before.rows.contains(row("mspacman", "driml-ada", "2")));
-    // Of the same weights it is kept, of others it is not.
+    // The evaluation of unchanged weights is kept; that of new weights is not.
     let is_kept = |seed: &str| row("chain", "c51", seed).iter().any(|it| it == "777.0");
     assert!(is_kept("1") && !is_kept("2"));
     assert_eq!(&row("chain", "c51", "1")[10], "", "no commit");
 
-    // More agents can be added; another length cannot.
+    // A call can add agents, but cannot change the length.
     system.run_ok(&format!("{call} --agents c51,cpc --report"));
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     assert!(page.contains("Not finished: chain-cpc-seed1"), "{page}");
     system.run(&format!("{call} --frames 900")).expect_code(64);
 
-    // Runs that lie there beside their calls, and nothing else, are reported.
+    // Without the pieces, a report is made from the runs alone.
     fs::remove_dir_all(&pieces).unwrap();
     system.run_ok(&format!("{call} --report"));
     let table = table();
@@ -189,12 +189,12 @@ fn pacman() {
     };
     assert!(config("epsilon0.25-seed1").contains("epsilon = 0.25"));
     let noise = config("noise-driml-fix-seed1");
-    // 32 among 4 environments.
+    // 32 episodes over 4 environments.
     check_has(&noise, &["episodes_per_task = 8", "[world.ising]"]);
     assert!(!config("ghosts-c51-seed1").contains("[world.ising]"));
 }
 
-/// A plan, then one dial, then one more in the same folder: what is finished stays unchanged.
+/// Makes a plan, runs one dial, then one more in the same folder. Finished runs stay unchanged.
 #[test]
 fn tradeoff() {
     let system = system();
@@ -224,7 +224,7 @@ fn tradeoff() {
     let files = data(&folder);
     let all = "equal_time.csv levels.csv pareto.png pareto.svg pareto_training.png pareto_training.svg runs.csv wall.png wall.svg";
     assert_eq!(names(&files), all);
-    // Of the base two seeds, of each level one; each dial's base has its own row.
+    // The base has two seeds and each level has one. The base of each dial has its own row.
     let counts = || ["levels.csv", "runs.csv"].map(|name| rows(&data(&folder), name));
     assert_eq!(counts(), [2 + 3, 2 + 3]);
     // Runs this short may have no return yet when the others end: then they have no row at equal time.
@@ -245,14 +245,14 @@ fn tradeoff() {
     check_has(&call("--report"), &["learner.precision = bf16 (c51): x"]);
     assert_eq!(data(&folder), files);
 
-    // Seeds of another call are on the page, and a report of one dial has that alone.
+    // The page includes the seeds of other calls. A report of one dial contains only that dial.
     call("--dials learner.precision --seeds 2");
     call("--report");
     assert_eq!(counts(), [2 + 3, 4 + 4]);
     call("--dials learner.precision --report");
     assert_eq!(counts()[0], 2);
 
-    // Of a level whose first seed is left out the others are reported.
+    // If the first seed of a level is missing, the other seeds are reported.
     let names = system.names("t/runs").into_iter();
     let first = names.filter(|it| it.contains("bf16") && it.ends_with("-seed1"));
     for name in first {
@@ -262,13 +262,13 @@ fn tradeoff() {
     assert_eq!(counts(), [2, 4 + 4 - 1]);
 }
 
-/// A killed experiment takes its runs with it, and resumes at the next call.
+/// Killing an experiment ends its runs; the next call resumes them.
 #[test]
 fn killed_and_resumed() {
     let system = system();
     let call =
         "experiment procgen --smoke --games mspacman --agents c51 --seeds 1 --out x --frames 4000";
-    // Its run is not over before it is killed.
+    // Hold the learner, so that the run does not end before it is killed.
     system.hold_at(100);
     let process = system.start(call);
     let run = system.run_folder("x/runs/mspacman-c51-seed1");
@@ -316,16 +316,16 @@ fn a_grid_makes_every_combination_once() {
     assert_eq!(cells, expected);
     let summary = folder.join("runs/1-c51-lr=1e-4-seed1/summary.json");
     assert!(summary.is_file());
-    // One seed more makes what is missing alone.
+    // One more seed makes only the missing runs.
     let made = || fs::metadata(&summary).unwrap().modified().unwrap();
     let before = made();
     system.run_ok(&format!("{call} --seeds 2 --jobs 2"));
     assert_eq!(made(), before);
     let made = table().rows;
     assert!(made.iter().all(|row| row.get(3) == Some("2")), "{made:?}");
-    // A report of the folder has all that is there.
+    // A report includes all runs in the folder.
     system.run_ok("grid --report");
     assert_eq!(table().rows, made);
-    // Another grid does not mix with it.
+    // Another grid is rejected in the same folder.
     system.refuses(&format!("{fixed} --frames 352"), "other settings");
 }

@@ -1,5 +1,5 @@
 //! Runs that end early: Ctrl-C, a process that dies, a launcher that dies. No process is ever left.
-//! What a dead process's successor may do is in `by_hand` (actors) and `successors` (learners); one Ctrl-C is in `resume`.
+//! Successors of dead processes are in `by_hand` (actors) and `successors` (learners); a single Ctrl-C is in `resume`.
 
 use std::{fs, process::Command};
 
@@ -16,7 +16,7 @@ use crate::{
 fn a_second_interrupt_ends_at_once() {
     let system = system();
     let mut process = launched(&system, 100);
-    // A learner that does not answer any more, for which the first interrupt would wait for minutes.
+    // After the first interrupt, the launcher would wait for minutes for this unresponsive learner.
     system.find_process("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
@@ -25,7 +25,7 @@ fn a_second_interrupt_ends_at_once() {
     system.check_over(Outcome::Failed);
 }
 
-/// Signals at nearly the same time count as one request, so this repeats it until it is noticed.
+/// Sends SIGINT until the process ends, because signals at nearly the same time count as one request.
 pub(crate) fn interrupt_until_it_ends(mut process: Process) -> Ended {
     wait_until("the launcher's end", || {
         let is_over = !process.is_running();
@@ -37,12 +37,12 @@ pub(crate) fn interrupt_until_it_ends(mut process: Process) -> Ended {
     process.wait()
 }
 
-/// No process listens for signals yet.
+/// The interrupt comes before any process handles signals.
 #[test]
 fn an_interrupt_at_the_start_is_an_interrupt() {
     let system = system();
     for _ in 0..3 {
-        // In the same folder: nothing was learned in it.
+        // All rounds use the same folder, in which nothing was learned.
         let process = system.start(&format!("local --agent c51 {SHORT} --run-dir run"));
         system.find_process("replay-server");
         let ended = process.interrupt().expect_code(130);
@@ -90,7 +90,7 @@ fn dead_processes_end_the_run_and_leave_no_shared_memory() {
     }
 }
 
-/// Its successor would count the episodes anew, and have other ghosts than the run is to have.
+/// A successor would count episodes from zero, and have other ghosts than the run's schedule.
 #[test]
 fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     let system = system();
@@ -105,7 +105,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     system.check_over(Outcome::Failed);
 }
 
-/// They all notice it at once: the replay server stays until the others have delivered what they have and left.
+/// All processes notice the launcher's death at once. The replay server stays until the others have delivered what they have and left.
 #[test]
 fn processes_whose_launcher_died_deliver_what_they_have() {
     /// A launcher of three processes, each with a file for its output.

@@ -1,5 +1,5 @@
-//! One process that stands still (Ctrl-Z, a debugger, a paused container): the others continue, and wait for it only so long.
-//! A whole run that stands still is in `closed_terminal`.
+//! One suspended process (Ctrl-Z, a debugger, a paused container): the others continue, and wait for it only for a limited time.
+//! A run that is suspended as a whole is in `closed_terminal`.
 
 use std::time::{Duration, Instant};
 
@@ -8,7 +8,7 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, failures::interrupt_until_it_ends, launched, system};
 
-/// All at the same time, as they wait for time-outs of up to a minute.
+/// Runs all checks at the same time, because each waits for time-outs of up to a minute.
 #[test]
 fn a_frozen_process_does_not_hold_the_others_up() {
     let checks: [fn(); 5] = [
@@ -21,9 +21,9 @@ fn a_frozen_process_does_not_hold_the_others_up() {
     at_once(checks, |check| check());
 }
 
-/// A run of two actors, of which one stands still, that has learned from all its transitions.
+/// Starts a run of two actors, suspends one of them, and waits until the learner has made its last update.
 fn complete_but_for_an_actor(system: &TestSystem) -> Process {
-    // It is not over before its second actor has started.
+    // Hold the learner, so that the run does not end before its second actor starts.
     system.hold_at(100);
     let flags = format!("--agent c51 {SHORT} --actors 2");
     let process = system.start(&system.local(&flags));
@@ -44,7 +44,7 @@ fn a_complete_run_is_finished() {
     system.check_over(Outcome::Finished);
 }
 
-/// The first interrupt waits for the actor, the second does not; neither makes the run another one.
+/// After the first interrupt the launcher waits for the actor, after the second it does not. Neither changes the run's outcome.
 fn an_interrupt_of_a_complete_run_leaves_it_finished() {
     let system = system();
     interrupt_until_it_ends(complete_but_for_an_actor(&system))
@@ -80,10 +80,10 @@ fn a_replay_server_ends_whose_launcher_died() {
     system.wait_until_all_have_ended();
 }
 
-/// A model whose weights are 5 MB, sent to the actors after each update: a frozen process is likely in the middle of a pull.
+/// Makes the weights 5 MB and publishes them after each update, so that a frozen process is likely in the middle of a pull.
 const LARGE: &str = "--set model.hidden=4096 --set learner.publish_period_updates=1";
 
-/// An actor that is suspended in the middle of its work delays the others for seconds, and continues when it is released.
+/// An actor that is suspended during its work delays the others only for seconds, and continues when it receives SIGCONT.
 fn a_frozen_actor_does_not_stop_the_others() {
     let system = system();
     let _server = system.start_replay_server(&format!("--agent c51 {LONG} {LARGE}"));
@@ -95,7 +95,7 @@ fn a_frozen_actor_does_not_stop_the_others() {
     let version = client.wait_for_updates(0).weights_version;
     client.wait_for_learner("weights to pull", |it| it.weights_version > version + 5);
     frozen.signal(Signal::SIGSTOP);
-    // Long past the moment when the link is given up, and short of the session's lease, which would end it in any case.
+    // Wait well beyond the time-out of a blocked link, but less than the session's lease, which would end the session anyway.
     let started = Instant::now();
     let late = |after_s| started.elapsed() > Duration::from_secs(after_s);
     let rows = || client.replay().map_or(0, |replay| replay.rows_sampled);

@@ -1,6 +1,6 @@
-//! What a run leaves outside its folder, in the temporary folder and in shared memory: nothing, however it ended; or until the
-//! next run starts, if all its processes were killed. A killed launcher's learner saves what it has learned.
-//! Shared memory of single processes that end is looked for in `failures`, too.
+//! A run leaves nothing outside its folder, neither in the temporary folder nor in shared memory, however it ended.
+//! If all its processes were killed, the next run removes what they left. After a killed launcher, the learner still saves a checkpoint.
+//! The shared memory of single processes that end is also checked in `failures`.
 
 use std::{fs, path::PathBuf};
 
@@ -8,13 +8,13 @@ use driml_tests::{Process, TestSystem};
 
 use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, system};
 
-/// A run whose temporary folder is `tmp` in the system's.
+/// Returns the call of a run whose temporary folder is `tmp` in the system's folder.
 fn local(system: &TestSystem, flags: &str) -> String {
     let folder = system.path("tmp");
     format!("env TMPDIR={} DRIML local {flags}", folder.display())
 }
 
-/// A run of [`local`] that has learned something and saved nothing, and the shared memory of its processes.
+/// Starts a run of [`local`] that has made updates and saved no checkpoint. Returns the run and its shared memory files.
 fn started(system: &TestSystem) -> (Process, Vec<PathBuf>) {
     fs::create_dir(system.path("tmp")).unwrap();
     let never = format!("--set learner.checkpoint_period_updates={NEVER}");
@@ -81,7 +81,7 @@ fn processes_started_by_hand_leave_no_shared_memory() {
     let client = system.connect();
     client.wait_for_updates(100);
     let segments = shared_memory(&system);
-    // A client may hold what it has seen.
+    // A client may hold shared memory that it has received.
     drop(client);
     for process in [actor, learner, server] {
         process.stop_ok();
@@ -89,7 +89,7 @@ fn processes_started_by_hand_leave_no_shared_memory() {
     check_gone(&segments);
 }
 
-/// The shared memory that the processes of a run have open.
+/// Returns the shared memory files that the processes of a run have open.
 pub(crate) fn shared_memory(system: &TestSystem) -> Vec<PathBuf> {
     let mut files = Vec::new();
     for role in PROCESSES {

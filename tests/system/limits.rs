@@ -1,11 +1,11 @@
-//! Limits of the system, on open files, sizes of files and names of sockets: a run is within them, or says before it starts that it
-//! cannot be. Memory that processes share is in `small_shared_memory`.
+//! Limits of the operating system on open files, file sizes and socket names: a run keeps to them, or reports before it starts that it
+//! cannot. Shared memory is in `small_shared_memory`.
 
 use std::fs;
 
 use crate::{LONG, SHORT, system};
 
-/// A call of the program with a limit of the shell's `ulimit`, for it and its children.
+/// Returns a call of the program under a limit of the shell's `ulimit`, which its children inherit.
 fn limited(limit: &str, call: &str) -> String {
     format!("sh -c 'ulimit {limit} && exec \"$0\" \"$@\"' DRIML {call}")
 }
@@ -18,7 +18,7 @@ fn a_run_with_more_actors_than_files_may_be_open_does_not_start() {
     system.refuses(&limited("-n 60", &run(20)), why);
     assert!(!system.path("run").exists());
     system.run_ok(&limited("-n 60", &run(2)));
-    // What may be raised is.
+    // A soft limit is raised if the hard limit permits it.
     let more = run(4).replace("--run-dir run", "--run-dir more");
     system.run_ok(&limited("-S -n 60", &more));
 }
@@ -39,7 +39,7 @@ fn a_replay_server_warns_if_it_may_not_open_enough_files() {
 fn a_file_that_may_not_grow_is_an_error_and_no_end() {
     let system = system();
     let server = system.replay_server(&format!("--agent c51 {LONG} --replay-dir replay"));
-    // Half a block of the system's is too little for a segment of shared memory, too.
+    // This size is also too small for a segment of shared memory.
     let mut server = system.start_process(&limited("-f 64", &server));
     server.wait_for_stderr("replay server listens on ");
     let (_learner, _actor) = (system.start_learner("run"), system.start_actor(0));

@@ -1,5 +1,5 @@
-//! `driml local` with a process for each role: what a run leaves behind, in every world that needs nothing installed.
-//! How runs end badly is in `failures`.
+//! `driml local` with a process for each role: what a run leaves behind, in every world that needs no installation.
+//! Runs that fail are in `failures`.
 
 use std::collections::BTreeSet;
 
@@ -14,7 +14,7 @@ fn c51_leaves_a_whole_run_folder() {
     let ended = system.run_ok(&format!("local --agent c51 {SHORT} --run-dir run"));
     let run = system.run_folder("run");
     let summary = run.check_finished();
-    // Chosen so that chunks and batches fit without a remainder; the promise is within 1%.
+    // The frames are chosen so that chunks and batches fit without a remainder; in general the ratio is within 1%.
     assert_eq!(summary.replay_ratio, Some(8.0));
     assert_eq!((summary.frames, summary.updates), (1280, 540));
     assert!(summary.episodes > 0 && summary.mean_return.is_some());
@@ -42,7 +42,7 @@ fn c51_leaves_a_whole_run_folder() {
     let names = system.names("run").into_iter();
     let events = names.filter(|name| name.contains("tfevents"));
     assert_eq!(events.count(), 0, "there are none without the flag");
-    // The settings that it left repeat it. Processes race, so the weights differ; the counts do not.
+    // The run's `config.toml` repeats the run. Processes race, so the weights differ; the counts do not.
     let again = system.train("--config run/config.toml", "again");
     assert_eq!(system.run_folder("again").config(), run.config());
     let counts = |it: &Summary| (it.frames, it.updates, it.replay.rows_sampled);
@@ -53,11 +53,11 @@ fn c51_leaves_a_whole_run_folder() {
 fn driml_ada_with_two_actors_over_tcp() {
     let (endpoint, _) = listener();
     let system = system().at(endpoint);
-    // The run is not over before its second actor has started.
+    // Hold the learner, so that the run does not end before its second actor starts.
     system.hold_at(500);
     let longer = chain(2_560);
-    // All three actions amount to one, so the learner's A is 1 everywhere and k goes as far as it may. Without the learner the
-    // replay server's A is 1/3 everywhere: then the mean of k is at most 1 + 1/3 + .. + 1/81.
+    // The alphabet maps all actions to one, so the learner's affinity A is 1 everywhere and k reaches its maximum. Without the learner's A,
+    // the replay server uses A = 1/3 everywhere, and the mean of k is at most 1 + 1/3 + .. + 1/81.
     let alphabet = "--set learner.affinity.alphabet=visible --set learner.affinity.visible=[0,0,0]";
     let flags = format!("--agent driml-ada {alphabet} {longer} --actors 2");
     let process = system.start(&system.local(&flags));
@@ -76,19 +76,19 @@ fn driml_ada_with_two_actors_over_tcp() {
         check_has(&log, &["leaves: "]);
         assert!(!log.contains("leaves: 0 "), "{log}");
     }
-    // The replay server says whose affinity it used; the learner sends one after each update.
+    // The learner sends an affinity after each update; the replay server reports the version that it uses.
     let affinity = run.table("metrics.csv").last::<u64>("affinity_version");
     assert!(affinity > Some(0), "it reached the replay server");
 }
 
-/// `driml local --listen` lets actors of other machines play in the same run, and other processes watch it.
+/// With `driml local --listen`, actors of other machines play in the same run, and other processes watch it.
 fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
     let run = system.start(&system.local(&format!("--agent c51 {LONG}")));
     let mut outside = system.start_actor(2);
     outside.wait_for_stderr("actor 2 steps 4 environments");
     let client = system.connect();
     client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
-    // Who only looks gets all that is recorded, episodes too.
+    // An observer receives everything that is recorded, including episodes.
     let mut watched = system.start(&system.connected("watch --run-dir seen"));
     let both = BTreeSet::from([0, 2]);
     let has_both = |folder| {
@@ -115,7 +115,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     plays_with_an_actor_from_elsewhere(&system().at(endpoint));
 }
 
-/// The processes of the run meet at a unix socket.
+/// The run's own processes connect through a unix socket.
 #[test]
 fn an_actor_from_elsewhere_plays_over_tls() {
     if let Some(system) = system().over_tls() {
@@ -131,14 +131,14 @@ fn mspacman_with_stacked_and_enlarged_frames() {
     assert_eq!(summary.mean_k, Some(1.0), "driml-fix serves k = 1 here");
 }
 
-/// Five positives a row over zenoh for cpc, none for curl; and the checkpoints can be played.
+/// Serves five positives a row over zenoh for `cpc` and none for `curl`. The checkpoints of both can be evaluated.
 #[test]
 fn cpc_and_curl_get_what_they_need_and_no_more() {
     let system = system();
     for (agent, served, loss) in [("cpc", 5, "cpc_4t4"), ("curl", 0, "curl")] {
         let summary = system.train(&format!("--agent {agent} {SHORT}"), agent);
         assert_eq!((summary.frames, summary.updates), (1280, 540));
-        // Rows by their furthest k: every one up to 5 is served where the episode is long enough.
+        // The histogram counts rows by their largest k: each k up to 5 is served where the episode is long enough.
         assert_eq!(summary.replay.k_histogram.len(), served + 1);
         assert!(summary.replay.k_histogram.iter().all(|&count| count > 0));
         let metrics = system.run_folder(agent).table("metrics.csv");
@@ -150,12 +150,12 @@ fn cpc_and_curl_get_what_they_need_and_no_more() {
     }
 }
 
-/// Anchors and positives still belong together after actor, server, wire and learner: what was learned tells the positive from
-/// the other rows'. Positives of other rows can be learned no better than ln B, which is where every loss begins.
+/// Anchors and positives stay paired through actor, server, wire and learner: the trained model tells a row's positive from those of other
+/// rows. With the positives of other rows, the loss cannot fall below ln B, where it begins.
 #[test]
 fn what_is_learned_tells_the_positive_from_other_rows() {
-    // Found, over five seeds each: 2.2 to 2.4 and 2.7 to 2.8; with the positives of other rows 4.0 to 4.1, and ln B is 4.16.
-    // Not `cpc`: five steps on, the chain's end is so often past that few rows are left to tell apart.
+    // Measured over five seeds: 2.2 to 2.4 and 2.7 to 2.8; with the positives of other rows 4.0 to 4.1. ln B is 4.16. `cpc` is left out:
+    // five steps ahead, most of the chain's episodes have ended, and few rows are left to tell apart.
     for (agent, loss) in [("driml-fix", "dim_4t4"), ("curl", "curl")] {
         let system = system();
         let longer = SHORT.replace("replay_ratio=8", "replay_ratio=32");
@@ -168,7 +168,7 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
     }
 }
 
-/// Two actors, one replay server each, and one learner: the counts are those of one replay.
+/// With two actors, a replay server for each, and one learner, the counts equal those of a single replay server.
 #[test]
 fn two_replay_shards_are_one_replay() {
     let system = system();
@@ -177,7 +177,7 @@ fn two_replay_shards_are_one_replay() {
     ));
     assert_eq!(system.survivors(), []);
     let summary = system.run_folder("run").check(Outcome::Finished);
-    // Each of the two limiters admits chunks until it learns of the other's.
+    // Each of the two limiters admits chunks until it learns the other's count.
     assert!((1280..=1800).contains(&summary.frames), "{summary:#?}");
     assert_eq!(summary.updates * 16, summary.replay.rows_sampled);
     let owed = (summary.frames - 200) * 8 / 16;

@@ -1,5 +1,5 @@
 //! `driml local --lockstep`: the same seed gives the same weights, and an agent learns what can be learned.
-//! It starts one process only.
+//! A run in lockstep has one process.
 
 use driml_envs::{ChainConfig, optimal_discounted_return};
 use driml_settings::presets::AGENTS;
@@ -12,7 +12,7 @@ fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
     system.train(&format!("--lockstep {flags}"), name)
 }
 
-/// Each row: the flags of two runs that are the same, what makes both so, and what makes a third one another.
+/// Each row: the flags of all three runs, the extra flags of two runs that are equal, and those of a third that is different.
 #[test]
 fn seed_and_settings_decide_the_weights() {
     let ada = format!("{} --agent driml-ada", chain(640));
@@ -23,7 +23,7 @@ fn seed_and_settings_decide_the_weights() {
         (&*of_two, "--seed 3", "--seed 4"),
         (&*ada, bf16, "--seed 3"),
         (&*of_two, PRIORITISED, ""),
-        // The augmentation draws from the learner's generator, which the seed decides.
+        // The augmentation draws from the learner's random generator, which the seed determines.
         (curl, "", "--set learner.augment.hue=0.3"),
     ] {
         let system = system();
@@ -34,7 +34,7 @@ fn seed_and_settings_decide_the_weights() {
         assert_eq!(first.replay.k_histogram, same.replay.k_histogram);
         assert_eq!(first.episodes, same.episodes);
         assert_ne!(first.weights_sha256, other.weights_sha256, "{flags}");
-        // And so do the settings that the first run left.
+        // The settings that the first run left give the same weights.
         let again = run(&system, "--config first/config.toml", "again");
         assert_eq!(first.weights_sha256, again.weights_sha256, "{flags} {own}");
         let configs = ["first", "again"].map(|name| system.run_folder(name).config());
@@ -42,14 +42,14 @@ fn seed_and_settings_decide_the_weights() {
     }
 }
 
-/// What a run came to.
+/// Returns the results of a run that are compared: weights, mean return, histogram of k, and episodes.
 fn result(it: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
     let k_histogram = it.replay.k_histogram;
     (it.weights_sha256, it.mean_return, k_histogram, it.episodes)
 }
 
-/// Runs it whole; finished after half of its frames and prolonged; and resumed after each signal: Ctrl-C, which saves, and death, after
-/// which what was learned since the last checkpoint is learned again. All come to the same.
+/// Makes a whole run, one that is prolonged after half of its frames, and one that is resumed after each signal. SIGINT saves a checkpoint;
+/// after SIGKILL, updates since the last checkpoint are made again. All runs give the same result.
 pub(crate) fn continues_exactly(flags: &str) {
     const FRAMES: u64 = 2048;
     let start = |system: &TestSystem, frames: u64, name: &str| {
@@ -78,7 +78,7 @@ pub(crate) fn continues_exactly(flags: &str) {
         system.hold_at(150);
         let process = start(&system, FRAMES, "run");
         let run = system.run_folder("run");
-        // After a checkpoint and before the next.
+        // The signal comes between two checkpoints.
         run.wait_for_updates(110);
         process.signal(signal);
         system.let_go();
@@ -94,7 +94,7 @@ pub(crate) fn continues_exactly(flags: &str) {
         let resumed = run.check_finished();
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
         assert_eq!(result(resumed), whole, "{signal}");
-        // A world whose run was killed is given a second to end by itself.
+        // A world's process has a second to exit by itself after its run was killed.
         system.wait_until_all_have_ended();
     }
 }
@@ -103,7 +103,7 @@ pub(crate) fn continues_exactly(flags: &str) {
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
     continues_exactly("--env chain --preset smoke --agent driml-ada");
     continues_exactly("--env mspacman --preset smoke --agent driml-ada");
-    // Its noise continues, in the learner and in the actors. Else beta rises over a run's own length.
+    // Rainbow's noise continues in the learner and the actors. By default beta would rise over the length of each run.
     let beta = "--set replay.sampling.beta_updates=500";
     let flags = format!("--env chain --preset smoke --agent rainbow {beta}");
     continues_exactly(&flags);

@@ -1,6 +1,6 @@
-//! Chunks, batches and answers that get lost between a replay server and its actors and learner, which send and ask again: each
-//! transition is stored once, and no batch counts twice.
-//! The replay server is played by the test, around the real replay; the side of actors and learner is the real one.
+//! Chunks, batches and replies that get lost between a replay server and its actors and learner, which retry: each transition is stored
+//! once, and no batch counts twice.
+//! The test plays the replay server around the real `Replay`; actors and learner use the real code.
 
 use std::{
     collections::BTreeMap,
@@ -30,29 +30,29 @@ use crate::{
     system, tiny_replay,
 };
 
-/// Actors, and chunks of each.
+/// The number of actors, and of chunks of each actor.
 const ACTORS: u32 = 3;
 const CHUNKS: u64 = 32;
-/// Transitions of one chunk.
+/// The number of transitions in a chunk.
 const STEPS: u32 = 4;
 const TRANSITIONS: u64 = ACTORS as u64 * CHUNKS * STEPS as u64;
-/// How often each transition is sampled, on average: that one is never drawn has a probability of exp(-64).
+/// How often each transition is sampled, on average. The probability that a given one is never drawn is exp(-64).
 const SAMPLED: u64 = 64;
 const ROWS: u32 = 16;
-/// Of each so many batches and parts of batches, one is lost.
+/// One of this many batches, or parts of batches, is lost.
 const LOSES: u32 = 4;
 
-/// Of the tests that lose chunks.
+/// Returns the run spec of the tests that lose chunks.
 fn spec() -> RunSpec {
     tiny_replay::spec("c51", Horizon::None {})
 }
 
-/// Of those that lose batches, whose rows have positives.
+/// Returns the run spec of the tests that lose batches; its rows have positives.
 fn batches_spec() -> RunSpec {
     tiny_replay::spec("driml-randk", Horizon::Uniform { k_max: 2 })
 }
 
-/// The place of a replay server, in which a test answers.
+/// The endpoint of a replay server, at which a test replies.
 struct Endpoint {
     session: Session,
     answered: Vec<Queryable<()>>,
@@ -69,7 +69,7 @@ impl Endpoint {
         }
     }
 
-    /// Answers messages of type `M`.
+    /// Replies to messages of type `M`.
     fn answer<M: Keyed>(&mut self, answer: impl Fn(Query) + Send + Sync + 'static) {
         let key = Keys::new("driml").unwrap().of::<M>();
         let queryable = self.session.declare_queryable(key).callback(answer).wait();
@@ -77,7 +77,7 @@ impl Endpoint {
     }
 }
 
-/// What the network does to a message about chunks, by its number: whether that arrives, and whether its answer does.
+/// Decides by the number of a message about chunks whether the message arrives, and whether its reply arrives.
 type Passes = fn(u32) -> [bool; 2];
 
 /// A replay server behind a network that loses messages.
@@ -87,7 +87,7 @@ struct Server {
     messages: AtomicU32,
     /// How often each actor sent `Leave`.
     leaves: Mutex<BTreeMap<u32, u32>>,
-    /// What is never answered; a query that is dropped would tell the actor so at once.
+    /// Queries that are never answered. They are kept, because dropping a query would notify the actor at once.
     lost: Mutex<Vec<Query>>,
 }
 
@@ -110,7 +110,7 @@ impl Server {
         })
     }
 
-    /// Answers about chunks and leaves as a replay server does, but for what is lost.
+    /// Replies to chunks, polls and leaves as a replay server does, except for lost messages.
     fn serve(self: &Arc<Self>, endpoint: &mut Endpoint) {
         self.answer::<ChunkHeader>(endpoint, |server, header, payload| {
             let chunk = Chunk::from_payload(header, payload.to_vec().into()).unwrap();
@@ -123,7 +123,7 @@ impl Server {
             let mut leaves = server.leaves.lock().unwrap();
             let tries = leaves.entry(leave.actor).or_default();
             *tries += 1;
-            // The first does not arrive, and the answer to the second does not.
+            // The first `Leave` does not arrive, and the reply to the second does not.
             if *tries > 1 {
                 let refused = server.replay.lock().unwrap().leave(&leave);
                 assert_eq!(refused, None);
@@ -158,7 +158,7 @@ impl Server {
         is_answered.then_some(reply)
     }
 
-    /// Checks that each actor sent `Leave` until it was answered.
+    /// Checks that each actor sent `Leave` until it got a reply.
     fn check_leaves(&self) {
         let leaves = self.leaves.lock().unwrap();
         assert_eq!(leaves.len(), ACTORS as usize, "{leaves:?}");
@@ -174,12 +174,12 @@ impl Server {
         check_nothing_lost(&status);
         let batches = TRANSITIONS * SAMPLED / u64::from(ROWS);
         let numbers = tiny_replay::numbers(&mut replay, batches, ROWS);
-        // As many are stored as there are numbers: if each number is there, none is there twice.
+        // As many transitions are stored as there are numbers: if each number is present, none is stored twice.
         assert_eq!(numbers, (0..TRANSITIONS).collect());
     }
 }
 
-/// Delivers the chunks of `ACTORS` actors, which are about to leave or not, to a server that then holds all of them.
+/// Delivers the chunks of `ACTORS` actors and checks that the server holds all of them. If `leaving`, the actors are told to stop first.
 fn deliver_all(passes: Passes, ack_timeout: Duration, leaving: bool) -> Arc<Server> {
     let server = Server::new(passes);
     let mut endpoint = Endpoint::open();
@@ -215,11 +215,11 @@ fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
     let passes = |message: u32| [message % 5 != 1, message % 5 != 3];
     let server = deliver_all(passes, Duration::from_millis(100), false);
     let retried = server.replay.lock().unwrap().status().chunks_retried;
-    // Some answers were lost; how many chunks came again for it, and were not just asked about, is the machine's.
+    // Some replies were lost. How many chunks are then sent again, and not just polled, depends on the machine.
     assert!(retried > 0, "answers were to get lost");
 }
 
-/// The time in which an actor that leaves must deliver is not spent on one message that was lost.
+/// An actor that leaves does not spend its time for delivery on one lost message.
 #[test]
 fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
     let passes = |message: u32| [message >= 3 * ACTORS, true];
@@ -234,7 +234,7 @@ fn config(shards: u32) -> Config {
     }
 }
 
-/// A shard that holds its share of the run.
+/// Returns a shard that holds its share of the run.
 fn full(shard: u32, shards: u32) -> Replay {
     let mut replay = Replay::shard(&batches_spec(), &config(shards), ROWS, shard).unwrap();
     tiny_replay::join(&mut replay, 0);
@@ -242,7 +242,7 @@ fn full(shard: u32, shards: u32) -> Replay {
     replay
 }
 
-/// Stores chunks of 8 transitions with these numbers.
+/// Stores chunks of 8 transitions with these sequence numbers.
 fn fill(replay: &mut Replay, sequences: Range<u64>) {
     for sequence in sequences {
         let stored = replay.insert(&tiny_replay::chunk(&batches_spec(), 0, sequence, 8));
@@ -250,7 +250,7 @@ fn fill(replay: &mut Replay, sequences: Range<u64>) {
     }
 }
 
-/// Answers as a replay server does, but for some batches, which it draws and does not send.
+/// Replies as a replay server does, but draws some batches without sending them.
 fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     let hash = batches_spec().hash();
     let payload = query.payload().unwrap().to_bytes();
@@ -270,7 +270,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     session::answer(query, message.into());
 }
 
-/// Replay servers of these shards, of which some batches get lost, and a learner's end of them.
+/// The replay servers of some shards, which lose some batches, and a learner connected to them.
 struct Shards {
     replays: Vec<Arc<Mutex<Replay>>>,
     drawn: Arc<AtomicU32>,
@@ -305,7 +305,7 @@ fn serve(shards: Vec<Replay>) -> Shards {
     }
 }
 
-/// Of a replay of one shard, and of one of three, whose batches have parts.
+/// Tests a replay of one shard, and a replay of three shards, whose batches have parts.
 #[test]
 fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     for shards in [1, 3] {
@@ -334,7 +334,7 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     }
 }
 
-/// Two empty shards of a run without an end, each with an actor.
+/// Returns two empty shards of an endless run, each with an actor.
 fn endless_shards() -> Vec<Replay> {
     let config = Config {
         transitions_max: None,
@@ -348,8 +348,8 @@ fn endless_shards() -> Vec<Replay> {
     (0..2).map(shard).collect()
 }
 
-/// A shard that held nothing when batches began, as its actors started late, is drawn from once it holds something, although the others
-/// never make the learner wait.
+/// A shard that is empty at first, because its actors started late, is drawn from once it holds transitions, although the others never make
+/// the learner wait.
 #[test]
 fn a_shard_that_fills_late_is_asked() {
     let mut shards = endless_shards();
@@ -372,12 +372,12 @@ fn a_shard_that_fills_late_is_asked() {
     panic!("a shard that holds something is never drawn from");
 }
 
-/// Inserts of a shard that wait by an old count of the other's rows are let in by the next draw that asks it.
+/// A shard's inserts wait while its count of the other shard's rows is old. The next draw request to the shard updates the count.
 #[test]
 fn a_shard_that_waits_hears_what_the_other_gave() {
     let slack = config(2).slack_transitions;
     let mut shards = endless_shards();
-    // Most batches are drawn from the first alone.
+    // Most batches are drawn from the first shard alone.
     fill(&mut shards[0], 0..slack / 8);
     fill(&mut shards[1], 0..1);
     let mut served = serve(shards);

@@ -1,5 +1,5 @@
 //! End-to-end tests: the program under test as its users run it, and the rules of the repository.
-//! What one crate promises is tested in that crate; here only what takes several of them.
+//! Each crate tests its own behaviour; these tests need several crates.
 
 #![allow(clippy::unwrap_used, reason = "these are tests")]
 
@@ -49,12 +49,12 @@ use std::net::{Ipv4Addr, TcpListener};
 
 use driml_tests::{Process, TestSystem};
 
-/// A fresh system of the program that cargo has built for this test.
+/// Creates a system for the program that cargo has built for this test.
 fn system() -> TestSystem {
     TestSystem::new(env!("CARGO_BIN_EXE_driml-under-test"))
 }
 
-/// An unused endpoint and what listens there, at a loopback address of this process so that no other takes it meanwhile.
+/// Returns an unused endpoint and its listener. The loopback address belongs to this process, so no other takes the port meanwhile.
 fn listener() -> (String, TcpListener) {
     let [_, high, middle, low] = std::process::id().to_be_bytes();
     let address = Ipv4Addr::new(127, high, middle, low);
@@ -67,27 +67,27 @@ fn listener() -> (String, TcpListener) {
 /// 1280 frames are whole chunks of one or two actors (4 environments x 8 steps), and (1280 - 200) * 8 / 16 is whole.
 const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.replay_ratio=8";
 
-/// [`SHORT`] with so many frames.
+/// Returns the flags of [`SHORT`] with another number of frames.
 fn chain(frames: u64) -> String {
     format!("--env chain --preset smoke --frames {frames} --set replay.replay_ratio=8")
 }
 
-/// A run on the chain that is too long to finish: it is ended from outside, long before its last frame.
+/// A run on the chain that is too long to finish: the test ends the run long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
 
-/// The processes of a run.
+/// The roles of a run's processes.
 const PROCESSES: [&str; 3] = ["replay-server", "learner", "actor"];
 
-/// Rows drawn by priority, with Rainbow's numbers.
+/// Draws rows by priority, with the numbers of Rainbow.
 const PRIORITISED: &str =
     "--set 'replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}'";
 
-/// A launched run of `driml-ada` that has learned more than so many `updates`.
+/// Starts a run of `driml-ada` and waits until it has made more than `updates` updates.
 fn launched(system: &TestSystem, updates: u64) -> Process {
     launched_with(system, "--agent driml-ada", updates)
 }
 
-/// A launched run with these flags that has learned more than so many `updates`.
+/// Starts a run with these flags and waits until it has made more than `updates` updates.
 fn launched_with(system: &TestSystem, flags: &str, updates: u64) -> Process {
     let process = system.start(&system.local(&format!("{LONG} {flags}")));
     system.connect().wait_for_updates(updates);

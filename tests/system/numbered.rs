@@ -1,5 +1,5 @@
-//! Numbered transitions and counted batches through deaths of the replay server: each number is in the replay once, and each batch of the
-//! plan is served. Actors and learner are synthetic, as those of the program count nothing from outside.
+//! Numbered transitions and counted batches while the replay server is killed: each number is stored once, and each planned batch is
+//! served. Actors and learner are synthetic, because those of the program show no such counts.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -13,19 +13,19 @@ use crate::{
     system, tiny_replay,
 };
 
-/// Actors that number their transitions, chunks of each, and transitions of a chunk.
+/// The number of actors, of chunks per actor, of streams per chunk, and of steps per stream.
 const ACTORS: u32 = 3;
 const CHUNKS: u64 = 40;
 const STREAMS: u32 = 4;
 const STEPS: u32 = 8;
 const OF_AN_ACTOR: u64 = CHUNKS * (STREAMS * STEPS) as u64;
 const TRANSITIONS: u64 = ACTORS as u64 * OF_AN_ACTOR;
-/// What the preset `smoke` says.
+/// The values of the preset `smoke`.
 pub(crate) const WARMUP: u64 = 200;
 pub(crate) const ROWS: u32 = 16;
-/// Rows for each transition.
+/// The replay ratio: rows per transition.
 const RATIO: u64 = 16;
-/// How often each transition is drawn at the end, on average: that one is never drawn has a probability of exp(-64).
+/// How often each transition is drawn at the end, on average. The probability that a given one is never drawn is exp(-64).
 const DRAWN: u64 = 64;
 /// How often the server is killed.
 pub(crate) const KILLS: u64 = 6;
@@ -43,7 +43,7 @@ fn deliver(run: RunClient, first: ChunkHeader) {
     synthetic.finish();
 }
 
-/// The numbers of all transitions in a replay whose server has ended, from rows that are drawn until each was seen.
+/// Returns the numbers of all transitions in the replay of a server that has ended. Draws rows until each number was seen.
 fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
     let mut config: Config = Settings::parse(config_toml)
         .unwrap()
@@ -66,11 +66,11 @@ fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSe
     tiny_replay::numbers(&mut replay, batches, ROWS)
 }
 
-/// Rows that are sampled of all transitions.
+/// The number of rows sampled from all transitions.
 pub(crate) const SAMPLED: u64 = (TRANSITIONS - WARMUP) * RATIO;
 
-/// Numbered transitions and counted batches through deaths of the server, after so many rows each: the sets are equal, and so are the
-/// counts.
+/// Kills the server each time it has served the next number of rows in `moments`. Checks that the numbers in the replay equal those sent,
+/// and that each planned batch was served.
 pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
     let system = system();
     let flags = format!(
@@ -103,10 +103,10 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
         learning.join().unwrap()
     });
     assert_eq!(batches, SAMPLED / u64::from(ROWS));
-    // A server that has just started is not reached at once.
+    // A server that has just started may not be reached at once.
     let replay = client.wait_for_replay("the counts in the end", |_| true);
     check_nothing_lost(&replay);
-    // As many are stored as there are numbers: if each number is there, none is there twice.
+    // As many transitions are stored as there are numbers: if each number is present, none is stored twice.
     assert_eq!(replay.transitions_inserted, TRANSITIONS);
     let (spec, config_toml) = (client.spec.clone(), client.config_toml.clone());
     drop(client);

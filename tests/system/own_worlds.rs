@@ -1,5 +1,5 @@
-//! Custom worlds: a process that the actor starts, in a whole run; and the errors when it fails.
-//! What passes between an actor and such a process is tested beside the worlds.
+//! Custom worlds in whole runs: the actor starts the world's process. Also the errors if that process fails.
+//! The protocol between an actor and such a process is tested with the code of the worlds.
 
 use std::{fs, path::Path, process::Command};
 
@@ -7,16 +7,16 @@ use driml_tests::{python, skipped_offline, succeeds, wait_until};
 
 use crate::{lockstep::continues_exactly, repo_rules::root, system};
 
-/// What a world with frames of 12 x 12 needs beside the preset `smoke`.
+/// The preset `smoke`, and the settings that a world with frames of 12 x 12 needs.
 const SMALL: &str =
     "--preset smoke --set run.frame_stack=2 --set model.conv=[{out=8,kernel=4,stride=2}]";
 
-/// A file of this repository.
+/// Returns the path of a file of this repository.
 fn file(name: &str) -> String {
     root().join(name).display().to_string()
 }
 
-/// The world whose every frame says which one it is; it needs `python3` and nothing else.
+/// Returns the command of a world whose frames contain their own number. Needs only `python3`.
 fn numbered(fault: &str) -> String {
     format!(
         "exec:exec python3 {} {fault}",
@@ -31,7 +31,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let flags = format!("{SMALL} --agent driml-ada --frames 1280 --env '{env}'");
     let summary = system.train(&format!("{flags} --actors 2"), "run");
     assert_eq!(summary.frames, 1280);
-    // Every third to sixth step of a copy ends an episode.
+    // Each episode of a copy lasts three to six steps.
     assert!(summary.episodes > 200, "{summary:#?}");
     let run = system.run_folder("run");
     let config = run.config();
@@ -46,7 +46,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let first = lockstep(&flags, "first");
     assert_eq!(first, lockstep("--config first/config.toml", "again"));
     let ended = system.run_ok("evaluate --run run --episodes 8");
-    // Each episode ends with 1000, and what comes before is 2 a step at most.
+    // Each episode ends with a reward of 1000; each step before gives at most 2.
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
     assert_eq!(system.survivors(), []);
@@ -87,12 +87,12 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
         run.check_finished();
         assert!(!run.path().join("replay").exists());
     }
-    // One that fails in it ends the run.
+    // A world that fails to save its state ends the run.
     let why = "wrote a state of 67108865 bytes; 67108864 are possible";
     system().fails(&run("saves large"), why);
 }
 
-/// Chunks are of eight steps of four copies; the last waits for thousands of updates when the world fails.
+/// The last chunk, of eight steps of four copies, waits for thousands of updates when the world fails.
 const SLOW: &str = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
 
 #[test]
@@ -112,7 +112,7 @@ fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored
         system.fails(&format!("local {flags} --run-dir run"), sentence);
         assert_eq!(system.survivors(), [], "{fault}");
         if limit == SLOW {
-            // On a slow machine the actor is started again, and plays as much once more.
+            // On a slow machine the actor is restarted, and plays the same number of frames again.
             let frames = system.run_folder("run").summary().frames;
             assert!(frames > 0 && frames.is_multiple_of(3 * 8 * 4), "{frames}");
         }
@@ -147,14 +147,14 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         .expect_said("--env \"exec:exec python3 ");
     let actor = |flags: &str| system.start_process(&system.connected(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");
-    // The same world by another command, as another machine may have it; it will hang.
+    // The same world by another command, as another machine may have it. This world will hang.
     let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
     let client = system.connect();
     client.wait_for_replay("the actor", |replay| replay.actors == 1);
     wait_until("the world's hanging", || {
         hanging.stderr().contains("sleeping")
     });
-    // A process that ignores its pipes does not outlive its actor, however that ends.
+    // A world's process that ignores its pipes does not outlive its actor, however the actor ends.
     let worlds = || {
         let is_world = |word: &String| word.ends_with("numbered.py");
         let all = system.survivors().into_iter();
@@ -169,7 +169,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     system.wait_until_all_have_ended();
 }
 
-/// A Python with Gymnasium and ALE, installed once into cargo's folder for tests; `None`, and a line that says so, where pip cannot.
+/// Returns a Python with Gymnasium and ALE, installed once into cargo's folder for tests. If pip fails, reports the test as skipped.
 fn gymnasium() -> Option<String> {
     if skipped_offline() {
         return None;
@@ -212,7 +212,7 @@ fn atari_by_gymnasium_trains() {
     assert_eq!(system.survivors(), []);
 }
 
-/// ALE's emulator, wrappers and generators come back as they were.
+/// The states of ALE's emulator, wrappers and random generators are restored.
 #[test]
 fn atari_continues_exactly_in_lockstep() {
     let Some(python) = gymnasium() else { return };
@@ -221,7 +221,7 @@ fn atari_continues_exactly_in_lockstep() {
     continues_exactly(&format!("{SMALL} --agent driml-ada --env '{env}'"));
 }
 
-/// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.
+/// Runs the adapter's own test, which needs Gymnasium: all autoreset modes of vector environments, seeds, shapes, and rejected worlds.
 #[test]
 fn the_adapter_keeps_gymnasium_s_episodes() {
     let Some(python) = gymnasium() else { return };

@@ -1,5 +1,5 @@
-//! The repository's Markdown pages: links lead somewhere, the book lists its pages, and all of it stays short.
-//! It follows no link to another site. Templates of result pages, `.md.j2`, count as words alone.
+//! The repository's Markdown pages: links are valid, the book lists its pages, and the text stays short.
+//! Links to other sites are not followed. Templates of result pages (`.md.j2`) only count as words.
 
 use std::{
     collections::BTreeSet,
@@ -9,18 +9,18 @@ use std::{
 
 use super::repo_rules::{Source, read, root, sources};
 
-/// Lines of the README, which is to be read on two screens.
+/// Most lines of the README, which should fit on two screens.
 const README_LINES_MAX: usize = 130;
 const README_WORDS_MAX: usize = 1_000;
-/// Of all Markdown, templates and generated pages included.
+/// Most words of all Markdown, including templates and generated pages.
 const WORDS_MAX: usize = 25_000;
-/// Of a table's cell, beside links and code.
+/// Most words of a table's cell, apart from links and code.
 const CELL_WORDS_MAX: usize = 12;
 
 const DOCS: &str = "deploy/docs/src";
 const LANGUAGES: [&str; 7] = ["", "sh", "text", "toml", "rust", "python", "ini"];
 
-/// The pages that are read as they are.
+/// Returns the Markdown pages without the templates.
 fn pages() -> Vec<Source> {
     sources(&[".md"])
 }
@@ -35,7 +35,7 @@ fn check_pages(what: &str, find: impl Fn(&Source) -> Vec<String>) {
     assert!(wrong.is_empty(), "{what}:\n{}", wrong.join("\n"));
 }
 
-/// Tokens with a letter or a digit: a table's bars are not words.
+/// Counts the tokens with a letter or a digit. The bars of a table are not words.
 fn words(text: &str) -> usize {
     let is_word = |token: &&str| token.chars().any(char::is_alphanumeric);
     text.split_whitespace().filter(is_word).count()
@@ -51,7 +51,7 @@ fn prose(text: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-/// The names that headings have as targets of links.
+/// Returns the anchors of the headings, by which links name them.
 fn anchors(text: &str) -> BTreeSet<String> {
     let headings = prose(text).filter(|line| line.starts_with('#'));
     let anchor = |line: &str| {
@@ -138,7 +138,7 @@ fn cells_of_tables_are_short() {
     check_pages("cells of more than 12 words", |page| {
         let mut long = Vec::new();
         for row in prose(&page.text).filter(|line| line.starts_with('|')) {
-            // What stands between backticks is code, and what a link shows and names is the link's.
+            // Code in backticks, and the text and targets of links, do not count.
             let plain: String = row.split('`').step_by(2).collect();
             let is_long = |cell: &&str| words(&without_links(cell)) > CELL_WORDS_MAX;
             long.extend(plain.split('|').filter(is_long).map(str::to_owned));

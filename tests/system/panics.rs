@@ -1,16 +1,16 @@
-//! A panic in any thread of any process: the process ends, the launcher says which process and thread it was, nothing is left.
-//! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fail_point`).
+//! A panic in any thread of any process: the process exits, the launcher names the process and the thread, and nothing is left.
+//! In debug builds `DRIML_TEST_PANIC` triggers the panics (`driml_protocol::fail_point`).
 
 use driml_protocol::fail_point;
 use driml_tests::{Outcome, at_once};
 
 use crate::{LONG, PRIORITISED, system};
 
-/// The launcher itself, after whose death the other processes exit.
+/// The launcher itself; the other processes exit after its death.
 const LAUNCHER: &str = "launcher";
 
-/// The process's name in the launcher, the points that its threads pass, and the flags of a run that has these threads. Where several
-/// processes have them, any may be the first.
+/// The process's name in the launcher, the fail points in its threads, and the flags of a run that has these threads. If several processes
+/// have them, any of them may panic first.
 static THREADS: [(&str, &str, &str); 8] = [
     (
         "replay-server",
@@ -31,7 +31,7 @@ static THREADS: [(&str, &str, &str); 8] = [
     (LAUNCHER, "interrupts, log of learner", ""),
 ];
 
-/// A run with a panic at `point`, to the end.
+/// Checks that a panic at `point` ends a run.
 fn ends_the_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
     let ended = system.run(&format!(
@@ -69,7 +69,7 @@ fn ends_the_run((process, point, flags): (&str, &str, &str)) {
 
 #[test]
 fn a_panic_in_any_thread_ends_the_run_and_is_named() {
-    // Only debug builds can be asked to panic.
+    // Only debug builds have fail points.
     if !cfg!(debug_assertions) {
         return driml_tests::skip("a release build");
     }
@@ -78,7 +78,7 @@ fn a_panic_in_any_thread_ends_the_run_and_is_named() {
         points.map(move |point| (*process, point, *flags))
     });
     let threads: Vec<_> = threads.collect();
-    // These runs wait for each other's ends more than they compute.
+    // These runs spend more time waiting for processes to end than computing.
     at_once(threads.chunks(6), |some| {
         some.iter().copied().for_each(ends_the_run);
     });

@@ -1,11 +1,11 @@
-//! `driml parity` on updates computed elsewhere in float64; `deploy/docs/src/reference/parity.md` says what the files hold.
-//! How each tensor compares is the learner's own test.
+//! `driml parity` on updates computed elsewhere in float64; `deploy/docs/src/reference/parity.md` describes the files.
+//! The learner's own tests check the comparison of each tensor.
 
 use std::fs;
 
 use crate::{repo_rules::root, system};
 
-/// A case, and its tensor that is changed.
+/// A case, and the tensor that the test changes.
 const CHANGED: [(&str, &str); 5] = [
     ("all_four", "expect.loss.total"),
     ("all_four", "expect.target_projection"),
@@ -35,7 +35,7 @@ fn a_case_with_another_expectation_fails() {
     }
 }
 
-/// Makes the first number of a tensor of a safetensors file 1000.
+/// Sets the first number of a tensor of a safetensors file to 1000.
 fn change(file: &mut [u8], tensor: &str) {
     let header_len = u64::from_le_bytes(file[..8].try_into().unwrap()) as usize;
     let header: serde_json::Value = serde_json::from_slice(&file[8..8 + header_len]).unwrap();

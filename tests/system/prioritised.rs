@@ -1,12 +1,12 @@
-//! Rows drawn by priority, in whole runs of one replay server and of several. A server that dies is in `durable`, lockstep in `lockstep`.
-//! The law of the draws is tested beside the code.
+//! Rows drawn by priority, in whole runs with one and several replay servers. Servers that die are in `durable`, lockstep in `lockstep`.
+//! The distribution of the draws is tested beside the code.
 
 use driml_tests::Outcome;
 
 use crate::{PRIORITISED, SHORT, system};
 
-/// The numbers of the last line with `words`: of a replay server, rows whose priority was set, came too late and came twice; of the
-/// learner, updates whose priorities arrived.
+/// Returns the numbers of the last line with `words`. A replay server logs rows whose priority was set, came too late and came twice; the
+/// learner logs updates whose priorities arrived.
 pub(crate) fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
     let line = log.lines().rfind(|line| line.contains(words));
     let line = line.unwrap_or_else(|| panic!("no word of priorities: {log}"));
@@ -16,11 +16,11 @@ pub(crate) fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
     numbers.try_into().unwrap()
 }
 
-/// Of the preset `smoke`.
+/// The batch size of the preset `smoke`.
 const BATCH_ROWS: u64 = 16;
 pub(crate) const SET: &str = "rows were set";
 
-/// The priorities of all updates that the learner says have arrived. Where the machine is busy, some are on their way when it ends.
+/// The servers got the priorities of all updates that the learner counts as arrived. On a busy machine it exits before some arrive.
 #[test]
 fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
     for flags in ["", "--actors 2 --replay-shards 2"] {

@@ -1,12 +1,12 @@
-//! Real Procgen through all processes. The engine is fetched into the cache folder once, as `driml local` does.
-//! With `DRIML_OFFLINE=1` each test here is skipped and says so; what each game does is tested beside the worlds.
+//! Real Procgen through all processes. The engine is downloaded into the cache folder once, as `driml local` does.
+//! With `DRIML_OFFLINE=1` each of these tests is skipped by name. Each game is tested with the code of the worlds.
 
 use driml_settings::config::RunConfig;
 use driml_tests::{TestSystem, check_has, skipped_offline};
 
 use crate::system;
 
-/// A system where the engine may be fetched; none, and the test is skipped by name, where it may not.
+/// Creates a system if the engine may be downloaded. Otherwise returns `None` and reports the test as skipped.
 fn with_engine() -> Option<TestSystem> {
     (!skipped_offline()).then(system)
 }
@@ -23,7 +23,7 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
         .expect_printed("procgen:bigfish on unseen levels, 2 episodes each");
 }
 
-/// Frames as the engine gives them lose a border that no convolution reads; at 104 x 80 they are enlarged after that.
+/// The engine's frames lose a border that no convolution reads. At 104 x 80 they are enlarged after that.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
     let Some(system) = with_engine() else { return };
@@ -57,7 +57,7 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
     }
 }
 
-/// N updates, saved and resumed for N more, are 2 N: the engine's state comes back.
+/// N updates, saved and resumed for N more, equal a run of 2 N: the engine's state is restored.
 #[test]
 fn a_run_that_is_prolonged_is_a_longer_one() {
     let Some(system) = with_engine() else { return };

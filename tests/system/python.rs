@@ -1,5 +1,5 @@
-//! What others read of a run, with their own programs: `deploy/python` against the numbers that driml computes itself.
-//! Each test is skipped, by name, where no Python has what it needs.
+//! Other programs that read a run: `deploy/python` must give the numbers that driml computes itself.
+//! Each test is skipped by name if no Python has the modules that it needs.
 
 use std::{
     fs,
@@ -25,13 +25,13 @@ use crate::{
     system,
 };
 
-/// Largest difference of a value, and of a probability, between PyTorch and driml, both in f32.
+/// The largest allowed difference of a value, and of a probability, between PyTorch and driml, both in f32.
 const VALUE_OFF: f64 = 2e-5;
 const PROBABILITY_OFF: f64 = 2e-6;
-/// States that are compared.
+/// The number of states that are compared.
 const STATES: usize = 16;
 
-/// Prints values and probabilities of the states in a file, as JSON.
+/// A script that prints values and probabilities of the states in a file, as JSON.
 const ASK: &str = "
 import json, sys
 sys.path.insert(0, sys.argv[1])
@@ -46,7 +46,7 @@ with torch.no_grad():
 print(json.dumps([values.flatten().tolist(), logits.softmax(-1).flatten().tolist()]))
 ";
 
-/// Prints values by ONNX's own runtime.
+/// A script that prints the values that ONNX Runtime computes.
 const ASK_ONNX: &str = "
 import json, sys
 import numpy, onnxruntime
@@ -56,8 +56,8 @@ states = numpy.fromfile(sys.argv[2], dtype=numpy.uint8).reshape(shape)
 print(json.dumps(session.run(['q_values'], {'states': states})[0].flatten().tolist()))
 ";
 
-/// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, C51 alone, with averaged weights, and with
-/// Rainbow's streams of noisy layers; the residual torsos.
+/// A run of each kind of network: all heads of local and global DIM with enlarged stacks, C51 alone with averaged weights, Rainbow's
+/// streams of noisy layers, and the residual torsos.
 const RUNS: [&str; 5] = [
     "--env mspacman --agent driml-ada --preset smoke --frames 320",
     "--env chain --agent c51 --preset smoke --frames 320 --set learner.update.average_tau=0.01",
@@ -66,7 +66,7 @@ const RUNS: [&str; 5] = [
     "--env chain --agent c51 --preset smoke --frames 320 --set model.torso=impoola --set model.channels=[4,6]",
 ];
 
-/// A run's agent, and what it makes of random states in a file beside the run.
+/// Makes a run. Returns its agent and the agent's outputs for random states, which are in a file beside the run.
 fn trained(system: &TestSystem, flags: &str) -> (Agent, Seen) {
     let _ = fs::remove_dir_all(system.path("run"));
     system.run_ok(&format!("local --lockstep {flags} --run-dir run"));
@@ -136,7 +136,7 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
             note(&format!("{flags}: ONNX values {off:.1e}"));
             assert!(off < VALUE_OFF, "{flags}: {off}");
         }
-        // A checkpoint of an earlier version has no metadata; config.toml says the same.
+        // A checkpoint of an earlier version has no metadata; `config.toml` contains the same facts.
         let newest = system.run_folder("run").checkpoints().pop().unwrap();
         let bare = agent.online().to_safetensors(|_| true).unwrap();
         fs::write(newest.join("online.safetensors"), bare).unwrap();
@@ -176,7 +176,7 @@ fn optuna_searches() {
         run(&python, &[script.to_str().unwrap()], &args)
     };
     check_has(&search(), &["best: ", "replay_ratio"]);
-    // It continues: the second trial is number 1.
+    // The search continues: the second trial has number 1.
     search();
     for trial in ["trial0-seed1", "trial0-seed2", "trial1-seed2"] {
         assert!(out.join(trial).join("summary.json").exists(), "{trial}");
@@ -203,7 +203,7 @@ fn a_helper_without_its_package_says_which() {
         command.stdin(Stdio::piped()).stderr(Stdio::piped());
         let mut process = command.spawn().unwrap();
         let asks = b"{\"driml_env\": 1, \"copies\": 1}\n";
-        // One that does not get that far does not read it.
+        // A script that fails earlier does not read this input.
         let _ = process.stdin.take().unwrap().write_all(asks);
         let ended = process.wait_with_output().unwrap();
         let said = String::from_utf8_lossy(&ended.stderr);
