@@ -1,8 +1,7 @@
-//! What the replay's compression saves on real Procgen frames, and what it costs: bytes a transition, inserts, batches.
-//! It measures neither the codec nor the network.
+//! What the replay's compression saves on real Procgen frames, and what it costs: bytes per transition, time of inserts and batches.
+//! The bench measures neither the codec nor the network.
 //!
-//! The frames are those of 16 copies under a random policy, or under one that mostly runs to the right: what scrolls
-//! compresses worse.
+//! The frames come from 16 copies under a random policy, or under one that mostly runs to the right: scrolling frames compress worse.
 #![allow(
     missing_docs,
     clippy::unwrap_used,
@@ -36,7 +35,7 @@ const RIGHT: u8 = 7;
 
 /// The paper's settings of a game, with frames as they are.
 fn settings(game: &str) -> RunConfig {
-    // What is free at this moment decides nothing here.
+    // The memory that is free now must not change the settings.
     let machine = Machine {
         memory_bytes: u64::MAX,
         ..Machine::this()
@@ -60,7 +59,7 @@ fn replay(config: &RunConfig, compression: Compression) -> Replay {
     replay
 }
 
-/// Everything that 16 copies of a game show, as an actor would send it.
+/// Returns what 16 copies of a game show, as the chunks of an actor.
 fn chunks(config: &RunConfig, runs_right: bool) -> Vec<Chunk> {
     let mut world = config.world.build(COPIES, 1, 0).unwrap();
     let frame_bytes = world.frame_shape().bytes();
@@ -84,7 +83,7 @@ fn chunks(config: &RunConfig, runs_right: bool) -> Vec<Chunk> {
     steps.filter_map(|_| step()).collect()
 }
 
-/// Stores the next chunk of an endless repetition.
+/// Stores the next chunk; the chunks repeat endlessly.
 fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: &mut usize) {
     let chunk = &mut chunks[*sequence % CHUNKS];
     chunk.header.sequence = *sequence as u64;
@@ -93,7 +92,7 @@ fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: &mut usize) 
     *sequence += 1;
 }
 
-/// Makes `batches` as the replay server's two threads do: drawn with the replay locked, unpacked without.
+/// Makes `batches` batches on two threads, as the replay server does: drawn with the replay locked, unpacked without the lock.
 fn on_two_threads(replay: &Mutex<Replay>, batches: u64) -> Duration {
     let make = |count| {
         for _ in 0..count {

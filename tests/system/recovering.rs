@@ -1,5 +1,5 @@
-//! A replay server that has a long log to read back: all processes learn the progress, wait, and continue; nothing is lost or doubled.
-//! The log is real, and its server gets little of the processor, as on a slow machine: nothing in the program waits for these tests.
+//! A replay server that reads back a long log: all processes receive the progress, wait, and continue; nothing is lost or stored twice.
+//! The log is real, and its server gets little processor time, as on a slow machine. The program contains no delay for these tests.
 
 use std::{fs, path::Path};
 
@@ -16,17 +16,17 @@ use crate::{
     system, tiny_replay,
 };
 
-/// Transitions in a log, one record each: in one that is read for longer than the limit for an absent server, and in the others.
+/// Transitions in a log, one record each. Reading `LONG` takes longer than the time-out for an unreachable server.
 const LONG: u64 = 1_000_000;
 const SHORTER: u64 = 400_000;
 const WARMUP: u64 = 192;
-/// How long the processes of these runs would wait for an unresponsive server, seconds.
+/// The time-out for an unresponsive server in these runs, in seconds.
 const UNREACHABLE_MAX_S: f64 = 5.0;
 /// What a waiting process logs.
 const WAITING: &str =
     "waiting for as long as it takes: the replay server reads its replay back from disk, ";
 
-/// Updates of a run that continues with so many transitions: one of 16 rows for 1,024 of them after the warm-up.
+/// Returns the updates of a run that continues with `kept` transitions: one of 16 rows for 1,024 transitions after the warm-up.
 const fn updates(kept: u64) -> u64 {
     kept / 1024 + 15
 }
@@ -35,7 +35,7 @@ const fn frames(kept: u64) -> u64 {
     WARMUP + 1024 * updates(kept)
 }
 
-/// Without shared memory: a process on a slow machine would take it for seconds, while those of other tests wait for theirs.
+/// Returns flags without shared memory: a slow process would hold the lock of `/dev/shm` for seconds, for which other tests wait.
 fn flags(kept: u64) -> String {
     let (frames, capacity) = (frames(kept), kept + 100_000);
     format!(
@@ -45,12 +45,12 @@ fn flags(kept: u64) -> String {
     )
 }
 
-/// Puts so many transitions of another actor into the log in `folder`, whose run has these settings.
+/// Writes `kept` transitions of another actor into the log in `folder`, for a run with these settings. Returns the run spec.
 fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     let settings = Settings::parse(config_toml).unwrap();
     let spec: RunSpec = settings.table("run").unwrap();
     let mut config: Config = settings.table("replay").unwrap();
-    // So that the learner need not follow.
+    // Lets the inserts run ahead of the learner.
     (config.slack_transitions, config.transitions_max) = (1 << 40, None);
     let args = PersistArgs {
         dir: folder.to_owned(),
@@ -71,7 +71,7 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     spec
 }
 
-/// Makes a log of so many transitions in the folder `replay`; gives its run, and what a replay server is called with to read it.
+/// Makes a log of `kept` transitions in the folder `replay`. Returns the run spec, and the flags of a replay server that reads the log.
 fn keep_for(system: &TestSystem, kept: u64) -> (RunSpec, String) {
     let flags = flags(kept);
     let server = system.start_replay_server(&flags);
@@ -82,14 +82,14 @@ fn keep_for(system: &TestSystem, kept: u64) -> (RunSpec, String) {
     (spec, format!("{flags} --replay-dir replay"))
 }
 
-/// Makes a server's machine a slow one, and waits until it has begun to read.
+/// Slows a server down, and waits until it has begun to read.
 fn slow_down(server: &mut Process) -> SlowMachine {
     let slow = SlowMachine::for_process(server.pid());
     server.wait_for_stderr("reads the replay in ");
     slow
 }
 
-/// Starts a replay server that stands still until its machine is slowed down: it cannot have read all before.
+/// Starts a replay server that is stopped until it is slowed down, so that it cannot have read everything before.
 fn start_stopped(system: &TestSystem, flags: &str) -> Process {
     let server = system.replay_server(flags);
     system.start_process(&format!(
@@ -97,7 +97,7 @@ fn start_stopped(system: &TestSystem, flags: &str) -> Process {
     ))
 }
 
-/// How far the server is, as `driml status --json` has it; none once it has read all.
+/// Returns the server's progress as `driml status --json` prints it; `None` once the server has read everything.
 fn recovering(system: &TestSystem) -> Option<Value> {
     let answer = system.run_ok(&system.connected("status --json")).json();
     let recovering = answer["servers"][0]["recovering"].clone();
@@ -108,7 +108,7 @@ fn recovering(system: &TestSystem) -> Option<Value> {
     Some(recovering)
 }
 
-/// Whatever is asked is put off.
+/// Checks that the server puts off every kind of request.
 fn check_put_off(system: &TestSystem, spec: &RunSpec) {
     let run = system.run_client(spec);
     let client = Client {
@@ -132,7 +132,7 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
     send(&client, rows);
 }
 
-/// Processes that were there when the server died, and others that come while it reads, longer than the limit for an absent server.
+/// Processes wait beyond the time-out for an unreachable server: some were there when the server died, others start while it reads.
 #[test]
 fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let system = system();
@@ -192,7 +192,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
         .expect_said("continues with the replay in replay");
 }
 
-/// A server that is told to end does, however much is left to read; the next one reads it all.
+/// A server that is told to stop exits, however much is left to read. The next server reads everything.
 #[test]
 fn a_server_that_reads_is_stopped_and_started_again() {
     let system = system();
@@ -211,7 +211,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     assert_eq!(replay.transitions_inserted, SHORTER);
     server.stop_ok();
 
-    // An unreadable log ends it with an error, and no process waits for it any more.
+    // A server with an unreadable log exits with an error, and no process waits for it any more.
     for entry in fs::read_dir(system.path("replay")).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|it| it == "log") {
@@ -245,7 +245,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     assert_eq!(system.survivors(), []);
 }
 
-/// Each role receives it in place of the answer.
+/// Each role receives the progress in place of the reply.
 #[test]
 fn roles_are_told_too() {
     let Some(system) = system().over_tls() else {

@@ -1,5 +1,5 @@
-//! The rules of the repository that no compiler holds: which crate may know which, and what may be where.
-//! It builds nothing and needs no network; the graph of crates is read from `Cargo.lock`.
+//! Rules of the repository that the compiler does not check: which crate may depend on which, and what may be where.
+//! The tests build nothing and need no network. They read the graph of crates from `Cargo.lock`.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -9,7 +9,7 @@ use std::{
 
 use walkdir::{DirEntry, WalkDir};
 
-/// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
+/// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_750),
     ("actor", 11_130),
@@ -18,10 +18,10 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("deploy", 31_270),
     ("tests", 10_635),
 ];
-/// Most lines of one file.
+/// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;
 
-/// Every package of ours, where it lies, and which others of ours it may know; * for all. Tests and benches count too.
+/// Each of our packages, its folder, and those of our packages that it may depend on; * for all. Dependencies of tests and benches count.
 const ARROWS: &str = "
 driml-protocol      protocol            :
 procgen-sys         actor/procgen-sys   :
@@ -46,7 +46,7 @@ driml-tests         tests               : *
 driml-decoders      tests/decoders      : driml-protocol driml-actor driml-replay-server driml-learner driml-settings
 ";
 
-/// A line of [`ARROWS`]: name, folder, and the packages that it may know.
+/// Returns the lines of [`ARROWS`]: name, folder, and the packages that it may depend on.
 fn arrows() -> impl Iterator<Item = (&'static str, &'static str, Vec<&'static str>)> {
     ARROWS.trim().lines().map(|line| {
         let (package, known) = line
@@ -65,22 +65,22 @@ pub(crate) fn root() -> PathBuf {
         .into()
 }
 
-/// Where the packages of ours lie.
+/// Returns the folders of our packages.
 pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
     arrows().map(|(_, folder, _)| folder)
 }
 
-/// The text of a file, by its path from the root.
+/// Returns the text of a file, by its path from the root.
 pub(crate) fn read(path: impl AsRef<Path>) -> String {
     fs::read_to_string(root().join(path)).unwrap()
 }
 
-/// A file of TOML, by its path from the root.
+/// Reads a TOML file, by its path from the root.
 fn toml(path: impl AsRef<Path>) -> toml::Table {
     read(path).parse().unwrap()
 }
 
-/// What each package of `Cargo.lock` depends on: on any platform, with tests and benches. Versions of one are taken together.
+/// Returns the dependencies of each package in `Cargo.lock`, on any platform, with tests and benches. Versions of a package are merged.
 fn locked() -> BTreeMap<String, BTreeSet<String>> {
     let mut packages = BTreeMap::<_, BTreeSet<_>>::new();
     for package in toml("Cargo.lock")["package"].as_array().unwrap() {
@@ -117,7 +117,7 @@ fn arrows_between_crates_point_one_way() {
     }
 }
 
-/// Everything that `package` depends on in any way.
+/// Returns everything that `package` depends on, directly or indirectly.
 fn depends_on(package: &str) -> BTreeSet<String> {
     let locked = locked();
     let mut seen = BTreeSet::new();
@@ -130,7 +130,7 @@ fn depends_on(package: &str) -> BTreeSet<String> {
     seen
 }
 
-/// A package, and what none of those that it depends on may be called: a name, or its beginning before a dash.
+/// A package, and names that none of its dependencies may have: a whole name, or the part before a dash.
 const FREE_OF: &str = "
 driml-replay-server : candle gemm safetensors rayon
 driml-model         : zenoh tokio bincode
@@ -149,21 +149,21 @@ fn each_process_is_free_of_what_is_none_of_its_business() {
             assert_eq!(found, None, "{package} has {name} in its tree");
         }
     }
-    // The names are right: the learner has them.
+    // Check the spelling of the names: the learner has these dependencies.
     let learner = depends_on("driml-learner");
     for name in "candle-core gemm safetensors rayon zenoh tokio bincode".split(' ') {
         assert!(learner.contains(name), "{name}");
     }
 }
 
-/// Every file of the repository that is not built, fetched or left by a run, by its path from the root.
+/// Returns the path from the root of every file of the repository that is not built, downloaded or left by a run.
 fn files() -> Vec<String> {
     let root = root();
     let name = |entry: &DirEntry| {
         let name = entry.path().strip_prefix(&root).unwrap();
         name.to_str().expect("names here are plain").to_owned()
     };
-    // `target` and `runs` are in .gitignore; a folder that cargo made has a tag.
+    // `target` and `runs` are in .gitignore; a folder that cargo made contains CACHEDIR.TAG.
     let is_ours = |entry: &DirEntry| {
         !matches!(&*name(entry), ".git" | "target" | "runs")
             && !entry.path().join("CACHEDIR.TAG").exists()
@@ -179,12 +179,12 @@ fn files() -> Vec<String> {
 
 /// A file of text.
 pub(crate) struct Source {
-    /// Its path from the root.
+    /// The path from the root.
     pub(crate) name: String,
     pub(crate) text: String,
 }
 
-/// The files whose names end in one of these.
+/// Returns the files whose names end in one of `endings`.
 pub(crate) fn sources(endings: &[&str]) -> Vec<Source> {
     let mut names = files();
     names.retain(|name| endings.iter().any(|it| name.ends_with(it)));
@@ -195,7 +195,7 @@ pub(crate) fn sources(endings: &[&str]) -> Vec<Source> {
     names.into_iter().map(source).collect()
 }
 
-/// The identifiers in a Rust file outside its comments. Strings count as code, which errs on the strict side.
+/// Returns the identifiers in a Rust file outside its comments. Strings count as code, which errs on the strict side.
 fn words(text: &str) -> BTreeSet<&str> {
     let code = text
         .lines()
@@ -240,13 +240,13 @@ fn the_code_stays_within_its_budget() {
 #[test]
 fn dangerous_words_stay_where_they_are_needed() {
     let ffi = &["actor/procgen-sys/", "learner/model/src/kernels/isa/"];
-    // What travels, and how a world is kept.
+    // The messages, and the saved state of worlds.
     let encoded = &["protocol/src/wire/", "actor/envs/src/saved.rs"];
     let rules: [(&str, &[&str]); 4] = [
         ("unsafe", ffi),
         ("unsafe_code", ffi),
         ("bincode", encoded),
-        // A panic ends the process: nothing of the program may count on catching one.
+        // A panic ends the process: no code of the program may rely on catching one.
         ("catch_unwind", &["replay-server/tests/"]),
     ];
     for (word, places) in rules {
@@ -270,7 +270,7 @@ fn dangerous_words_stay_where_they_are_needed() {
 
 #[test]
 fn comments_and_messages_say_who_does_what() {
-    // This file is looked at too.
+    // Put together here, because this file is checked, too.
     let vague = ["no_body", "some_body", "every_body", "who_ever"].map(|it| it.replace('_', ""));
     for Source { name, text } in sources(&[".rs"]) {
         let text = text.to_lowercase();
@@ -281,7 +281,7 @@ fn comments_and_messages_say_who_does_what() {
 
 #[test]
 fn nothing_points_at_the_machine_it_was_written_on() {
-    // Put together here, as this file is looked at too.
+    // Put together here, because this file is checked, too.
     let places = ["work", "root"].map(|folder| format!("/{folder}/"));
     for name in files() {
         // Binary files, such as parity cases, hold no paths.
@@ -295,7 +295,7 @@ fn nothing_points_at_the_machine_it_was_written_on() {
     }
 }
 
-/// Whether `line` has `place` as the start of an absolute path, not as the middle of a longer one or of an address.
+/// Returns whether `place` starts an absolute path in `line`, rather than standing inside a longer path or an address.
 fn points_at(line: &str, place: &str) -> bool {
     line.match_indices(place).any(|(at, _)| {
         let before = line[..at].chars().next_back();

@@ -1,4 +1,4 @@
-//! Interrupted runs that are resumed: by Ctrl-C, by the death of all their processes; and what cannot be resumed.
+//! Resuming runs that ended by Ctrl-C or by the death of all their processes; and runs that cannot be resumed.
 
 use std::fs;
 
@@ -7,22 +7,22 @@ use driml_tests::{Outcome, Summary, TestSystem, check_has};
 
 use crate::{SHORT, launched, system};
 
-/// Updates that a resumed run makes: more than are left for the 256 transitions of slack, a chunk that is on its way and one that
-/// fills the memory again.
+/// The number of updates that a resumed run makes. More than the 256 transitions of slack, a chunk in flight and a chunk that fills the
+/// replay again would still allow.
 const MORE: u64 = 200;
 
-/// Resumes `run` for so many updates more than it has, and checks what it leaves.
+/// Resumes `run` for [`MORE`] updates, and checks what the run leaves behind.
 fn resumes(system: &TestSystem) -> Summary {
     let run = system.run_folder("run");
     let updates = run.saved_updates();
-    // The warm-up, and 2 for each update of 16 rows at replay ratio 8.
+    // The warm-up, and 2 frames for each update of 16 rows at replay ratio 8.
     let frames = 200 + 2 * (updates + MORE);
     let ended = system.run_ok(&format!("local --resume run --frames {frames}"));
     let from = format!("from its checkpoint after {updates} updates");
     ended.expect_printed(&from);
     let summary = run.check_finished();
     assert_eq!(summary.resumed_after_updates, updates);
-    // The last chunk is stored whole, which are up to 16 updates.
+    // The last chunk is stored whole, which allows up to 16 updates more.
     let planned = updates + MORE..updates + MORE + 16;
     assert!(planned.contains(&summary.updates), "{summary:#?}");
     assert!(summary.episodes > 0);
@@ -54,18 +54,18 @@ fn an_interrupt_saves_and_ends_all_processes_and_the_run_continues() {
     let before = system.run_folder("run").check(Outcome::Interrupted);
     assert!(before.updates > 1_000, "{before:#?}");
     let summary = resumes(&system);
-    // A few tens of episodes ended since, the short ones first; the mean return is of 100 all the same.
+    // A few tens of episodes have ended since, the short ones first. The mean return is still that of 100 episodes.
     let since = summary.episodes - before.episodes;
     assert!((1..100).contains(&since), "{since} episodes since");
     assert_eq!((before.mean_return_of, summary.mean_return_of), (100, 100));
-    // And once more, with more frames, now that it is finished.
+    // A finished run can be resumed with more frames.
     assert_eq!(resumes(&system).mean_return_of, 100);
     system
         .run_ok("local --resume run")
         .expect_printed("nothing is left to do");
 }
 
-/// Runs of earlier versions recorded whole frames where a border of them is cut today.
+/// Runs of earlier versions recorded whole frames; today a border of the frames is cut off.
 #[test]
 fn a_run_with_whole_frames_continues_and_is_evaluated() {
     let system = system();
@@ -91,7 +91,7 @@ fn a_run_whose_processes_were_all_killed_continues() {
     let process = launched(&system, 200);
     system.kill_all();
     process.wait();
-    // A save may have been cut off; what it leaves is not a checkpoint.
+    // The kill may have interrupted a save, whose remains are not a checkpoint.
     for entry in fs::read_dir(system.path("run/checkpoints")).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some() {
@@ -140,7 +140,7 @@ fn what_cannot_be_resumed() {
         system.run_ok(&format!("evaluate {run} --episodes 2"));
         system.run_ok(&format!("local --resume {run} --frames 2000"));
     }
-    // The pace at which another run was resumed is its own.
+    // A new run with the settings of a resumed run does not take over the pace since its resume.
     let since = |run: &str| {
         let config = system.run_folder(run).config();
         config["replay"].get("since").is_some()
@@ -151,7 +151,7 @@ fn what_cannot_be_resumed() {
     system.refuses("local --resume run --frames 2000", "there is no checkpoint");
 }
 
-/// All was learned when the launcher was killed: only the run's end is missing, and its shards hold nothing any more.
+/// The launcher was killed after the last update: only the end of the run is missing, and the shards no longer hold anything.
 #[test]
 fn a_run_cut_off_at_its_end_is_finished() {
     let system = system();
@@ -169,7 +169,7 @@ fn a_run_cut_off_at_its_end_is_finished() {
         system.run_ok(&format!("local --resume {dir}"));
         let summary = run.summary();
         assert_eq!(summary.outcome, Outcome::Finished);
-        // The last chunk of 32 is stored whole, which are 16 updates.
+        // The last chunk of 32 is stored whole, which allows up to 16 updates more.
         let planned = before..before + 16;
         assert!(planned.contains(&summary.updates), "{summary:#?}");
     }

@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::system;
 
-/// Frames of the first life, those that warm it up, and its settings.
+/// The frames, warm-up, batch size and replay ratio of the first life, which is the run until it is stopped.
 const FRAMES: u64 = 2_400;
 const WARMUP: u64 = 200;
 const ROWS: u64 = 16;
@@ -27,11 +27,11 @@ enum Stop {
     KillLauncher,
     /// All processes are killed.
     KillAll,
-    /// A process is killed, with which the run fails; but a replay server that is kept on disk is started again.
+    /// A process is killed, and the run fails. A replay server with its replay on disk is restarted instead.
     Kill(&'static str),
 }
 
-/// Settings of the second life.
+/// The settings of the second life, which is the resumed run.
 #[derive(Clone, Copy, Debug)]
 struct Change {
     frames: u64,
@@ -40,7 +40,7 @@ struct Change {
     actors: u32,
 }
 
-/// What a checkpoint says of the run.
+/// The counts of the run in a checkpoint.
 #[derive(Clone, Copy, Debug)]
 struct Saved {
     updates: u64,
@@ -48,10 +48,10 @@ struct Saved {
     rows: u64,
 }
 
-/// The newest checkpoint; none before the first.
+/// Reads the newest checkpoint; `None` before the first.
 fn saved(run: &RunFolder) -> Option<Saved> {
     let entries = fs::read_dir(run.path().join("checkpoints")).ok()?;
-    // What a kill has cut off is not a checkpoint.
+    // A checkpoint that a kill has cut off does not count.
     let whole = entries.map(|it| it.unwrap().path()).filter(|path| {
         let name = path.file_name().unwrap().to_str().unwrap();
         name.starts_with("checkpoint-") && !name.ends_with(".tmp")
@@ -68,9 +68,9 @@ fn saved(run: &RunFolder) -> Option<Saved> {
     })
 }
 
-/// Transitions that actors have delivered in all lives so far, by their own logs.
+/// Returns the transitions that actors have delivered in all lives so far, according to their logs.
 fn delivered(run: &RunFolder) -> u64 {
-    // A run in lockstep has none.
+    // A run in lockstep has no logs.
     let logs = fs::read_dir(run.path().join("logs")).into_iter().flatten();
     let logs = logs.map(|entry| entry.unwrap().path());
     let actors = logs.filter(|path| path.to_str().unwrap().contains("/actor"));
@@ -98,7 +98,7 @@ fn resume_once(seed: u64) {
         Stop::Kill("learner"),
         Stop::Kill("replay-server"),
     ];
-    // In lockstep there is one process.
+    // A run in lockstep has one process.
     let is_lockstep = store == "--lockstep";
     let kinds = if is_lockstep { 5 } else { stops.len() };
     let stop = *stops[..kinds].choose(&mut rng).unwrap();
@@ -150,7 +150,7 @@ fn resume_once(seed: u64) {
     }
     let ended = system.run_ok(&flags);
     let has_other_pace = change.rows != ROWS || change.ratio != RATIO;
-    // Where nothing was learned, nothing is behind it.
+    // Without an update before the resume, the run begins again.
     let is_fresh = before.updates == 0;
     let planned = |frames: u64| match has_other_pace && !is_fresh {
         true => before.updates + frames.saturating_sub(before.frames) * change.ratio / change.rows,
@@ -177,7 +177,7 @@ fn resume_once(seed: u64) {
         let counted = after.frames + replay.transitions_refilled;
         match (is_graceful, store) {
             (true, _) | (false, "") => assert_eq!(counted, before.frames + delivered, "{said}"),
-            // The log holds what came after the checkpoint, too.
+            // The replay's log also contains what came after the checkpoint.
             (false, _) => assert!(counted >= before.frames + delivered, "{said}"),
         }
         let is_refilled = replay.transitions_refilled > 0;
@@ -204,7 +204,7 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
         Stop::KillLauncher => process.signal(Signal::SIGKILL),
         Stop::KillAll => system.kill_all(),
         Stop::Kill(role) => {
-            // There is none before the launcher has started it, and after the run's end.
+            // The launcher may not have started the process yet, or the run may be over.
             let found = system.find_process_now(role);
             found.iter().for_each(|it| it.signal(Signal::SIGKILL));
         }

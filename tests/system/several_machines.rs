@@ -1,5 +1,5 @@
-//! A run whose processes are on separate machines, joined by a router: cables that are pulled, links that are narrow.
-//! Machines are network namespaces; without the right to make them the tests are skipped by name.
+//! A run whose processes are on separate machines, joined by a router: machines that are disconnected, links that are slow.
+//! The machines are network namespaces; without the privileges to make them, the tests are skipped by name.
 
 use std::{
     thread::sleep,
@@ -13,7 +13,7 @@ use serde_json::Value;
 
 use crate::system;
 
-/// What the preset `smoke` says.
+/// The values of the preset `smoke`.
 const WARMUP: u64 = 200;
 const ROWS: u64 = 16;
 
@@ -23,14 +23,14 @@ struct Run {
     network: Network,
     flags: String,
     ratio: u64,
-    /// Of each of [`MACHINES`], as far as they take part.
+    /// The processes on the first of the [`MACHINES`], in the same order.
     processes: Vec<Process>,
 }
 
 const MACHINES: [&str; 5] = ["server", "learner", "actor0", "actor1", "actor2"];
 
 impl Run {
-    /// None, and the test is skipped, where there can be no such network.
+    /// Starts a run. If the network cannot be made, returns `None` and reports the test as skipped.
     fn start(system: TestSystem, actors: usize, frames: u64, ratio: u64) -> Option<Self> {
         let network = Network::new(&MACHINES[..2 + actors])?;
         let flags = format!(
@@ -67,7 +67,7 @@ impl Run {
         self.system.start_process(&format!("{on} DRIML {args}"))
     }
 
-    /// The status of the run, fetched from the router; none while no process answers.
+    /// Requests the status of the run from the router; `None` while no process answers.
     fn status(&self) -> Option<Value> {
         let (on, endpoint) = (self.network.on("router"), self.endpoint());
         let status = format!("{on} DRIML status --json --connect {endpoint}");
@@ -86,7 +86,7 @@ impl Run {
         wait_until(&format!("{frames} frames"), || self.inserted() >= frames);
     }
 
-    /// Waits for the end of the run, which must be as if nothing had happened.
+    /// Waits for the end of the run, and checks that the counts are as if nothing had happened.
     fn check_end(mut self, patience: Duration) {
         let deadline = Instant::now() + patience;
         let status = loop {
@@ -114,7 +114,7 @@ impl Run {
         for actor in self.processes.drain(2..) {
             actor.wait_ok();
         }
-        // The learner, then the server.
+        // Stop the learner, then the server.
         for process in self.processes.into_iter().rev() {
             process.stop_ok();
         }
@@ -122,12 +122,12 @@ impl Run {
     }
 }
 
-/// An actor's cable is out for longer than a session's lease, the learner's and the server's meanwhile too. The others continue while
+/// An actor is disconnected for longer than a session's lease; meanwhile the learner and the server are, too. The others continue while
 /// they can.
 #[test]
 fn cut_cables_heal_by_themselves() {
     let system = system();
-    // However fast the machine is, the learner is not done before the last cut.
+    // Hold the learner, so that even on a fast machine it is not done before the last cut.
     system.hold_at(25_000);
     let Some(run) = Run::start(system, 2, 60_000, 8) else {
         return;
@@ -151,7 +151,7 @@ fn cut_cables_heal_by_themselves() {
     run.check_end(Duration::from_secs(300));
 }
 
-/// One actor behind 256 kbit/s: it and all others take part until the end.
+/// One actor has a link of 256 kbit/s. This actor and all other processes take part until the end.
 #[test]
 fn a_narrow_link_stops_no_process() {
     let Some(run) = Run::start(system(), 2, 16_000, 8) else {
@@ -171,7 +171,7 @@ fn a_narrow_link_stops_no_process() {
     run.check_end(Duration::from_secs(300));
 }
 
-/// Each process is cut off for 30 s, then for 90 s. By hand: it takes seven minutes.
+/// Disconnects each process for 30 s, then for 90 s. Run by hand: it takes seven minutes.
 #[test]
 #[ignore = "seven minutes: cargo nextest run --workspace --run-ignored only -E 'test(cut_off_for_long)'"]
 fn each_process_is_cut_off_for_long() {
@@ -191,7 +191,7 @@ fn each_process_is_cut_off_for_long() {
     run.check_end(Duration::from_secs(600));
 }
 
-/// Kills, freezes, cuts and restarts at random, from the seed in DRIML_FAULTS_SEED (1 if there is none), DRIML_FAULTS of them (200).
+/// Kills, suspends, disconnects and restarts at random: DRIML_FAULTS faults (default 200) with the seed DRIML_FAULTS_SEED (default 1).
 #[test]
 #[ignore = "a quarter of an hour: cargo nextest run --workspace --run-ignored only -E 'test(random_faults)'"]
 fn random_faults_lose_nothing() {

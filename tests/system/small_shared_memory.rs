@@ -1,5 +1,5 @@
-//! Shared memory of which there is too little, at the start or later: a run says so once, goes through sockets, and ends well.
-//! A small `/dev/shm` takes root's rights to mount; without them a line says what is skipped.
+//! Too little shared memory, at the start or later: a run warns once, sends its messages through sockets, and succeeds.
+//! Mounting a small `/dev/shm` needs root; without root the tests are skipped by name.
 
 use std::process::Command;
 
@@ -8,8 +8,8 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, chain, disk_full::fill, system};
 
-/// A call of the program in which it and its children have a `/dev/shm` of this size; none, and a line that the test is skipped, if that is
-/// not permitted.
+/// Returns a call of the program that gives it and its children a `/dev/shm` of this size. If that is not permitted, returns `None` and
+/// reports the test as skipped.
 fn with_shared_memory(size: &str, call: &str) -> Option<String> {
     let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm");
     let mut tried = Command::new("unshare");
@@ -18,7 +18,7 @@ fn with_shared_memory(size: &str, call: &str) -> Option<String> {
         .then(|| format!("unshare -m sh -c '{mount} && exec \"$0\" \"$@\"' DRIML {call}"))
 }
 
-/// How often it was said that there is too little, or that what was sent so does not arrive.
+/// Returns the number of warnings that there is too little, or that messages sent through shared memory do not arrive.
 fn warnings(ended: &Ended) -> usize {
     let lines = ended.stderr.lines();
     lines.filter(|line| line.contains("shared memory")).count()
@@ -26,7 +26,7 @@ fn warnings(ended: &Ended) -> usize {
 
 #[test]
 fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
-    // zenoh alone takes 1.3 MB of each process.
+    // zenoh alone takes 1.3 MB for each process.
     for (size, actors, enough) in [
         ("512k", 2, false),
         ("1m", 2, false),
@@ -66,7 +66,7 @@ fn a_run_continues_when_others_fill_it_up() {
     let mut process = system.start(&run);
     let client = system.connect();
     client.wait_for_updates(100);
-    // One that starts when it is full warns, too.
+    // Wait for all processes, because one that starts when shared memory is full warns, too.
     client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
     fill(format!("/proc/{}/root/dev/shm/filler", process.pid()));
     let then = client.learner().unwrap().updates;

@@ -1,5 +1,5 @@
-//! A long run at a closed limiter, with actors that join, leave and die all the time: nothing of it grows.
-//! By hand; it lasts as long as `DRIML_SOAK_MINUTES` says, an hour if there is none.
+//! A long run at a closed limiter, with actors that join, leave and die all the time: memory, files and threads do not grow.
+//! Run by hand; it lasts `DRIML_SOAK_MINUTES` minutes, by default an hour.
 
 use std::{
     fs,
@@ -13,10 +13,10 @@ use rand::{Rng, SeedableRng, rngs::StdRng};
 use crate::system;
 
 const ACTORS: usize = 32;
-/// Time before the first look: buffers fill, and as many actors have come and gone as may send through shared memory.
+/// The time before the first measurement: buffers fill, and as many actors come and go as may send through shared memory.
 const WARM: Duration = Duration::from_secs(300);
 
-/// What a process holds.
+/// The resources that a process holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Held {
     rss_kib: u64,
@@ -69,7 +69,7 @@ fn nothing_grows() {
             let look = (
                 held(&system, "replay-server"),
                 held(&system, "learner"),
-                // Segments of shared memory on this machine, other runs' too.
+                // Segments of shared memory on this machine, including those of other runs.
                 fs::read_dir("/dev/shm").unwrap().count(),
             );
             note(&format!("after {:?}: {look:?}", started.elapsed()));
@@ -83,7 +83,7 @@ fn nothing_grows() {
     ));
     let (first, last) = (looks[0], looks[looks.len() - 1]);
     for (before, after) in [(first.0, last.0), (first.1, last.1)] {
-        // A tenth and 8 MiB: the allocator's pools fill unevenly.
+        // Allow a tenth and 8 MiB, because the allocator's pools fill unevenly.
         let most = before.rss_kib * 11 / 10 + 8 * 1024;
         assert!(after.rss_kib < most, "{before:?}, then {after:?}");
         assert!(

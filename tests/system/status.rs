@@ -1,5 +1,5 @@
-//! `driml status`: what it prints of a run in which a process is missing, gone, suspended or done.
-//! What processes log while they wait is here too.
+//! `driml status`: its output for a run in which a process is missing, gone, suspended or done.
+//! The messages that processes log while they wait are tested here, too.
 
 use std::fs;
 
@@ -12,7 +12,7 @@ fn status(system: &TestSystem) -> String {
     system.run_ok(&system.connected("status")).stdout
 }
 
-/// Asks until the answer holds all of `words`.
+/// Requests the status until it contains all of `words`.
 fn wait_for_status(system: &TestSystem, words: &[&str]) -> String {
     wait_for(&format!("{words:?} in the status"), || {
         let said = status(system);
@@ -31,7 +31,7 @@ fn missing_processes_are_named_with_what_to_do() {
     let act = format!("no actor has joined: start `driml actor --connect {endpoint} --id N`");
     let words = ["chain, c51: frames 0/", &learn, &act];
     check_has(&status(&system), &words);
-    // It says so itself.
+    // The server also logs this itself.
     server.wait_for_stderr("no learner has joined yet, waiting since");
 
     let mut learner = system.start_learner("run");
@@ -98,7 +98,7 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     system.refuses("status --run nowhere", "nowhere is not the folder of a run");
 }
 
-/// Its launcher still plays the last checkpoint; no other process is left.
+/// The launcher still plays the last checkpoint; no other process is left.
 #[test]
 fn a_run_that_is_ending_is_no_riddle() {
     let system = system();

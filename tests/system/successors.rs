@@ -1,14 +1,14 @@
-//! A learner that ends, however it ends, has saved what it learned; one that comes after it makes the updates that were planned.
-//! How the launcher sees it is in `failures` and `resume`.
+//! A learner that exits in order saves its updates; the successor of any learner makes the updates that were planned.
+//! `failures` and `resume` test such learners with the launcher.
 
 use driml_tests::{Client, Process, TestSystem};
 
 use crate::{LONG, SHORT, chain, system};
 
-/// Versions that a learner may have named and not sent when it is killed.
+/// The number of versions that a learner may have reported and not sent when it is killed.
 const UNSENT_MAX: u64 = 5;
 
-/// A learner that was killed between two checkpoints has forgotten updates; its successor makes them again.
+/// A learner that was killed between two checkpoints loses updates; its successor makes them again.
 #[test]
 fn killed_learners_cost_no_update_of_the_plan() {
     let system = system();
@@ -16,27 +16,27 @@ fn killed_learners_cost_no_update_of_the_plan() {
     let server = system.start_replay_server(&format!(
         "--agent driml-ada {longer} --set learner.checkpoint_period_updates=200"
     ));
-    // Between two checkpoints: whether one is saved before the kill does not depend on who is faster.
+    // Hold the learner between two checkpoints: whether it saves one before the kill must not depend on who is faster.
     system.hold_at(390);
     let mut learner = system.start_learner("run");
     let actor = system.start_actor(0);
     let client = system.connect();
     let (mut version, mut forgotten) = (0, 0);
-    // Each learner is held at the first number, and its successor, which begins at the checkpoint, at the second.
+    // Each learner is held at the first number of updates; its successor, which starts from the checkpoint, at the second.
     for (updates, successor) in [(390, 300), (300, 250), (250, 225)] {
         let killed = client.wait_for_learner("updates", |it| it.updates == updates);
         learner.kill();
         system.hold_at(successor);
         learner = system.start_learner("run");
         let next = client.wait_for_learner("the successor", |it| it.weights_version > version);
-        // A learner names a version when it hands it over: the last ones may not have left the one that was killed, and what
-        // no actor has seen may come again. Its checkpoint's version is far below.
+        // A learner reports a version when it queues it: a killed learner may not have sent the last ones, and versions that no actor has
+        // seen may come again. The version in its checkpoint is far lower.
         assert!(
             next.weights_version + UNSENT_MAX > killed.weights_version,
             "actors take the successor's weights: {killed:#?} {next:#?}"
         );
         version = next.weights_version;
-        // Versions of A count updates: it is the successor's that is in use.
+        // The version of an affinity counts updates, so the successor's affinity is in use.
         let replay = client.wait_for_replay("the successor's affinity", |replay| {
             (200..killed.updates).contains(&replay.affinity_version)
         });
@@ -54,14 +54,14 @@ fn killed_learners_cost_no_update_of_the_plan() {
     drop(client);
     server.stop_ok();
 
-    // What is in the folder is another run's to a run with other settings.
+    // A run with other settings cannot resume from the checkpoint in the folder.
     let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let learner = system.start_learner("run");
     learner.fails("resume with the settings it was made with");
     server.stop_ok();
 }
 
-/// A run by hand whose learner has made more than 75 updates since its last checkpoint.
+/// Starts a run by hand, and waits until the learner has made more than 75 updates; the first checkpoint is due after 1,000.
 fn between_checkpoints(system: &TestSystem, flags: &str) -> (Process, Process, Client) {
     let server = system.start_replay_server(&format!(
         "--agent c51 {LONG} --set learner.checkpoint_period_updates=1000 {flags}"
@@ -85,14 +85,14 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     assert!(system.run_folder("run").saved_updates() > 75);
 }
 
-/// A new replay server at the same endpoint knows nothing of the run: actors and learner of before exit, and a learner with the run's
+/// A new replay server at the same endpoint knows nothing of the run: the old actors and learner exit, and a learner with the run's
 /// checkpoint resumes the run's counts.
 #[test]
 fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let system = system();
     let (server, learner, client) = between_checkpoints(&system, "");
     let actor = system.start_actor(1);
-    // One without weights would wait for these, and learn nothing of a new server.
+    // An actor without weights would wait for them, and not notice the new server.
     client.wait_for_replay("a second actor", |replay| {
         (replay.actors, replay.actors_acting) == (1, 2)
     });
@@ -120,8 +120,8 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     }
 }
 
-/// A learner without a checkpoint of the run: where updates were learned it is rejected with a sentence, unless it is told to restart;
-/// a finished run admits no learner.
+/// If the run has made updates, a learner without its checkpoint is rejected with a clear message, unless it is told to restart. A finished
+/// run admits no learner.
 #[test]
 fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let system = system();

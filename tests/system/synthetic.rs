@@ -1,5 +1,5 @@
-//! An actor without a world: numbered transitions through the real delivery, each an episode of its own whose return is its number.
-//! And a learner without a network, which fetches batches as the real one does. What becomes of them is for the tests that start them.
+//! An actor without a world: it sends numbered transitions through the real delivery; each is an episode whose return is its number. A
+//! learner without a network fetches batches as the real one does. The tests that start them check the results.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use driml_actor::{Delivery, DeliveryLimits};
 use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End, RunClient, Shutdown};
 
-/// How long a batch and an answer are waited for.
+/// The time-out of a batch and of a reply.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 pub(crate) struct SyntheticLearner {
@@ -15,7 +15,7 @@ pub(crate) struct SyntheticLearner {
 }
 
 impl SyntheticLearner {
-    /// One that asks these replay servers, each for a shard, for batches of `rows`, so many at a time.
+    /// Starts a learner that requests batches of `rows` rows from these replay servers, one per shard, `in_flight` at a time.
     pub(crate) fn start(clients: &[RunClient], learner: u64, rows: u32, in_flight: u32) -> Self {
         let requests = Requests {
             learner,
@@ -31,7 +31,7 @@ impl SyntheticLearner {
         }
     }
 
-    /// The next batch; none at the end of the run.
+    /// Returns the next batch; `None` at the end of the run.
     pub(crate) fn next(&mut self) -> Option<Served> {
         match self.source.next(PATIENCE).unwrap() {
             Next::Batch(served) => Some(*served),
@@ -51,7 +51,7 @@ pub(crate) struct SyntheticActor {
 }
 
 impl SyntheticActor {
-    /// One whose chunks all look like `first`.
+    /// Starts an actor whose chunks all look like `first`.
     pub(crate) fn start(
         run: RunClient,
         first: ChunkHeader,
@@ -65,7 +65,7 @@ impl SyntheticActor {
         }
     }
 
-    /// Sends the next chunk; `number` is that of the actor's first transition of all.
+    /// Sends the next chunk. `number` is the number of the very first transition of the actor.
     pub(crate) fn send(&mut self, number: u64) {
         let mut chunk = Chunk::zeroed(self.next);
         for row in 0..self.next.transitions() {
@@ -77,7 +77,7 @@ impl SyntheticActor {
         assert!(self.delivery.send(chunk));
     }
 
-    /// Delivers what it has, and gives the number of its transitions.
+    /// Delivers the remaining chunks, and returns the number of transitions sent.
     pub(crate) fn finish(self) -> u64 {
         assert_eq!(self.delivery.finish().unwrap(), 0);
         self.next.first_transition

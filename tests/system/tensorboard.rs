@@ -1,5 +1,5 @@
-//! `driml local --tensorboard`: event files as TensorBoard itself reads them, beside the rows of `metrics.csv`.
-//! That records are whole and right by their sums is tested where they are written.
+//! `driml local --tensorboard`: event files as TensorBoard itself reads them, compared with the rows of `metrics.csv`.
+//! The framing and checksums of records are tested beside the code that writes them.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use crate::system;
 
-/// Prints what TensorBoard finds in a folder: points of curves, histograms, sizes of pictures.
+/// A script that prints what TensorBoard finds in a folder: points of curves, histograms, sizes of pictures.
 const READ: &str = "
 import json, sys
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -26,7 +26,7 @@ print(json.dumps({
 }))
 ";
 
-/// The columns of `metrics.csv`, empty cells left out: frames and value.
+/// Returns the columns of `metrics.csv` without empty cells, as pairs of frames and value.
 fn columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
     let metrics = system.run_folder("run").table("metrics.csv");
     let mut columns = BTreeMap::<_, Vec<_>>::new();
@@ -48,7 +48,7 @@ fn read(python: &str, system: &TestSystem) -> Value {
     serde_json::from_str(&run(python, &["-c", READ], &[&folder])).unwrap()
 }
 
-/// Every number of the rows is a point of the curve of its name, and there are no others.
+/// Checks that each number in the rows is a point of the curve with its name, and that there are no other points.
 fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
     let curves = read["scalars"].as_object().unwrap();
     let names: Vec<_> = curves

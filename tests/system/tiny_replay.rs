@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use driml_protocol::{ActorJoin, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec};
 use driml_replay_server::{Config, Replay};
 
-/// Frames of 4 x 4 bytes that are not stacked.
+/// Returns a run spec with frames of 4 x 4 bytes that are not stacked.
 pub(crate) fn spec(agent: &str, horizon: Horizon) -> RunSpec {
     RunSpec {
         world: "chain".into(),
@@ -18,7 +18,7 @@ pub(crate) fn spec(agent: &str, horizon: Horizon) -> RunSpec {
     }
 }
 
-/// One shard of `transitions`, each sampled once; as many may come before any is sampled.
+/// Returns a config of one shard of `transitions`, each sampled once. The shard can be filled before any is sampled.
 pub(crate) fn config(transitions: u64) -> Config {
     Config {
         replay_ratio: 1.0,
@@ -30,7 +30,7 @@ pub(crate) fn config(transitions: u64) -> Config {
 /// The incarnation of every actor.
 const INCARNATION: u64 = 1;
 
-/// Lets an actor take part.
+/// Lets an actor join.
 pub(crate) fn join(replay: &mut Replay, actor: u32) {
     let join = ActorJoin {
         actor,
@@ -39,7 +39,7 @@ pub(crate) fn join(replay: &mut Replay, actor: u32) {
     replay.join_actor(join).unwrap();
 }
 
-/// The first chunk of an actor of any run.
+/// Returns the header of the first chunk of an actor in a run with this spec.
 pub(crate) fn header(spec: &RunSpec, actor: u32, streams: u32, steps: u32) -> ChunkHeader {
     ChunkHeader {
         actor,
@@ -51,7 +51,7 @@ pub(crate) fn header(spec: &RunSpec, actor: u32, streams: u32, steps: u32) -> Ch
     }
 }
 
-/// An actor's chunk of `steps` steps of one environment, all zeroes; the ones before it were as long.
+/// Returns an actor's chunk of `steps` steps of one environment, all zeros; earlier chunks have the same length.
 pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Chunk {
     Chunk::zeroed(ChunkHeader {
         sequence,
@@ -60,7 +60,7 @@ pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Ch
     })
 }
 
-/// The returns of the rows of so many batches, as numbers: of transitions that are episodes of their own, their rewards.
+/// Returns the returns in the rows of `batches` batches, as integers. If transitions are whole episodes, these are their rewards.
 pub(crate) fn numbers(replay: &mut Replay, batches: u64, rows: u32) -> BTreeSet<u64> {
     let mut numbers = BTreeSet::new();
     let mut request = RequestId::first(1);

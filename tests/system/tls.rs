@@ -1,5 +1,5 @@
 //! Mutual TLS in QUIC: files that cannot be used, and clients that are not admitted.
-//! Runs over it are in `by_hand` and `local`, what each role may do in `refusals::roles`.
+//! Runs over TLS are in `by_hand` and `local`; the permissions of each role are in `refusals::roles`.
 
 use std::time::{Duration, Instant};
 
@@ -8,15 +8,15 @@ use zenoh::{Session, Wait};
 
 use crate::{LONG, system};
 
-/// How soon a rejection is reported, on a busy machine too.
+/// The time within which a rejection must be reported, on a busy machine too.
 const SECONDS: Duration = Duration::from_secs(30);
 
-/// Good certificates in another folder, to be spoiled there.
+/// Copies the good certificates to another folder, where a test can make them invalid.
 fn spoiled(system: &TestSystem, name: &str) -> Certificates {
     system.certificates().copy(system.path(name))
 }
 
-/// A stranger in the place of a replay server.
+/// Opens the session of a stranger that listens in place of a replay server.
 fn listen_raw(endpoint: &str, certificates: &Certificates, role: &str) -> Session {
     let own = raw_tls("listen", certificates, Some(role));
     open_raw(&[
@@ -27,7 +27,7 @@ fn listen_raw(endpoint: &str, certificates: &Certificates, role: &str) -> Sessio
     .unwrap()
 }
 
-/// Opens a session with zenoh alone, without any check of ours; as a client it gives up soon.
+/// Opens a session with zenoh alone, without driml's checks. As a client, the session gives up soon.
 fn open_raw(settings: &[(&str, String)]) -> zenoh::Result<Session> {
     let mut config = zenoh::Config::default();
     for (key, value) in [
@@ -132,7 +132,7 @@ fn strangers_at_a_replay_server() {
         ("transport/link/tls", learner),
     ]);
     assert!(accepted.is_ok(), "else what is below says nothing");
-    // Each takes as long as it may to give up.
+    // Each attempt lasts until its time-out.
     at_once(attempts, |(name, certificates, role)| {
         let opened = open_raw(&[
             ("connect/endpoints", format!("[{endpoint:?}]")),
@@ -141,21 +141,21 @@ fn strangers_at_a_replay_server() {
         assert!(opened.is_err(), "a certificate that is {name}");
     });
     server.wait_for_stderr("QUIC acceptor failed: ");
-    // Without QUIC, at whose port nothing listens.
+    // An endpoint without QUIC: nothing listens at this TCP port.
     let plain = system.endpoint().replace("quic/", "tcp/");
     let started = Instant::now();
     let why = "One with --tls-dir is reached with quic/HOST:PORT";
     system.fails(&format!("actor --connect {plain}"), why);
     assert!(started.elapsed() < SECONDS);
 
-    // Who is let in is not disturbed.
+    // The strangers do not disturb admitted processes.
     let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
     observer.wait_for_updates(10);
     actor.stop_ok();
     learner.stop_ok();
 }
 
-/// A process does not follow a stranger in the place of its replay server, and names the endpoint.
+/// A process does not join a stranger in place of its replay server, and names the endpoint.
 #[test]
 fn strangers_in_the_place_of_a_replay_server() {
     let Some(system) = system().over_tls() else {

@@ -1,5 +1,5 @@
-//! `driml watch`: what is shown and recorded of runs that others have started, without disturbing them.
-//! What `driml status` says of a run is in `status`.
+//! `driml watch`: shows and records runs that others have started, without disturbing them.
+//! `driml status` is tested in `status`.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,10 +21,10 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let client = system.connect();
     let watch = system.start(&system.connected("watch --run-dir run --tensorboard"));
     wait_until("the folder", || system.path("run/metrics.csv").exists());
-    // They begin together, with the first weights: one that came late would play hardly an episode.
+    // Both actors start together, with the first weights: an actor that starts late would play hardly an episode.
     let actors = [system.start_actor(0), system.start_actor(1)];
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
-    // Into the same folder, which is then as good as a launched run's.
+    // The learner writes into the same folder, which is then as complete as that of a launched run.
     let learner = system.start_process(&system.connected("learner --run-dir run"));
     watch
         .wait_ok()
@@ -36,7 +36,7 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let watched = system.run_folder("run");
     let summary = watched.check_finished();
     assert_eq!((summary.frames, summary.updates), (1280, 540));
-    // Who played each episode, and that all of each was seen: what is missing to all frames is still being played.
+    // Check who played each episode, and that each was seen completely: frames outside these episodes are of episodes still being played.
     let episodes = watched.episodes();
     let who: BTreeSet<_> = episodes.iter().map(|it| (it.actor, it.env)).collect();
     let expected = (0..2).flat_map(|actor| (0..4).map(move |env| (actor, env)));
@@ -70,7 +70,7 @@ fn a_launched_run_is_watched_and_continues_without() {
     let before = rows();
     assert!(!system.path("seen/summary.json").exists());
 
-    // Where its launcher writes, no other process does; and another run's folder is not this one's.
+    // No other process may write where the launcher writes, and a folder holds only one run.
     system.run_ok(&format!("local --agent c51 {SHORT} --run-dir other"));
     system.refuses_each(
         "
@@ -143,7 +143,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     assert_eq!(said["healthy"], true);
     assert_eq!(said["finished"], true);
     assert_eq!(said["losses"].as_object().unwrap().len(), 1);
-    // The page for persons is that of `driml status`.
+    // The text output is that of `driml status`.
     system
         .run_ok(&look)
         .expect_printed("the run is over: everything is learned and saved");
@@ -158,7 +158,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     );
     assert_eq!(labels["endpoint"], system.endpoint());
     assert_eq!(of("driml_updates_total").2, 540.0);
-    // JSON's reader may be off by a last place.
+    // The JSON parser may be off by the last digit.
     let (found, said) = (of("driml_mean_return").2, &said["mean_return"]);
     assert!((found - said.as_f64().unwrap()).abs() < 1e-12, "{found}");
     assert_eq!(of("driml_finished").2, 1.0);
@@ -172,7 +172,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     drop(server);
 }
 
-/// Name, labels and value of each sample; panics at what Prometheus' text format does not allow.
+/// Returns name, labels and value of each sample. Panics if the text is not in Prometheus' text format.
 fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> {
     assert!(text.ends_with('\n'));
     let (mut families, mut samples) = (BTreeSet::new(), Vec::new());

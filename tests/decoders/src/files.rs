@@ -5,13 +5,13 @@ use driml_learner::{LearnerConfig, checkpoint};
 use driml_protocol::config::Settings;
 use driml_settings::config::RunConfig;
 
-/// A checkpoint's `state.json`.
+/// Reads a checkpoint's `state.json`.
 pub(crate) fn state(bytes: &[u8]) {
-    // What it says is for a person.
+    // An error is a valid result; its text is for people.
     let _ = checkpoint::check_state(bytes);
 }
 
-/// A run's settings, as the components and the program read them. Accepted settings are written back unchanged.
+/// Reads a run's settings as the components and the program do. Accepted settings are written back unchanged.
 pub(crate) fn config(bytes: &[u8]) {
     let Ok(text) = str::from_utf8(bytes) else {
         return;

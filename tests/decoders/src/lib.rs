@@ -1,9 +1,9 @@
-//! What reads messages, settings, checkpoints and logs, as functions of bytes alone: what fuzzers and the bounded runs in CI call.
-//! None may panic, whatever the bytes; what is read must be written back unchanged.
-//! Not among them: weights (safetensors) and the line in which a world declares itself.
+//! The decoders of messages, settings, checkpoints and logs, as functions of bytes alone, for fuzzers and for bounded runs in CI.
+//! No bytes may make a decoder panic, and it must write back unchanged what it reads.
+//! Weights (safetensors) and the line in which a world declares itself are not covered.
 //!
-//! A new decoder is a function here, a line in [`ALL`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test holds that none
-//! of these is forgotten.
+//! A new decoder needs a function here, a line in [`ALL`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test checks that none of
+//! these is missing.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,7 +18,7 @@ mod segments;
 pub use messages::forged;
 pub use segments::{held, highest_ordinal, logs};
 
-/// One decoder: its name, and what is to be tried with some bytes.
+/// One decoder: its name, and the function that tries it on some bytes.
 pub type Decoder = (&'static str, fn(&[u8]));
 
 /// Every decoder.

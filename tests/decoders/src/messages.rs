@@ -1,4 +1,4 @@
-//! Messages: as they come, and with a prefix that fits, so that what is behind the checksum is reached.
+//! Messages: arbitrary bytes, and bytes after a valid prefix, so that the code behind the checksum is reached.
 
 use std::{fmt::Debug, io::Read as _};
 
@@ -12,13 +12,13 @@ use driml_protocol::{
 
 use crate::segments::mend_message;
 
-/// The hash of the run that these messages are of.
+/// The hash of the run spec in these messages.
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
 /// Reads bytes as one type of message.
 type Read = fn(&[u8]);
 
-/// Reads a message in one piece and in several; both ways agree, and what is read is written back unchanged.
+/// Reads a message in one piece and in several. Both ways must agree, and the message must be written back unchanged.
 fn read<M: Message + Debug>(bytes: &[u8]) {
     let whole = codec::decode::<M>(bytes, Some(SPEC));
     let (first, second) = bytes.split_at(bytes.len() / 3);
@@ -29,7 +29,7 @@ fn read<M: Message + Debug>(bytes: &[u8]) {
             assert_eq!(payload, &copy[..]);
             let again = codec::encode(SPEC, &message, payload).unwrap();
             let (back, _) = codec::decode::<M>(&again, Some(SPEC)).unwrap();
-            // By their text, as a NaN is not equal to itself.
+            // Compare the texts, because a NaN does not equal itself.
             assert_eq!(format!("{back:?}"), format!("{message:?}"));
             assert_eq!(format!("{same:?}"), format!("{message:?}"));
         }
@@ -55,14 +55,14 @@ fn read_batch(bytes: &[u8]) {
     read::<BatchReply>(bytes);
     let reply = codec::decode::<BatchReply>(bytes, Some(SPEC)).ok();
     if let Some((BatchReply::Batch(header), payload)) = reply {
-        // Its counts of states may not be those of its rows.
+        // The counts of states in the header may contradict the rows.
         let Ok(batch) = Batch::from_payload(header, payload.to_vec().into()) else {
             return;
         };
         assert_eq!(batch.n_step_returns().len(), batch.rows());
         let bytes = |states: u32| states as usize * header.state_bytes as usize;
         let planes = [header.rows, header.states_k, header.states_n].map(bytes);
-        // Few frames may be many states.
+        // A few frames can make many states.
         if planes.iter().sum::<usize>() < 1 << 20 {
             let states = [batch.states_t(), batch.states_k(), batch.states_n()];
             assert_eq!(states.map(|states| states.len()), planes);
@@ -116,12 +116,12 @@ fn read_status(bytes: &[u8]) {
     }
 }
 
-/// Bytes as they come, read as each kind of message.
+/// Reads arbitrary bytes as each kind of message.
 pub(crate) fn wire(bytes: &[u8]) {
     KINDS.iter().for_each(|(_, read)| read(bytes));
 }
 
-/// A message with a good prefix: one byte chooses the kind, two are the header's length, the rest is header and payload.
+/// Reads a message with a valid prefix: one byte chooses the kind, two are the header's length, the rest is header and payload.
 pub(crate) fn messages(bytes: &[u8]) {
     let Some((&[kind, low, high], rest)) = bytes.split_first_chunk() else {
         return;
@@ -139,7 +139,7 @@ pub(crate) fn messages(bytes: &[u8]) {
     read(&message);
 }
 
-/// What the decoder `messages` takes, of a message's bytes.
+/// Converts the bytes of a message to input of the decoder `messages`.
 pub fn forged(message: &[u8]) -> Vec<u8> {
     let kind = u16::from_le_bytes([message[6], message[7]]);
     let at = KINDS.iter().position(|(known, _)| *known as u16 == kind);

@@ -1,4 +1,4 @@
-//! Well-formed messages in any order and with any numbers, to the core of a replay server: none breaks what it holds.
+//! Well-formed messages in any order and with any numbers, sent to the core of a replay server: none breaks its state.
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, ChunkPoll, End, Horizon, InsertReply, Learned,
@@ -7,7 +7,7 @@ use driml_protocol::{
 };
 use driml_replay_server::{Config, Replay};
 
-/// Rows drawn by priority.
+/// Draws rows by priority.
 const PRIORITISED: Sampling = Sampling::Prioritised {
     alpha: 0.5,
     beta_start: 0.4,
@@ -15,12 +15,12 @@ const PRIORITISED: Sampling = Sampling::Prioritised {
     beta_updates: 1,
 };
 
-/// Actions of [`spec`].
+/// The number of actions in [`spec`].
 pub(crate) const ACTIONS: u32 = 3;
-/// Messages of one try.
+/// The most messages in one execution.
 const MESSAGES_MAX: usize = 64;
 
-/// The bytes that are left, as numbers.
+/// Reads numbers from the remaining bytes.
 struct Numbers<'a>(&'a [u8]);
 
 impl Numbers<'_> {
@@ -30,7 +30,7 @@ impl Numbers<'_> {
         Some(first)
     }
 
-    /// Small ones most of the time, and those at the edges.
+    /// Returns a small number most of the time, else one at an edge or any number.
     fn count(&mut self) -> Option<u64> {
         Some(match self.byte()? {
             small @ 0..=199 => u64::from(small % 16),
@@ -53,7 +53,7 @@ impl Numbers<'_> {
     }
 }
 
-/// A run whose frames are of so many bytes.
+/// Returns the spec of a run with frames of `frame_bytes` bytes.
 pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     RunSpec {
         agent: "driml-ada".into(),
@@ -67,7 +67,7 @@ pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     }
 }
 
-/// Sends the messages that the bytes say, one after the other.
+/// Sends the messages that the bytes encode, one after the other.
 pub(crate) fn replay(bytes: &[u8]) {
     let mut numbers = Numbers(bytes);
     let Some(byte) = numbers.byte() else {
@@ -136,7 +136,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
                 number: numbers.count()?,
                 attempt: numbers.count()?,
             };
-            // The service serves no more rows than the run's batches have.
+            // The service never serves more rows than the run's batches have.
             let rows = numbers.count()?.min(64) as u32;
             let drawn = replay.draw_for(id, rows, driml_protocol::Buffer::zeroed);
             if let Ok(batch) = drawn {

@@ -1,5 +1,5 @@
-//! The replay's segments on disk, in any state: the server starts or says why not, what it serves was stored, and it comes back.
-//! That every row is right to the last field is for the replay server's own tests: here the bytes decide what was stored.
+//! The replay's segments on disk, in any state: the server starts or reports why not, serves only what was stored, and starts again.
+//! The replay server's own tests check every field of a row. Here the bytes decide what was stored.
 
 use std::{
     collections::HashSet,
@@ -16,20 +16,20 @@ use driml_replay_server::{Config, PersistArgs, Replay};
 
 use crate::replay::{self, ACTIONS};
 
-/// Bytes of a frame: its number, which is never 0.
+/// The size of a frame in bytes. A frame is its number, which is never 0.
 const FRAME_BYTES: usize = 4;
-/// Rows of a batch.
+/// The number of rows in a batch.
 const ROWS: u32 = 4;
-/// Batches that are drawn from what came back.
+/// The number of batches drawn from a recovered replay.
 const BATCHES: u64 = 8;
-/// Segments of one try.
+/// The most segments in one execution.
 const SEGMENTS_MAX: usize = 8;
-/// Transitions that are held.
+/// The capacity of the replay, in transitions.
 const CAPACITY: u64 = 64;
-/// From this size on, a segment is followed by another.
+/// The size from which a segment is followed by another, in bytes.
 const SEGMENT_BYTES: u64 = 700;
 
-/// A record's head: where its fields are, and how long it is.
+/// The positions of the fields in a record's head, and the length of the head.
 const KIND: Range<usize> = 4..8;
 const BODY_BYTES: Range<usize> = 16..24;
 const CHECKED_BYTES: Range<usize> = 24..28;
@@ -37,7 +37,7 @@ const RECORD_SUM: Range<usize> = 28..32;
 const HEAD_BYTES: usize = 32;
 /// The kind of a record that holds a chunk.
 const CHUNK: u32 = 3;
-/// A message's prefix: the lengths of its header and payload, and its checksum.
+/// The positions in a message's prefix of the length of the header, the length of the payload, and the checksum.
 const HEADER_BYTES: Range<usize> = 16..20;
 const PAYLOAD_BYTES: Range<usize> = 20..28;
 const MESSAGE_SUM: Range<usize> = 28..32;
@@ -57,7 +57,7 @@ fn open(dir: &Path) -> Result<Replay, String> {
         mark: None,
     };
     let config = Config {
-        // Without a thread.
+        // With 0 there is no thread that flushes.
         fsync_ms: Some(0),
         ..Config::unlimited(CAPACITY)
     };
@@ -66,19 +66,19 @@ fn open(dir: &Path) -> Result<Replay, String> {
         .map_err(|e| e.to_string())
 }
 
-/// A folder in memory if there is such a place: whether a real disk keeps what it was given is not what is tried.
+/// Creates a folder, in memory if possible, because these tests do not check that a real disk keeps its data.
 fn folder() -> tempfile::TempDir {
     let memory = tempfile::tempdir_in("/dev/shm");
     memory.or_else(|_| tempfile::tempdir()).unwrap()
 }
 
-/// The file of segment `number`.
+/// Returns the file of segment `number`.
 fn path(dir: &Path, number: usize) -> PathBuf {
     dir.join(format!("segment-{number:012}.log"))
 }
 
-/// A folder with the segments that the bytes hold: a byte of which the lowest bit says whether the checksums are to be mended, the
-/// number of the first, then each segment after its length in two bytes.
+/// Opens a replay from the segments in `bytes`. The lowest bit of the first byte says whether to repair the checksums. Then come the number
+/// of the first segment, and each segment after its length in two bytes.
 pub(crate) fn segments(bytes: &[u8]) {
     let Some((&[mode, first], rest)) = bytes.split_first_chunk() else {
         return;
@@ -103,7 +103,7 @@ pub(crate) fn segments(bytes: &[u8]) {
     drop(replay);
     let mut replay = open(dir.path()).unwrap();
     assert_eq!(replay.stored_bytes().unwrap(), before);
-    // It works again.
+    // The reopened replay still works.
     let actor = 1000;
     let join = ActorJoin {
         actor,
@@ -140,7 +140,7 @@ fn draw(replay: &mut Replay, stored: &HashSet<Step>) {
     }
 }
 
-/// The segments that the bytes hold.
+/// Splits the bytes into segments.
 fn split(mut bytes: &[u8]) -> Vec<Vec<u8>> {
     let mut all = Vec::new();
     while let Some((length, rest)) = bytes.split_first_chunk()
@@ -168,14 +168,14 @@ fn add_stored(bytes: &[u8], stored: &mut HashSet<Step>) {
 }
 
 fn add_chunk(chunk: &Chunk, stored: &mut HashSet<Step>) {
-    // One of another world, whose frames do not fit.
+    // The frames may not fit if the chunk is of another world.
     let frames = chunk.frames().chunks_exact(FRAME_BYTES);
     for (frame, &action) in frames.zip(chunk.actions()) {
         stored.insert((*frame.first_chunk().unwrap(), action));
     }
 }
 
-/// Length of the message that begins here, if it is all there.
+/// Returns the length of the message that begins here, if it is complete.
 fn message_bytes(bytes: &[u8]) -> Option<usize> {
     let prefix = bytes.get(..codec::PREFIX_BYTES)?;
     let header = number(&prefix[HEADER_BYTES]);
@@ -185,13 +185,13 @@ fn message_bytes(bytes: &[u8]) -> Option<usize> {
     (length <= bytes.len()).then_some(length)
 }
 
-/// A number of up to 8 bytes, little-endian.
+/// Reads a little-endian number of up to 8 bytes.
 fn number(bytes: &[u8]) -> usize {
     let number = |sum: u64, &byte: &u8| sum << 8 | u64::from(byte);
     usize::try_from(bytes.iter().rev().fold(0, number)).unwrap_or(usize::MAX)
 }
 
-/// Makes the lengths and checksums of all records right, and those of the chunks in them, so that what is behind them is reached.
+/// Repairs the lengths and checksums of all records and of the chunks in them, so that the code behind these checks is reached.
 fn mend(segment: &mut [u8]) {
     let mut at = 0;
     while segment.len() - at >= HEAD_BYTES {
@@ -213,7 +213,7 @@ fn mend(segment: &mut [u8]) {
     }
 }
 
-/// Makes the lengths and the checksum of a message right.
+/// Repairs the lengths and the checksum of a message.
 pub(crate) fn mend_message(body: &mut [u8]) {
     if body.len() < codec::PREFIX_BYTES {
         return;
@@ -240,7 +240,7 @@ fn header(actor: u32, sequence: u64, first_transition: u64) -> ChunkHeader {
     }
 }
 
-/// Fills a chunk with frames from `frame` on.
+/// Fills a chunk with frames numbered from `frame`.
 fn set(chunk: &mut Chunk, frame: &mut u32) {
     for row in 0..chunk.header.transitions() {
         chunk.frame_mut(row).copy_from_slice(&frame.to_le_bytes());
@@ -255,7 +255,7 @@ fn set(chunk: &mut Chunk, frame: &mut u32) {
     }
 }
 
-/// What the decoder `segments` takes, of a log of several segments and of one of a single segment; intact, and to be mended.
+/// Returns input of the decoder `segments`: a log of a single segment and one of several, each intact and to be repaired.
 pub fn logs() -> Vec<(String, Vec<u8>)> {
     let mut all = Vec::new();
     for (name, chunks) in [("short", 2), ("long", 12)] {
@@ -268,7 +268,7 @@ pub fn logs() -> Vec<(String, Vec<u8>)> {
     all
 }
 
-/// The segments of a replay in which every kind of record was written.
+/// Returns the segments of a replay in which every kind of record was written.
 fn log(chunks: u64) -> Vec<u8> {
     let dir = folder();
     let mut replay = open(dir.path()).unwrap();
@@ -324,7 +324,7 @@ fn log(chunks: u64) -> Vec<u8> {
     bytes
 }
 
-/// The first of [`logs`], whose first record has the highest number that there is.
+/// Returns the first of [`logs`] with a number in its first record that no replay reaches.
 pub fn highest_ordinal() -> Vec<u8> {
     let mut log = logs().swap_remove(0).1;
     let segment = &mut log[4..];
@@ -333,7 +333,7 @@ pub fn highest_ordinal() -> Vec<u8> {
     log
 }
 
-/// Transitions that are held in a log as [`logs`] gives it, or why it is refused.
+/// Returns the number of transitions held in a log from [`logs`], or why the log is rejected.
 pub fn held(log: &[u8]) -> Result<u64, String> {
     let dir = folder();
     for (number, segment) in split(&log[2..]).iter().enumerate() {

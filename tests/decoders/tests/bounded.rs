@@ -1,5 +1,5 @@
-//! A bounded run of every decoder over changed seeds, in CI: the same functions that the fuzz targets call.
-//! `DRIML_DECODER_RUNS=N` makes N executions of each instead.
+//! Runs every decoder on a bounded number of changed seeds, in CI, by the same functions that the fuzz targets call.
+//! `DRIML_DECODER_RUNS=N` sets the number of executions of each.
 
 #![allow(clippy::unwrap_used, reason = "these are tests")]
 
@@ -16,9 +16,9 @@ use rand_chacha::ChaCha8Rng;
 
 /// Executions of each decoder in CI.
 const RUNS: u64 = 20_000;
-/// The same of the decoder of segments, each of which opens a folder twice.
+/// The same for the decoder `segments`, whose executions open a folder twice.
 const SEGMENTS_RUNS: u64 = 3_000;
-/// Bytes beyond which a changed seed is cut.
+/// The most bytes of a changed seed; the rest is cut off.
 const BYTES_MAX: usize = 1 << 14;
 
 fn folder(decoder: &str) -> PathBuf {
@@ -57,7 +57,7 @@ fn change(bytes: &mut Vec<u8>, seeds: &[Vec<u8>], rng: &mut ChaCha8Rng) {
                 bytes.splice(at..(at + length).min(bytes.len()), edge[..width].to_vec());
             }
             5 => {
-                // bincode's own marks of longer numbers.
+                // bincode's markers of longer numbers.
                 let mark = rng.random_range(251..=254);
                 bytes.splice(at..at, [mark, 255, 255, 255, 255, 255, 255, 255, 255]);
             }
@@ -98,7 +98,7 @@ fn run(name: &str) {
     }
 }
 
-/// Says which bytes were tried when a decoder panics with them.
+/// Reports the bytes of an execution if the decoder panics.
 struct Said<'a> {
     name: &'a str,
     number: u64,
@@ -113,14 +113,14 @@ impl Drop for Said<'_> {
             bytes,
         } = self;
         let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
-        // The panic is what fails the test; where its bytes are is a help alone.
+        // The panic fails the test; the file with its bytes is only a help.
         let _ = fs::write(&file, bytes);
         let said = format!("{name}, execution {number}: {}\n", file.display());
         let _ = std::io::stderr().write_all(said.as_bytes());
     }
 }
 
-/// A test for each decoder, and their names.
+/// Defines a test for each decoder, and the list of their names.
 macro_rules! bounded {
     ($($name:ident)*) => {
         const BOUNDED: &[&str] = &[$(stringify!($name)),*];
@@ -134,7 +134,7 @@ macro_rules! bounded {
 
 bounded!(wire messages replay state config segments);
 
-/// A stored seed; `UPDATE_CORPUS=1` stores these bytes first.
+/// Reads a stored seed. With `UPDATE_CORPUS=1`, first stores these bytes.
 fn stored(file: &Path, bytes: &[u8]) -> Vec<u8> {
     if std::env::var_os("UPDATE_CORPUS").is_some() {
         fs::create_dir_all(file.parent().unwrap()).unwrap();
@@ -176,7 +176,7 @@ fn the_states_among_the_seeds_can_be_read() {
     }
 }
 
-/// The logs among the seeds are ones that this version reads: `UPDATE_CORPUS=1` writes them. They are not the same each time.
+/// This version reads the logs among the seeds. `UPDATE_CORPUS=1` writes them; their bytes differ each time.
 #[test]
 fn the_logs_among_the_seeds_can_be_read() {
     for (name, log) in logs() {

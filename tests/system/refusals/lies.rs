@@ -43,12 +43,12 @@ impl Lied {
         }
     }
 
-    /// Sends rows, of which so many are counted as refused.
+    /// Sends rows and checks the number of lies that the server counts as refused.
     fn sends(&self, rows: impl IntoIterator<Item = Row>, lies: u64) {
         send_refused(&self.client, "all lies", rows, lies);
     }
 
-    /// The run continues with its own numbers, and its log is short.
+    /// Checks that the run continues, and that its log is short.
     fn continues(self) {
         continues(&self.client);
         let log = self.system.read("run/logs/replay-server.log");
@@ -62,7 +62,7 @@ impl Lied {
 #[test]
 fn lies_are_counted_and_change_nothing() {
     let lied = Lied::new("");
-    // First, as memory that was held once hides what is held later.
+    // This check comes first, because an earlier peak of memory would hide a later one.
     of_half_a_gigabyte(&lied);
     of_each_kind_of_message(&lied);
     of_processes_whose_number_can_be_read(&lied);
@@ -80,7 +80,7 @@ fn of_each_kind_of_message(lied: &Lied) {
     lied.sends(joins, 0);
     let join = actor_join(0, LIFE);
     lied.sends([Row::of(client, &join, "Taken {")], 0);
-    // As another number than its key's.
+    // The number of the actor differs from that in the key.
     let key = keys.of_actor::<ActorJoin>(STRANGER);
     let bytes = sealed(client, &join);
     lied.sends((0..4).map(|_| Row::new(&key, &*bytes, SILENCE)), 4);
@@ -144,7 +144,7 @@ fn of_each_kind_of_message(lied: &Lied) {
         .map(|version| affinity(LEARNER, version, client.spec.num_actions))
         .map(|affinity| Row::of(client, &affinity, SILENCE));
     lied.sends(affinities, 3);
-    // This run does not draw by priorities, and has no place for them.
+    // This run does not draw by priority, and ignores the message.
     lied.sends([Row::of(client, &priority(1, 1.0), SILENCE)], 0);
 
     let uploads = [0, 1, 1 << 60, u64::MAX].map(|version| {
@@ -164,7 +164,7 @@ fn of_each_kind_of_message(lied: &Lied) {
     lied.sends(requests.map(|(it, said)| Row::of(client, &it, said)), 0);
 }
 
-/// The priority of a transition, by a learner that is not the run's.
+/// Returns the priority of a transition, sent by a learner that is not the run's.
 fn priority(transition: u64, priority: f32) -> PriorityUpdate {
     PriorityUpdate {
         learner: LEARNER,
@@ -177,7 +177,7 @@ fn priority(transition: u64, priority: f32) -> PriorityUpdate {
     }
 }
 
-/// Without certificates every client may offer to answer in the replay server's place.
+/// Without certificates any client may declare that it answers in place of the replay server.
 #[test]
 fn lies_of_who_answers_are_not_believed() {
     let lied = Lied::new("");
@@ -200,7 +200,7 @@ fn lies_of_who_answers_are_not_believed() {
     lied.run.stop().expect_code(130);
 }
 
-/// More than a run may have; then one that belongs to the run.
+/// More strangers join than a run can remember; then an actor joins that belongs to the run.
 fn of_4096_strangers(lied: &Lied) {
     let client = &lied.client;
     let tokens: Vec<_> = (0..300)
@@ -218,12 +218,12 @@ fn of_4096_strangers(lied: &Lied) {
     client.wait_for_replay("two actors", |replay| replay.actors_acting == 2);
     actor.stop_ok().expect_said("leaves: ");
     client.wait_for_replay("one actor", |replay| replay.actors == 1);
-    // Those who were forgotten, and who say what they will.
+    // A forgotten actor leaves with a count that no run reaches.
     let leave = leave(STRANGER, LIFE, 1 << 60);
     lied.sends([Row::of(client, &leave, "Ack")], 1);
 }
 
-/// Of a run that draws by them.
+/// Tests a run that draws rows by priority.
 #[test]
 fn lies_of_priorities_change_nothing() {
     let lied = Lied::new(PRIORITISED);
@@ -243,7 +243,7 @@ fn lies_of_priorities_change_nothing() {
     lied.continues();
 }
 
-/// 512 MB of zeros are never held; what is too long by less is refused and counted before it is copied.
+/// A message of 512 MB is never held in memory. Shorter messages that are still too long are rejected and counted before they are copied.
 fn of_half_a_gigabyte(lied: &Lied) {
     let client = &lied.client;
     let server = lied.system.find_process("replay-server");
@@ -264,7 +264,7 @@ fn of_half_a_gigabyte(lied: &Lied) {
     );
 }
 
-/// What a liar would need is not to be seen: the numbers by which the replay server knows its learner and its actors.
+/// The public liveliness tokens do not show the secret numbers by which the replay server knows its learner and its actors.
 fn of_processes_whose_number_can_be_read(lied: &Lied) {
     let client = &lied.client;
     let tokens = client
@@ -277,7 +277,7 @@ fn of_processes_whose_number_can_be_read(lied: &Lied) {
     while let Ok(reply) = tokens.recv() {
         let token = reply.into_result().unwrap();
         let Alive { process, mark } = client.keys.alive(token.key_expr().as_str()).unwrap();
-        // The mark is of no use in the place of the number.
+        // The public mark does not work in place of the secret number.
         rows.push(match process {
             ProcessName::Actor(actor) => Row::of(client, &leave(actor, mark, 0), "Ack"),
             ProcessName::Learner => {

@@ -1,5 +1,5 @@
-//! Messages that a live replay server must refuse: of other runs and versions, damaged, cut off, not ours at all.
-//! Each is counted once and stores nothing, and the server continues to store. That no cut and no flip is missed is the codec's test.
+//! Messages that a live replay server must reject: of other runs and versions, damaged, cut off, or not driml's at all.
+//! Each is counted once and stores nothing, and the server continues to store. The codec's tests check that no cut and no flip is missed.
 
 use driml_protocol::{
     AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Leave, Message, codec,
@@ -11,11 +11,11 @@ use super::{
 };
 use crate::{LONG, system};
 
-/// The life of actor 0 that sends chunks here, and the learner.
+/// The incarnation of actor 0, which sends the chunks here, and the number of the learner.
 const INCARNATION: u64 = 9;
 const LEARNER: u64 = 5;
 
-/// The next chunk of actor 0: two streams of three steps, the last one ending an episode.
+/// Returns the next chunk of actor 0: two streams of three steps, the last one ending an episode.
 fn chunk(client: &Client, sequence: u64) -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         sequence,
@@ -31,10 +31,10 @@ fn chunk(client: &Client, sequence: u64) -> Chunk {
     chunk
 }
 
-/// Why a chunk is refused, and what makes it so.
+/// Words of the reason for which a chunk is rejected, and the change that makes it invalid.
 type Senseless = (&'static str, fn(&mut Chunk));
 
-/// Chunks that make no sense in this run. All that makes none is tested beside the codec and the replay.
+/// Chunks that are invalid in this run. All kinds of invalid chunks are tested beside the codec and the replay.
 const SENSELESS: [Senseless; 4] = [
     ("do not fill", |it| it.header.steps = 4),
     ("the reward of row 5 is not finite", |it| {
@@ -48,12 +48,12 @@ const SENSELESS: [Senseless; 4] = [
     }),
 ];
 
-/// A message of another run.
+/// Encodes a message of another run.
 fn foreign(client: &Client, message: &impl Message, payload: &[u8]) -> Vec<u8> {
     codec::encode(client.spec.hash() ^ 1, message, payload).unwrap()
 }
 
-/// What is refused in the place of chunks.
+/// Returns messages that are rejected at the key for chunks, each with words of the reason.
 fn no_chunks(client: &Client) -> Vec<(Vec<u8>, &'static str)> {
     let chunk = chunk(client, 0);
     let whole = client.seal(&chunk);
@@ -116,12 +116,12 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
     let (batches, leaves) = (keys.of::<BatchRequest>(), keys.of_actor::<Leave>(0));
     let leave = leave(0, INCARNATION, 1000);
     let others = [
-        // Requests are answered with the reason.
+        // The replies to requests contain the reason.
         Row::new(&batches, garbage, "Refused {"),
         Row::new(&batches, foreign(client, &batch(16), &[]), "Refused {"),
         Row::of(client, &batch(0), "a batch of"),
         Row::of(client, &batch(u32::MAX), "a batch of"),
-        // What needs no answer gets none.
+        // Messages that need no reply get none.
         Row::new(&leaves, garbage, SILENCE),
         Row::new(&leaves, foreign(client, &leave, &[]), SILENCE),
         Row::new(keys.of::<AffinityUpdate>(), garbage, SILENCE),

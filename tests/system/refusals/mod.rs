@@ -1,6 +1,6 @@
-//! What a live run refuses, as tables of what is sent and what comes of it: malformed messages, well-formed lies, what a role may not
-//! send, wrong weights, and commands that connect to the wrong place.
-//! That no bytes make the codec panic is its own test; here whole processes continue their work.
+//! Input that a live run rejects, as tables of messages and expected replies: malformed messages, well-formed lies, messages that a role
+//! may not send, wrong weights, and commands that connect to the wrong place. The codec's own tests check that no bytes make it panic; here
+//! whole processes continue their work.
 
 mod lies;
 mod messages;
@@ -21,14 +21,14 @@ use zenoh::qos::Priority;
 
 use crate::tiny_replay;
 
-/// What comes of a message to whose sender nothing is promised.
+/// The expected result of a message that need not be answered.
 const SILENCE: &str = "no answer";
 
-/// How long an answer is waited for that does not come, and one that does.
+/// How long to wait for a reply that must not come, and the time-out of one that must.
 const NO_ANSWER: Duration = Duration::from_millis(700);
 const ANSWER_MAX: Duration = Duration::from_secs(20);
 
-/// A message, and words of the answer to it.
+/// A message, and words that the reply must contain.
 pub(crate) struct Row {
     key: String,
     bytes: Vec<u8>,
@@ -48,7 +48,7 @@ impl Row {
         }
     }
 
-    /// A well-formed message of the client's run, at the key where such messages go.
+    /// Returns a well-formed message of the client's run, at the key for its type.
     pub(crate) fn of<M: Keyed>(client: &Client, message: &M, expected: &'static str) -> Self {
         let actor = message.actor().unwrap_or_default();
         let key = client.keys.of_actor::<M>(actor);
@@ -77,7 +77,7 @@ pub(crate) fn batch_request(learner: u64, rows: u32) -> BatchRequest {
     }
 }
 
-/// Affinities of all pairs of actions, each 0.5.
+/// Returns affinities of 0.5 for all pairs of actions.
 fn affinity(learner: u64, version: u64, num_actions: u32) -> AffinityUpdate {
     AffinityUpdate {
         learner,
@@ -87,14 +87,14 @@ fn affinity(learner: u64, version: u64, num_actions: u32) -> AffinityUpdate {
     }
 }
 
-/// A learner's weights of this version, as it hands them over.
+/// Encodes weights of this version as a learner uploads them.
 pub(crate) fn upload(spec_hash: u64, learner: u64, version: u64, safetensors: &[u8]) -> Vec<u8> {
     let weights = WeightsHeader::new(version, version, safetensors);
     let upload = WeightsUpload { learner, weights };
     codec::encode(spec_hash, &upload, safetensors).unwrap()
 }
 
-/// The first chunk of an actor: one stream of two steps.
+/// Returns the header of the first chunk of an actor: one stream of two steps.
 fn chunk_header(client: &Client, actor: u32, incarnation: u64) -> ChunkHeader {
     ChunkHeader {
         incarnation,
@@ -107,13 +107,13 @@ fn sealed(client: &Client, message: &impl Message) -> Vec<u8> {
     codec::encode(client.spec.hash(), message, &[]).unwrap()
 }
 
-/// The same message of a version to come.
+/// Returns the same message with the next protocol version.
 fn newer(mut bytes: Vec<u8>) -> Vec<u8> {
     bytes[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
     bytes
 }
 
-/// Sends each row's message and checks the answer.
+/// Sends each row's message and checks the reply.
 pub(crate) fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
     for (i, row) in rows.into_iter().enumerate() {
         let Row {
@@ -138,16 +138,16 @@ pub(crate) fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
     }
 }
 
-/// Sends each row's message, checks the answer, and that the replay server counts so many messages more as refused.
+/// Sends each row's message and checks the reply, and that the replay server counts exactly `refused` more messages as refused.
 fn send_refused(client: &Client, what: &str, rows: impl IntoIterator<Item = Row>, refused: u64) {
     let before = client.replay().unwrap().messages_refused;
     send(client, rows);
-    // The last one may still be on its way through a busy server.
+    // A busy server may not have received the last message yet.
     let status = client.wait_for_replay(what, |replay| replay.messages_refused >= before + refused);
     assert_eq!(status.messages_refused - before, refused, "{what}");
 }
 
-/// The run of this client continues with its own numbers.
+/// Checks that the client's run continues and loses nothing.
 fn continues(client: &Client) {
     let updates = client.learner().unwrap().updates;
     let transitions = client.replay().unwrap().transitions_inserted;
@@ -160,7 +160,7 @@ fn continues(client: &Client) {
     assert!(learner.weights_version < 1 << 20, "{learner:#?}");
 }
 
-/// An answer of any kind.
+/// Returns a reply of any type as text.
 fn describe(bytes: &[u8]) -> String {
     fn read<M: Message + std::fmt::Debug>(bytes: &[u8]) -> Option<String> {
         let (message, _) = codec::decode::<M>(bytes, None).ok()?;

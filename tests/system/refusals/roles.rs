@@ -1,4 +1,4 @@
-//! What a certificate is good for: its own role and number, and nothing else, whatever its holder sends.
+//! A certificate permits the messages of its own role and number, and nothing else, whatever its holder sends.
 //! Which clients are admitted at all is in `tls`.
 
 use std::sync::{
@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{LONG, system};
 
-/// A run over TLS, and who watches it.
+/// A run over TLS, and an observer.
 struct Guarded {
     system: TestSystem,
     observer: Client,
@@ -47,7 +47,7 @@ impl Guarded {
     }
 }
 
-/// Sends all rows at the same time, as most of their answers are waited for in vain.
+/// Sends all rows at the same time, because most of them wait for a reply until the time-out.
 fn send_at_once(client: &Client, rows: impl IntoIterator<Item = Row>) {
     at_once(rows, |row| send(client, [row]));
 }
@@ -95,7 +95,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
     );
     assert_eq!(run.refused(), before, "nothing of it reached the server");
 
-    // At its own keys, messages that speak for another.
+    // At the actor's own keys, send messages that speak for another actor.
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
     let chunks = keys.of_actor::<ChunkHeader>(1);
     let said = "speaks for actor 0 at the key";
@@ -111,7 +111,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
     wait_until("four refusals", || run.refused() >= before + 4);
 }
 
-/// It can neither answer in the place of others, nor publish or receive what is not for it, nor count as another process.
+/// An actor can neither answer in place of others, nor publish or receive what is not for it, nor count as another process.
 fn an_actor_declares_nothing_but_its_own(run: &Guarded) {
     let one = run.system.connect_as(Role::Actor(1));
     let keys = &one.keys;

@@ -1,5 +1,5 @@
-//! Weights that a replay server must not take and an actor must not act with, and run infos that no process must follow: of other
-//! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
+//! Weights that a replay server must reject and actors must not use, and run infos that no process may follow: of other runs and versions,
+//! from strangers, damaged. The test itself plays the learner or the replay server.
 
 use driml_learner::{Compute, Learner, LearnerConfig};
 use driml_protocol::{Keys, RunInfo, WeightsUpload, WeightsVersion, codec, session};
@@ -9,10 +9,10 @@ use zenoh::Wait;
 use super::{Row, SILENCE, newer, send_refused, upload};
 use crate::system;
 
-/// The learner that this test plays.
+/// The number of the learner that the test plays.
 const LEARNER: u64 = 5;
 
-/// Sends what the replay server refuses, and counts as refused.
+/// Sends weights that the replay server must reject and count as refused.
 fn refused(client: &Client, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
     for (name, bytes) in rows {
         let key = client.keys.of::<WeightsUpload>();
@@ -23,7 +23,7 @@ fn refused(client: &Client, rows: impl IntoIterator<Item = (&'static str, Vec<u8
 #[test]
 fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let system = system();
-    // Inserts alone are watched here, so the warm-up is as long as the run.
+    // The test watches only inserts, so the warm-up is nearly as long as the run.
     let flags = "--env chain --agent c51 --preset smoke --set replay.capacity_transitions=20000000 --frames 20000000";
     let _server =
         system.start_replay_server(&format!("{flags} --set replay.warmup_transitions=19000000"));
@@ -36,12 +36,12 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         .unwrap()
         .safetensors;
     let of = |version, weights: &[u8], learner| upload(hash, learner, version, weights);
-    // What the replay server takes.
+    // Uploads weights that the replay server accepts.
     let send = |version, weights: &[u8]| {
         let key = client.keys.of::<WeightsUpload>();
         client.ask(&key, of(version, weights, LEARNER)).unwrap();
     };
-    // Says that there are newer weights, as a stranger could.
+    // Announces newer weights, as a stranger could.
     let announce = |version, spec_hash| {
         let bytes = codec::encode(spec_hash, &WeightsVersion { version }, &[]).unwrap();
         let put = client
@@ -50,7 +50,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         put.wait().unwrap();
     };
 
-    // Until there are weights that it may use, an actor asks again and steps nothing.
+    // Until there are usable weights, an actor retries and steps nothing.
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr("waiting for the learner's first weights");
     refused(&client, [("it has not joined", of(1, &good, LEARNER))]);
@@ -63,7 +63,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     send(1, &good);
     client.wait_for_transitions(0);
 
-    // Then it keeps them, whatever comes.
+    // Then the actor keeps its weights, whatever is sent.
     let mut damaged = of(2, &good, LEARNER);
     *damaged.last_mut().unwrap() ^= 1;
     let rows = [
@@ -85,9 +85,9 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     announce(4, hash ^ 1);
     actor
         .wait_for_stderr("an announcement of weights was dropped: the message belongs to run spec");
-    // Nothing newer is there, so nothing comes of it.
+    // There are no newer weights, so the announcement has no effect.
     announce(1 << 60, hash);
-    // Of the right learner, but no network of this shape: seen only when they are to be used.
+    // These weights come from the right learner but do not fit the network, which shows only when the actor loads them.
     send(6, &good[..good.len() / 2]);
     actor.wait_for_stderr("weights 6 were refused, the old ones stay");
     send(7, &good);

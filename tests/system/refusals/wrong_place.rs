@@ -1,4 +1,4 @@
-//! Processes that are told to connect to the wrong place: each cause has its own error, soon, and with what to do.
+//! Processes that connect to the wrong place: each cause soon gets its own error, which says what to do.
 //! Wrong certificates are in `tls`, wrong settings in the learner's and the watch's own tests.
 
 use std::{
@@ -20,12 +20,11 @@ const COMMANDS: [&str; 4] = [
     "watch --connect",
 ];
 
-/// Runs a command to its end, which must come within so many seconds, and checks that its output names no file of the build
-/// machine.
+/// Runs a command that must exit within `seconds` seconds, and checks that its output names no file of the build machine.
 fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
     let started = Instant::now();
     let ended = system.run(command).expect_code(1);
-    // Beside that a busy machine takes its time.
+    // Allow more time on a busy machine.
     let took = started.elapsed();
     assert!(
         took < Duration::from_secs(seconds + 10),
@@ -72,7 +71,7 @@ fn a_web_server_is_no_replay_server() {
             thread::spawn(move || {
                 let mut request = [0; 1024];
                 let count = stream.read(&mut request).unwrap_or(0);
-                // As web servers do with what they do not understand.
+                // Reply as web servers do to a request that they do not understand.
                 if request[..count].starts_with(b"GET") {
                     let _ = stream.write_all(b"HTTP/1.0 404 Not Found\r\n\r\n");
                 }
