@@ -22,19 +22,19 @@ pub use crate::registry::Registry;
 
 use crate::cli::{Cli, Command};
 
-/// Runs the program: 0 when all went well, 64 for a call that cannot work, 130 when interrupted, 1 for all else.
+/// Runs the program. The exit code is 0 on success, 64 for a call that cannot work, 130 after an interrupt, and 1 for other errors.
 pub fn main() -> ExitCode {
     main_with(Registry::default())
 }
 
-/// [`main`] of a program that adds worlds, losses or agents.
+/// Runs like [`main`], for a program that adds worlds, losses or agents.
 pub fn main_with(registry: Registry) -> ExitCode {
     registry.register();
     panics::end_the_process();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
-            // Nothing is left to be done if the terminal is gone.
+            // If printing fails, the terminal is gone.
             let _ = e.print();
             return match e.use_stderr() {
                 true => ExitCode::from(EXIT_USAGE),

@@ -1,5 +1,5 @@
-//! `driml`: every part of the system in one program.
-//! The library holds all code.
+//! `driml`: every process of the system in one program.
+//! All code is in the library.
 
 use std::process::ExitCode;
 

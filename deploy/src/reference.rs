@@ -1,5 +1,5 @@
-//! The reference pages of `deploy/docs` that are generated: the commands from clap, the settings from the commented presets.
-//! A test fails when they are stale; `UPDATE_EXPECT=1` rewrites them. It also holds every `driml` command of the pages to clap.
+//! Generates reference pages of `deploy/docs`: the commands from clap, the settings from the commented presets.
+//! A test fails if they are stale; `UPDATE_EXPECT=1` rewrites them. Another test parses every `driml` command of the pages with clap.
 
 use std::{
     collections::BTreeMap,
@@ -17,7 +17,7 @@ use crate::cli::Cli;
 const GENERATED: &str =
     "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml --lib reference` rewrites this page. -->";
 
-/// A flag or argument as its command's list shows it.
+/// Returns the entry of a flag or argument in the list of its command.
 fn entry(arg: &Arg) -> String {
     let takes_values = arg.get_action().takes_values();
     let value = match arg.get_value_names() {
@@ -46,13 +46,13 @@ fn entry(arg: &Arg) -> String {
     format!("* `{name}`: {help}\n")
 }
 
-/// The help up to its first full stop or semicolon; `--help` has the rest.
+/// Returns the help up to its first full stop or semicolon; `--help` shows the rest.
 fn first_clause(help: &str) -> &str {
     let ends = [". ", "; "].into_iter().filter_map(|it| help.find(it));
     ends.min().map_or(help, |end| &help[..end])
 }
 
-/// Every command that does something or has flags for those below it, by the words that call it.
+/// Collects every command that does something or has flags for its subcommands, with the words that call it.
 fn commands_of(command: &Command, name: &str, found: &mut Vec<(String, Command)>) {
     let has_flags = command.get_arguments().any(|it| !it.is_hide_set());
     if has_flags || !command.has_subcommands() {
@@ -63,7 +63,7 @@ fn commands_of(command: &Command, name: &str, found: &mut Vec<(String, Command)>
     }
 }
 
-/// The page of all commands; a flag that several commands have in the same words stands once.
+/// Returns the page of all commands. A flag that several commands have in the same words appears once.
 fn commands() -> String {
     let mut found = Vec::new();
     commands_of(&Cli::command(), "driml", &mut found);
@@ -118,7 +118,7 @@ fn presets(folder: &str) -> Vec<(String, PathBuf)> {
     presets
 }
 
-/// The page of settings: the base preset in full, and links to the others.
+/// Returns the page of settings: the base preset in full, and links to the others.
 fn settings() -> String {
     let base = root().join("deploy/settings/presets/base.toml");
     let mut page = format!("# Settings\n\n{GENERATED}\n\n");

@@ -1,12 +1,12 @@
-//! What a program of your own adds to driml's worlds, losses and agents.
+//! Lets your own program add worlds, losses and agents to those of driml.
 
 use driml_envs::{CustomKind, WorldSettings};
 use driml_learner::auxiliary::{self, loss::MenuItem};
 use driml_settings::presets::{self, Agent};
 use serde::de::DeserializeOwned;
 
-/// Worlds, losses and agents beside driml's own, for [`main_with`](crate::main_with). The name of a world or an agent that
-/// driml has stays driml's.
+/// Worlds, losses and agents in addition to driml's own, for [`main_with`](crate::main_with). If a world or an agent has the name of one of
+/// driml's, driml's is used.
 #[derive(Debug, Default)]
 pub struct Registry {
     worlds: Vec<CustomKind>,
@@ -15,7 +15,7 @@ pub struct Registry {
 }
 
 impl Registry {
-    /// Adds the world of settings `S`, for `--env NAME`; `preset` is its layer of settings, TOML ([`CustomKind::of`] says which).
+    /// Adds the world with settings `S`, for `--env NAME`. `preset` is its layer of settings in TOML (see [`CustomKind::of`]).
     #[must_use]
     pub fn world<S>(mut self, name: &'static str, preset: &'static str) -> Self
     where
@@ -25,21 +25,21 @@ impl Registry {
         self
     }
 
-    /// Adds an auxiliary loss, for `learner.update.auxiliary_loss`, under a name that driml's have not.
+    /// Adds an auxiliary loss, for `learner.update.auxiliary_loss`. Its name must differ from those of driml's losses.
     #[must_use]
     pub fn loss(mut self, item: &'static MenuItem) -> Self {
         self.losses.push(item);
         self
     }
 
-    /// Adds an agent, for `--agent NAME`, with a sentence on it and its layer of settings, TOML.
+    /// Adds an agent, for `--agent NAME`, with a sentence that describes it and its layer of settings in TOML.
     #[must_use]
     pub fn agent(mut self, name: &'static str, about: &'static str, layer: &'static str) -> Self {
         self.agents.push(Agent::new(name, about, layer));
         self
     }
 
-    /// Makes all of it known to the crates that look for it.
+    /// Registers all additions with the crates that look for them.
     pub(crate) fn register(self) {
         driml_envs::register(self.worlds);
         auxiliary::register(self.losses);

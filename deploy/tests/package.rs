@@ -1,5 +1,5 @@
 //! The recipes in `deploy/package`: every call of the program in them has flags that the program knows.
-//! Whether they start where they are for was tried by hand; deploy/docs/src/how-to/install.md says how.
+//! The recipes were started by hand on their platforms; deploy/docs/src/how-to/install.md describes how.
 
 #![allow(clippy::unwrap_used)]
 
@@ -18,7 +18,7 @@ const RECIPES: [(&str, &str); 6] = [
     ("systemd/driml-actor@.service", "actor"),
 ];
 
-/// What a recipe's place holders become.
+/// The values of the place holders in the recipes.
 const VALUES: [(&str, &str); 8] = [
     ("${DRIML_ENV:-procgen:coinrun}", "procgen:coinrun"),
     ("${DRIML_AGENT:-driml-ada}", "driml-ada"),
@@ -36,7 +36,7 @@ fn recipe(name: &str) -> String {
     std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The call without its effect: flags are read in their order, and the last one asks for help.
+/// Runs a call without its effect: clap checks the flags in their order, and the last one asks for help.
 fn help(words: &[String]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_driml"))
         .args(words)
@@ -53,7 +53,7 @@ fn words(text: &str) -> Vec<String> {
     words.filter(|word| !word.is_empty()).collect()
 }
 
-/// The calls of the program in a recipe: of a shell's line, of systemd's, or the list under a key of YAML, in a line or an item a line.
+/// Returns the calls of the program in a recipe: lines of a shell or of systemd, or a YAML list in one line or with an item per line.
 fn calls(text: &str) -> Vec<Vec<String>> {
     let lines = text.lines().map(str::trim);
     let mut lines = lines.filter(|line| !line.starts_with('#')).peekable();
@@ -106,7 +106,7 @@ fn the_batch_script_is_a_shell_s() {
     assert!(checked.status.success(), "{checked:?}");
 }
 
-/// What the image installs and copies is where it says.
+/// The files that the image installs and copies exist.
 #[test]
 fn the_image_is_made_of_what_is_there() {
     let file = recipe("Dockerfile");

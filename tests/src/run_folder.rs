@@ -1,5 +1,5 @@
 //! The files that a run leaves behind: summary, metrics, checkpoints, logs.
-//! This module reads the files and checks what holds for every run. Each test checks the results of its own run.
+//! This module reads the files and checks what holds for every run. Each test checks the results of the run that it started.
 
 use std::{
     fs,

@@ -7,8 +7,8 @@ use driml_tests::{Outcome, Summary, TestSystem, check_has};
 
 use crate::{SHORT, launched, system};
 
-/// The number of updates that a resumed run makes. More than the 256 transitions of slack, a chunk in flight and a chunk that fills the
-/// replay again would still allow.
+/// The number of updates that a resumed run makes: more than the 256 transitions of slack, a chunk in flight and a chunk that fills the
+/// replay again can allow.
 const MORE: u64 = 200;
 
 /// Resumes `run` for [`MORE`] updates, and checks what the run leaves behind.

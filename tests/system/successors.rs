@@ -1,4 +1,4 @@
-//! A learner that exits in order saves its updates; the successor of any learner makes the updates that were planned.
+//! A learner saves its updates when it exits, unless it is killed; the successor of any learner makes the updates that were planned.
 //! `failures` and `resume` test such learners with the launcher.
 
 use driml_tests::{Client, Process, TestSystem};

@@ -1,4 +1,4 @@
-//! Procgen's steps through our wrapper, or those of other worlds, frames copied out after each as an actor does.
+//! Measures steps of Procgen through our wrapper, or of other worlds. Frames are copied out after each step as an actor does.
 //! No policy is measured: actions are drawn beforehand.
 
 use driml_envs::StepEnd;
@@ -10,19 +10,19 @@ use rand_chacha::ChaCha8Rng;
 use crate::{report::Bench, settings};
 
 pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
-/// Environments that are stepped together.
+/// The number of environments that are stepped together.
 const ENVS: usize = 32;
-/// The engine's own threads; with 0 the caller's steps every environment.
+/// The numbers of engine threads. With 0 the caller's thread steps every environment.
 pub(super) const ENGINE_THREADS: [usize; 2] = [0, 2];
-/// Steps of which a call that is timed consists.
+/// The number of steps in a timed call.
 const STEPS: usize = 64;
 
-/// The name of the figure of one of Procgen's games.
+/// Returns the name of the figure of a Procgen game.
 pub(super) fn name(game: &str, threads: usize) -> String {
     format!("{game}, {ENVS} environments, {threads} engine threads")
 }
 
-/// Steps a second of some worlds, Procgen's if none is named, each environment's counted.
+/// Measures steps per second of the named worlds, or of Procgen if none is named. The steps of each environment count.
 pub(super) fn measure(worlds: &[String], bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let mut cases = Vec::new();
     for world in worlds {
@@ -51,7 +51,7 @@ fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> a
     let actions: Vec<[u8; ENVS]> = (0..STEPS).map(&mut of_step).collect();
     let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
     let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
-    // A step that starts episodes takes longer than others, so the mean counts.
+    // A step that starts episodes takes longer than others, so measure the mean.
     let calls = effort.rate_overall(|| {
         for actions in &actions {
             world.step(actions, &mut rewards, &mut ends)?;

@@ -1,5 +1,5 @@
 //! The command line of `driml bench`.
-//! What a value means is for the bench that takes it.
+//! Each bench interprets its own flags.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use driml_learner::{DeviceName, Precision};
 use driml_machine::{device::DeviceFlag, whole_number};
 
-/// What `driml bench` takes.
+/// The arguments of `driml bench`.
 #[derive(Debug, Args)]
 pub struct BenchArgs {
     /// What to measure.
@@ -51,7 +51,7 @@ pub enum BenchCommand {
     Peers(BenchPeersArgs),
 }
 
-/// What every bench can be told.
+/// The flags of all benches.
 #[derive(Clone, Debug, Args)]
 pub struct BenchFlags {
     /// Few iterations: shows only that the bench works
@@ -69,7 +69,7 @@ pub struct BenchFlags {
 }
 
 impl BenchFlags {
-    /// The precisions to measure: unless they are named, those that the device has.
+    /// Returns the precisions to measure: the named ones, else those that the device supports.
     pub(crate) fn precisions(&self, device: DeviceName) -> Vec<Precision> {
         match (&self.precision[..], device) {
             ([], DeviceName::Cpu) => Precision::ALL.to_vec(),
@@ -79,7 +79,7 @@ impl BenchFlags {
     }
 }
 
-/// What `driml bench learner` takes.
+/// The flags of `driml bench learner`.
 #[derive(Clone, Debug, Args)]
 pub struct BenchLearnerArgs {
     /// Measure C51 + global DIM with growing batch, observation, atoms and vectors instead
@@ -92,7 +92,7 @@ pub struct BenchLearnerArgs {
     pub(crate) on: DeviceFlag,
 }
 
-/// What `driml bench replay` takes.
+/// The flags of `driml bench replay`.
 #[derive(Clone, Debug, Args)]
 pub struct BenchReplayArgs {
     /// Compare a replay on disk, in DIR/driml-bench, with one in memory instead; also measures reading it back
@@ -112,7 +112,7 @@ pub struct BenchReplayArgs {
     pub(crate) tls_dir: Option<PathBuf>,
 }
 
-/// What `driml bench peers` takes.
+/// The flags of `driml bench peers`.
 #[derive(Debug, Args)]
 pub struct BenchPeersArgs {
     /// Only these components
@@ -149,7 +149,7 @@ pub enum Component {
 }
 
 impl Component {
-    /// Its name on the command line.
+    /// Returns the component's name on the command line.
     pub(crate) fn name(self) -> String {
         let value = self.to_possible_value().expect("no component is hidden");
         value.get_name().to_owned()

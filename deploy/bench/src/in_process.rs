@@ -1,5 +1,5 @@
-//! Batches drawn and put together inside the replay server, without wire and codec.
-//! It starts no process.
+//! Measures batches drawn and assembled inside the replay server, without wire and codec.
+//! This bench starts no process.
 
 use std::hint::black_box;
 
@@ -21,9 +21,9 @@ use crate::{
 pub(super) const ASSEMBLED: &str = "batch of 3 states, without a wire";
 pub(super) const COPIED: &str = "plain copy of a batch's bytes";
 
-/// Side of black frames: so small that the draw is measured and not the copying of states.
+/// The side of the black frames, in pixels: so small that the bench measures the draw, not the copying of states.
 const SIDE: u32 = 8;
-/// Rainbow's alpha; beta is the learner's.
+/// Prioritised sampling with Rainbow's alpha. Beta affects only the learner.
 const PRIORITISED: Sampling = Sampling::Prioritised {
     alpha: 0.5,
     beta_start: 0.4,
@@ -31,7 +31,7 @@ const PRIORITISED: Sampling = Sampling::Prioritised {
     beta_updates: 1,
 };
 
-/// Batches of recorded frames a second, and as many bytes merely copied.
+/// Measures batches of recorded frames per second, and plain copies of as many bytes.
 pub(super) fn assembling(recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
     let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes);
@@ -58,8 +58,8 @@ pub(super) fn assembling(recording: &Recording, bench: &mut Bench<'_>) -> anyhow
     Ok(())
 }
 
-/// Batches a second of a replay that holds `held` transitions: drawn uniformly, by priority, and by priorities that are then set,
-/// in turn.
+/// Measures batches per second of a replay that holds `held` transitions, in turn: drawn uniformly, by priority, and by priority with new
+/// priorities set after each draw.
 pub(super) fn sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let blank = Recording::blank((SIDE * SIDE) as usize);
     let filled = |sampling| {
@@ -74,7 +74,7 @@ pub(super) fn sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let mut prioritised = filled(PRIORITISED)?;
     let mut learned_from = filled(PRIORITISED)?;
     let rows = uniform.rows;
-    // Most transitions have a priority of their own, as after a while of learning.
+    // Give most transitions an individual priority, as after a while of learning.
     for _ in 0..2 * held / u64::from(rows) {
         prioritised.learn()?;
         learned_from.learn()?;
@@ -96,7 +96,7 @@ pub(super) fn sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A replay that is full, and what its learner finds.
+/// A full replay, and the state of a learner that sets priorities.
 struct Filled {
     replay: Replay,
     rows: u32,
@@ -105,7 +105,7 @@ struct Filled {
 }
 
 impl Filled {
-    /// A replay with the chunks of one actor, until it has stored more than `held` transitions.
+    /// Fills a replay with the chunks of one actor, until it has stored more than `held` transitions.
     fn new(config: &RunConfig, held: u64, recording: &Recording) -> anyhow::Result<Self> {
         let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
         let rows = config.learner.batch_size;
@@ -132,7 +132,7 @@ impl Filled {
         batch.map_err(|why| anyhow!("no batch: {why:?}"))
     }
 
-    /// Draws a batch and sets its rows' priorities.
+    /// Draws a batch and sets random priorities for its rows.
     fn learn(&mut self) -> anyhow::Result<()> {
         let batch = self.draw()?;
         let found: Vec<f32> = (0..self.rows).map(|_| self.rng.random()).collect();

@@ -1,5 +1,5 @@
-//! How much of what the processor can multiply the kernels reach: convolutions alone, and whole updates.
-//! The convolutions are 3 x 3, of 256 maps of a residual stage with their border of zeros, and their ReLU.
+//! Measures how close the kernels come to the processor's highest rate of products: convolutions alone, and whole updates.
+//! The convolutions are 3 x 3 with ReLU, on 256 maps of a residual stage with their border of zeros.
 
 use candle_core::{Device, Tensor};
 use driml_learner::DeviceName;
@@ -13,14 +13,14 @@ use crate::{
 };
 
 const ROWS: usize = 256;
-/// Side and channels of the maps of a stage, which has as many going in as coming out.
+/// Side and channels of the maps of each stage, which has as many input channels as output channels.
 const STAGES: [(usize, usize); 3] = [(32, 16), (16, 32), (8, 32)];
-/// Torsos of the updates, of C51.
+/// The torsos of the C51 updates.
 const TORSOS: [&str; 2] = ["nature", "impala"];
-/// Tiles in a call.
+/// The number of tiles in a call.
 const TILES: usize = 10_000;
 
-/// GFLOP/s in each precision.
+/// Measures GFLOP/s in each precision.
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let effort = bench.effort;
     for precision in bench.flags.precisions(DeviceName::Cpu) {
@@ -56,7 +56,7 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A tensor of numbers of a usual size.
+/// Returns a tensor of random numbers in [-1, 1).
 fn numbers(shape: &[usize]) -> candle_core::Result<Tensor> {
     let rng = ChaCha8Rng::seed_from_u64(1);
     let values = rng.random_iter::<f32>().map(|it| 2.0 * it - 1.0);

@@ -1,5 +1,5 @@
-//! Updates of the learner: at the paper's sizes, and as sizes grow.
-//! Nothing but the update is timed; batches of sizes are made up.
+//! Measures updates of the learner at the paper's sizes, and as sizes grow.
+//! Only the update is timed, on synthetic batches.
 
 use driml_learner::{
     Agent, Compute, DeviceName, Kernels, OwnedBatch, Precision,
@@ -16,7 +16,7 @@ use crate::{
     settings::{self, AGENT, WORLD},
 };
 
-/// What is measured: its name, agent, preset and further settings.
+/// The cases: name, agent, preset and further settings.
 const CASES: &str = "\
 C51, 64x64x3|c51|paper
 C51 + global-global DIM, 64x64x3|driml-ada|paper
@@ -25,22 +25,22 @@ C51 + global-global DIM, 104x80x3|driml-ada|paper-observation
 C51, impala, 64x64x3|c51|paper|model.torso=impala
 C51, impala, 64x64x3, 64 rows|c51|paper|model.torso=impala|learner.batch_size=64
 C51 + global-global DIM, impala, 64x64x3|driml-ada|paper|model.torso=impala";
-/// The update that is also computed with candle's own operations, as on a GPU, in place of our kernels.
+/// The update that is also computed with candle's own operations, as on a GPU, instead of our kernels.
 pub(super) const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
-/// What that figure's name ends with.
+/// The end of that figure's name.
 pub(super) const CANDLE: &str = "candle's own operations";
-/// Shares of s_t and s_{t+k}, and of s_{t+n}, that repeat another state.
+/// Shares of s_t and s_{t+k}, and of s_{t+n}, that are copies of another state.
 const REPEATED: [(f64, &str); 3] = [
     (0.0, "no states repeat"),
     (0.04, "4% of states repeat"),
     (0.38, "38% of states repeat"),
 ];
-/// What is done with equal states.
+/// The two ways to compute equal states.
 const DEDUPLICATION: [(&str, &str); 2] = [
     ("learner.deduplicate_states=false", "each computed"),
     ("learner.deduplicate_states=true", "equal ones once"),
 ];
-/// What grows, and the settings over those of the paper: C51 + global DIM, 256 rows of 64x64x3, 51 atoms, vectors of 512.
+/// The growing sizes, and settings that override the paper's: C51 + global DIM, 256 rows of 64x64x3, 51 atoms, vectors of 512.
 const SIZES: [(&str, &[&str]); 13] = [
     ("32 rows", &["learner.batch_size=32"]),
     ("64 rows", &["learner.batch_size=64"]),
@@ -57,7 +57,7 @@ const SIZES: [(&str, &[&str]); 13] = [
     ("vectors of 1024", &["model.embedding_dim=1024"]),
 ];
 
-/// Updates a second on a device, in each precision; on the CPU also with candle's own operations.
+/// Measures updates per second on a device, in each precision; on the CPU also with candle's own operations.
 pub(super) fn measure(args: &BenchLearnerArgs, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let device = args.on.device;
     for precision in bench.flags.precisions(device) {
@@ -70,7 +70,7 @@ pub(super) fn measure(args: &BenchLearnerArgs, bench: &mut Bench<'_>) -> anyhow:
     Ok(())
 }
 
-/// Updates at the paper's sizes; on a CPU with candle's own operations too, and where states of a batch repeat.
+/// Measures updates at the paper's sizes; on a CPU also with candle's own operations, and with repeated states in a batch.
 fn paper(
     precision: Precision,
     compute: &Compute,
@@ -114,7 +114,7 @@ fn paper(
     Ok(())
 }
 
-/// For each size updates a second, and the arithmetic that this is: the products that `driml inspect` counts.
+/// Measures updates per second at each size, and GFLOP/s of the products that `driml inspect` counts.
 fn growth(precision: Precision, compute: &Compute, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     for (name, sets) in SIZES {
         let sets = [sets, &["learner.deduplicate_states=false"]].concat();
@@ -129,7 +129,7 @@ fn growth(precision: Precision, compute: &Compute, bench: &mut Bench<'_>) -> any
     Ok(())
 }
 
-/// Updates of this agent with settings over those of the paper, and the GFLOP of one.
+/// Returns the work of an update of this agent with settings that override the paper's, and the GFLOP of that update.
 pub(super) fn counted_updates(
     agent: &str,
     sets: &[&str],
@@ -141,7 +141,7 @@ pub(super) fn counted_updates(
     Ok((updates(&config, compute, 0.0)?, gflop))
 }
 
-/// Updates of an agent of these settings on a batch that no world gave, of whose states this share repeats another one.
+/// Returns the work of an update with these settings, on a synthetic batch with the share `repeated` of repeated states.
 fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Result<Work<'static>> {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut rows = synthetic(config, &mut rng);
@@ -155,7 +155,7 @@ fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Resu
     }))
 }
 
-/// A batch that no world gave: as many rows, random bytes and actions as `config` has, and random returns.
+/// Makes a synthetic batch with the sizes of `config`: random bytes, actions and returns.
 fn synthetic(config: &RunConfig, rng: &mut ChaCha8Rng) -> OwnedBatch {
     let rows = config.learner.batch_size as usize;
     let mut states = || {
@@ -183,7 +183,7 @@ fn synthetic(config: &RunConfig, rng: &mut ChaCha8Rng) -> OwnedBatch {
     }
 }
 
-/// Makes this share of s_t and s_{t+k} together, and of s_{t+n}, copies of states before them, spread evenly.
+/// Replaces this share of s_t and s_{t+k} together, and of s_{t+n}, by copies of states before them, spread evenly.
 fn repeat(batch: &mut OwnedBatch, share: f64) {
     let len = batch.states_t.len() / batch.action.len();
     for plane in [

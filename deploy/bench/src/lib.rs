@@ -1,9 +1,9 @@
-//! `driml bench`: how fast the components are, alone and beside what others use for the same work.
+//! `driml bench`: measures the speed of the components, alone and compared with other software for the same work.
 //!
-//! A file is one bench, and gives `Measurement`s, each of which says what it is of; [`flags::BenchCommand`]
-//! lists them. `deploy/bench/peers/` has the same work in Python. Nothing here passes or fails by its speed.
+//! Each file is one bench and returns `Measurement`s, each with its name and unit; [`flags::BenchCommand`] lists the benches.
+//! `deploy/bench/peers/` has the same work in Python. No bench passes or fails by its speed.
 //!
-//! Start with [`run`]; what it takes comes from a command line:
+//! Start with [`run`]; its arguments come from a command line:
 //!
 //! ```no_run
 //! use clap::Parser;
@@ -45,8 +45,8 @@ use crate::{
     report::{Bench, Figures, Report, publish},
 };
 
-/// Runs one bench and reports its figures. A bench that computes in this process starts the program again in its place, if it has
-/// another number of threads than the flags ask for.
+/// Runs one bench and reports its figures. A bench that computes in this process first re-executes the program, if its number of threads is
+/// not that of the flags.
 pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
     let on = match command {
         BenchCommand::Learner(args) => args.on.device,

@@ -1,5 +1,5 @@
-//! Frames through an actor's policy, forward only.
-//! It takes no action in a world.
+//! Measures an actor's policy: the forward pass alone.
+//! No action is taken in a world.
 
 use driml_learner::DeviceName;
 use driml_model::{Parameters, PolicyNetwork};
@@ -11,16 +11,16 @@ use crate::{
     settings,
 };
 
-/// Frames that are given to the policy at once.
+/// The batch sizes: frames per call of the policy.
 const BATCHES: [usize; 2] = [32, 256];
-/// What each network is called, its preset, and further settings.
+/// The name of each network in figures, its preset, and further settings.
 const NETWORKS: [(&str, &str, &[&str]); 3] = [
     ("64x64x3", "paper", &[]),
     ("104x80x3", "paper-observation", &[]),
     ("64x64x3, impala", "paper", &["model.torso=impala"]),
 ];
 
-/// Frames a second in each precision.
+/// Measures frames per second in each precision.
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     for precision in bench.flags.precisions(DeviceName::Cpu) {
         for (network, preset, sets) in NETWORKS {

@@ -1,5 +1,5 @@
-//! Frames of Procgen, recorded once, or black ones, from which benches make transitions.
-//! The loop and the recorder are those of an actor. It keeps no time: recording is not measured.
+//! Procgen frames that are recorded once, or black frames, from which benches make transitions.
+//! The loop and the recorder are those of an actor. Recording is not timed.
 
 use std::{iter::Cycle, path::Path, slice};
 
@@ -13,14 +13,14 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::settings;
 
-/// The life of the actor whose chunks are made of it.
+/// The incarnation of the actor whose chunks are made from a recording.
 pub(super) const INCARNATION: u64 = 1;
-/// Environments, each a stream of transitions.
+/// The number of environments, each a stream of transitions.
 const STREAMS: usize = 8;
-/// Steps of each environment; then the recording begins again.
+/// The number of steps of each environment; then the recording begins again.
 const STEPS: usize = 256;
 
-/// Chunks that are measured. An actor of 16 environments sends the last.
+/// The shapes of the measured chunks. An actor of 16 environments sends the last.
 pub(super) const CHUNKS: [ChunkShape; 4] = [
     ChunkShape::new(4, 1),
     ChunkShape::new(8, 4),
@@ -36,7 +36,7 @@ pub(super) struct ChunkShape {
 }
 
 impl ChunkShape {
-    /// The first `streams` of [`STREAMS`].
+    /// Returns the shape of chunks from the first `streams` of the [`STREAMS`] environments.
     pub(super) const fn new(streams: u32, steps: u32) -> Self {
         assert!(streams as usize <= STREAMS);
         Self { streams, steps }
@@ -53,7 +53,7 @@ pub(super) struct Recording {
     steps: Vec<Step>,
 }
 
-/// One step of all environments: frames [`STREAMS`, frame bytes], and one of everything else for each.
+/// One step of all environments: frames [`STREAMS`, frame bytes], and an action, a reward and an end for each.
 struct Step {
     frames: Vec<u8>,
     actions: Vec<u8>,
@@ -85,7 +85,7 @@ impl Recording {
         Ok(Self { frame_bytes, steps })
     }
 
-    /// Black frames of so many bytes; an episode is as long as the recording.
+    /// Returns a recording of black frames of `frame_bytes` bytes; an episode is as long as the recording.
     pub(super) fn blank(frame_bytes: usize) -> Self {
         let step = |number: usize| Step {
             frames: vec![0; STREAMS * frame_bytes],
@@ -100,13 +100,13 @@ impl Recording {
         Self { frame_bytes, steps }
     }
 
-    /// Writes the frames, raw [`STEPS`, `STREAMS`, frame bytes], for a process that is not ours.
+    /// Writes the raw frames [`STEPS`, `STREAMS`, frame bytes] to a file, for the process of a peer.
     pub(super) fn write_frames(&self, path: &Path) -> anyhow::Result<()> {
         let frames: Vec<&[u8]> = self.steps.iter().map(|it| &it.frames[..]).collect();
         std::fs::write(path, frames.concat()).with_context(|| format!("writing {}", path.display()))
     }
 
-    /// Chunk after chunk of one actor, each of `shape` and in memory of `pool`; the recording plays round and round.
+    /// Returns the chunks of one actor, each of `shape` and in memory of `pool`. The recording repeats endlessly.
     pub(super) fn chunks(&self, actor: u32, shape: ChunkShape, pool: BufferPool) -> Chunks<'_> {
         let (streams, bytes) = (shape.streams, self.frame_bytes);
         let mut recorder = ChunkRecorder::new(pool, actor, INCARNATION, streams, bytes as u32);
@@ -119,16 +119,16 @@ impl Recording {
     }
 }
 
-/// An actor's chunks without end, each filled anew as a real actor's are.
+/// An endless sequence of an actor's chunks, each filled anew as a real actor's chunks are.
 pub(super) struct Chunks<'a> {
     recorder: ChunkRecorder,
     steps: Cycle<slice::Iter<'a, Step>>,
-    /// Bytes of the frames that are taken of a step.
+    /// The bytes of the frames that a chunk takes from a step.
     step_bytes: usize,
 }
 
 impl Chunks<'_> {
-    /// Transitions in all chunks so far.
+    /// Returns the number of transitions in all chunks so far.
     pub(super) const fn transitions(&self) -> u64 {
         self.recorder.produced()
     }

@@ -1,5 +1,5 @@
-//! Transitions into a replay server and batches out of it: over each wire, kept on disk, and without a wire.
-//! What a disk still has to do when the bench has ended is not seen.
+//! Measures transitions into a replay server and batches out of it: over each wire, kept on disk, and without a wire.
+//! Disk writes that are still pending at the end of the bench are not measured.
 
 use std::{
     fs,
@@ -18,11 +18,11 @@ use crate::{
     server::{REPLAY_DIR, Server, TLS_DIR, Wire},
 };
 
-/// Rounds of servers on disk and in memory.
+/// The default number of rounds that compare servers on disk and in memory.
 const ROUNDS_ON_DISK: u32 = 3;
 
-/// What the flags ask for: rows drawn without a wire; or transitions stored a second and batches a second over wires, or in memory
-/// and on disk. Medians of the rounds.
+/// Measures what the flags select: batches per second without a wire; or transitions and batches per second over wires, or on disk and in
+/// memory. Figures are medians of the rounds.
 pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     if args.sampling {
         return in_process::sampling(args.held, bench);
@@ -38,7 +38,7 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
         folder: None,
     };
     let tcp = wire("tcp", &format!("tcp/{}", free_port()?));
-    // It is emptied before and after.
+    // This folder is emptied before and after.
     let dir = args.replay_dir.as_ref().map(|it| it.join("driml-bench"));
     let wires = match (&dir, &args.tls_dir) {
         (Some(dir), _) => {
@@ -77,12 +77,12 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     Ok(())
 }
 
-/// The name of the figure of chunks of `transitions` over a wire.
+/// Returns the name of the figure of chunks of `transitions` transitions over a wire.
 pub(super) fn insert_name(transitions: u32, wire: &str) -> String {
     format!("insert, {transitions} transitions a chunk, {wire}")
 }
 
-/// Transitions that a server stores a second and batches that it gives a second, once its replay is full.
+/// Measures the transitions that a server stores per second and the batches that it serves per second, once its replay is full.
 fn rates(server: &mut Server, recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let (effort, held) = (bench.effort, server.wire.held);
     server.deliver(recording, CHUNKS[3], |sent, _| sent >= held)?;
@@ -124,7 +124,7 @@ fn empty(dir: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A free port at the loopback address: the system's choice, given back at once.
+/// Returns a free port at the loopback address. The system chooses the port, which is released at once.
 fn free_port() -> std::io::Result<std::net::SocketAddr> {
     std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()
 }

@@ -1,5 +1,5 @@
-//! What a bench is told and what it has found, as a table and as JSON, and the machine that it was measured on.
-//! It measures nothing and compares nothing.
+//! The input and the figures of a bench, as a table and as JSON, with the machine on which it ran.
+//! This file measures nothing and compares nothing.
 
 use std::{fs, path::Path};
 
@@ -15,27 +15,27 @@ use serde::{Deserialize, Serialize};
 
 use crate::flags::BenchFlags;
 
-/// What a bench is told, and what it has found so far.
+/// The flags of a bench, and its figures so far.
 pub(super) struct Bench<'a> {
     pub(super) flags: &'a BenchFlags,
     pub(super) effort: Effort,
     pub(super) figures: Figures,
-    /// What is printed in place of a row for each figure.
+    /// A table that is printed instead of one row per figure.
     pub(super) table: Option<String>,
 }
 
-/// One thing that was measured.
+/// One figure.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Measurement {
-    /// What, unique in its bench.
+    /// What was measured; unique in its bench.
     pub(super) what: String,
-    /// How much of the unit.
+    /// The value in this unit.
     pub(super) value: f64,
     /// The unit, such as `updates/s`.
     pub(super) unit: String,
 }
 
-/// What was found, each figure with its values in the order of the rounds.
+/// The figures of a bench, each with its values in the order of the rounds.
 #[derive(Debug, Default)]
 pub(super) struct Figures(Vec<(Measurement, Vec<f64>)>);
 
@@ -55,13 +55,13 @@ impl Figures {
         }
     }
 
-    /// A figure's values and its unit.
+    /// Returns a figure's values and its unit; `None` if it was not measured.
     pub(super) fn of(&self, what: &str) -> Option<(&[f64], &str)> {
         let (figure, values) = self.0.iter().find(|(it, _)| it.what == what)?;
         Some((&values[..], figure.unit.as_str()))
     }
 
-    /// Each figure's median.
+    /// Returns the median of each figure.
     pub(super) fn medians(self) -> Vec<Measurement> {
         let median_of = |(figure, values): (Measurement, Vec<f64>)| Measurement {
             value: median(&values),
@@ -71,7 +71,7 @@ impl Figures {
     }
 }
 
-/// What is computed, and in which precision if it is not f32.
+/// Returns `what`, followed by the precision if that is not f32.
 pub(super) fn named(what: &str, precision: Precision) -> String {
     match precision {
         Precision::F32 => what.to_owned(),
@@ -79,30 +79,30 @@ pub(super) fn named(what: &str, precision: Precision) -> String {
     }
 }
 
-/// A bench's figures as JSON has them.
+/// The JSON output of a bench.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Report {
     /// The name of the bench that measured.
     pub(super) bench: String,
-    /// Whether it took a few iterations only.
+    /// Whether the bench made only a few iterations.
     pub(super) quick: bool,
     /// Threads for arithmetic.
     pub(super) threads: u32,
-    /// Where, as it was before the first measurement.
+    /// The machine, as it was before the first measurement.
     pub(super) machine: MachineNote,
-    /// What was found.
+    /// The medians of the figures.
     pub(super) figures: Vec<Measurement>,
 }
 
 impl Report {
-    /// The figures as rows of three fields, which blanks part: value, unit, and all the rest of the line what was measured.
+    /// Returns the figures as rows of three fields, separated by blanks: value, unit, and as the rest of the line what was measured.
     pub(super) fn rows(&self) -> String {
         let row = |it: &Measurement| vec![number(it.value), it.unit.clone(), it.what.clone()];
         aligned(&self.figures.iter().map(row).collect::<Vec<_>>(), &[0])
     }
 }
 
-/// Prints `table` and writes `report` to `json`; to stdout, alone, if that is `-`.
+/// Prints `table` and writes `report` to the file `json`. If `json` is `-`, prints only the report.
 pub(super) fn publish(
     report: &impl Serialize,
     table: &str,

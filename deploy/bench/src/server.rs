@@ -1,5 +1,5 @@
 //! A replay server in its own process, with real clients over the real wire.
-//! The clients are the actor's delivery and the learner's batch source, so what is measured is what runs in production.
+//! The clients are the actor's delivery and the learner's batch source, so the bench measures the code that runs in production.
 
 use std::{
     hint::black_box,
@@ -29,7 +29,7 @@ use crate::{
 
 /// The number of a bench's learner.
 const LEARNER: u64 = 1;
-/// How long a batch or an insert may take to come, and the server to end.
+/// The time-out of a batch, of an insert and of the server's exit.
 const ANSWER_MAX: Duration = Duration::from_secs(30);
 
 /// The flag for certificates.
@@ -37,16 +37,16 @@ pub(super) const TLS_DIR: &str = "--tls-dir";
 /// The flag for a replay on disk.
 pub(super) const REPLAY_DIR: &str = "--replay-dir";
 
-/// A server, and how clients reach it.
+/// The settings of a server, and how clients reach it.
 #[derive(Clone, Debug)]
 pub(super) struct Wire {
-    /// Its name in figures.
+    /// The name in figures.
     pub(super) name: &'static str,
     pub(super) endpoint: String,
     pub(super) shared_memory: bool,
-    /// Transitions that the server holds.
+    /// The capacity of the server's replay, in transitions.
     pub(super) held: u64,
-    /// A folder that it has, and the flag for it: certificates of all roles, or a replay on disk.
+    /// The flag for a folder of the server, and the folder: certificates of all roles, or a replay on disk.
     pub(super) folder: Option<(&'static str, String)>,
 }
 
@@ -55,11 +55,11 @@ pub(super) struct Server {
     process: ManagedProcess,
     pub(super) wire: Wire,
     keys: Keys,
-    /// The first may do anything where nothing is guarded, else only watch; then each role has its own.
+    /// Without TLS the first session serves all roles. With TLS it is the observer's, and each role has its own.
     sessions: Vec<Session>,
     actor: ActorSettings,
     learner: LearnerConfig,
-    /// Actors so far; each delivery is another one.
+    /// The number of actors so far; each delivery is another actor.
     actors: u32,
 }
 
@@ -89,8 +89,8 @@ impl Server {
         })
     }
 
-    /// Delivers chunks until `is_enough` of what was sent and since when, and gives transitions stored a second, from the
-    /// first chunk's making to the last one's acknowledgement.
+    /// Delivers chunks until `is_enough` holds for the transitions sent and the start time. Returns the transitions stored per second, from
+    /// the making of the first chunk to the acknowledgement of the last.
     pub(super) fn deliver(
         &mut self,
         recording: &Recording,
@@ -121,10 +121,10 @@ impl Server {
         Ok(chunks.transitions() as f64 / seconds)
     }
 
-    /// Batches a second, each read as a learner would.
+    /// Measures batches per second, each read as a learner would.
     pub(super) fn fetch(&mut self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
-        // One that has learned from nothing.
+        // A learner that has made no update.
         let join = LearnerJoin {
             learner: LEARNER,
             run: LEARNER,
@@ -145,7 +145,7 @@ impl Server {
         let mut source = BatchSource::start(clients, requests, &Counters::at_start(1), &shutdown)?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
             Next::Batch(served) => {
-                // One byte of each cache line, so that all of the states have come.
+                // Read one byte of each cache line, so that all states have arrived.
                 let batch = &served.batch;
                 for plane in [batch.states_t(), batch.states_k(), batch.states_n()] {
                     let bytes = plane.iter().step_by(64);
@@ -164,7 +164,7 @@ impl Server {
         rate
     }
 
-    /// A client that takes part in the run as `join` says, and counts as connected until the token is dropped.
+    /// Returns a client that joins the run with `join`, and counts as connected until the token is dropped.
     fn take_part(
         &mut self,
         role: Role,
@@ -184,7 +184,7 @@ impl Server {
         Ok((client, alive))
     }
 
-    /// Ends the server as its process is told to, and waits for it; another one can take its place.
+    /// Ends the server by `tell` and waits until it exits. Another server can use the returned wire.
     pub(super) fn end(mut self, tell: fn(&mut ManagedProcess)) -> Wire {
         for session in &self.sessions {
             if let Err(e) = session.close().wait() {
@@ -199,7 +199,7 @@ impl Server {
 }
 
 impl Wire {
-    /// A session in a role, with its certificate where the server is guarded.
+    /// Opens a session in a role, with the role's certificate if the server uses TLS.
     fn open(&self, keys: &Keys, role: Role) -> anyhow::Result<Session> {
         let credentials = match &self.folder {
             Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?),

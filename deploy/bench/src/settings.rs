@@ -1,14 +1,14 @@
 //! The settings that benches take from the presets, so that they measure what a run does.
-//! Its own numbers are those of a replay that is soon full.
+//! The settings of [`REPLAY`] make a replay that is soon full.
 
 use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{config::RunConfig, flags};
 
-/// The world where it does not matter which.
+/// The world of figures that do not depend on the world.
 pub(super) const WORLD: &str = "procgen:bigfish";
 
-/// Settings that leave the limiter out of what is measured, and a replay that is soon full. `bench peers` gives Reverb a
-/// table of the same size.
+/// Settings that keep the limiter from affecting the figures, and a replay that is soon full. `bench peers` gives Reverb a table of the
+/// same size.
 pub(super) const REPLAY: [&str; 5] = [
     "replay.capacity_transitions=20000",
     "replay.replay_ratio=1e9",
@@ -16,12 +16,12 @@ pub(super) const REPLAY: [&str; 5] = [
     "replay.transitions_max=1000000000000",
     "replay.warmup_transitions=1000",
 ];
-/// What the first of them says.
+/// The capacity in [`REPLAY`], in transitions.
 pub(super) const CAPACITY: u64 = 20_000;
 /// The agent whose k is drawn along the stored actions.
 pub(super) const AGENT: &str = "driml-ada";
 
-/// A run's settings: world, agent and preset, and single settings over them.
+/// Returns the settings of a run: world, agent and preset, overridden by single settings.
 pub(super) fn of_run(
     world: &str,
     agent: &str,

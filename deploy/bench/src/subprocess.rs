@@ -1,5 +1,5 @@
-//! This program as another process: a replay server, a whole run, or itself with other threads.
-//! What is asked of a process that runs is for `server` and `system`.
+//! Starts this program as another process: a replay server, a whole run, or itself with another number of threads.
+//! `server` and `system` send requests to these processes.
 
 use std::path::Path;
 
@@ -14,8 +14,8 @@ use driml_protocol::Shutdown;
 
 use crate::settings;
 
-/// Makes sure that this process has `threads` threads for arithmetic, as the launcher gives those of a run: with others it starts
-/// again in the same process, with the same arguments.
+/// Makes sure that this process has `threads` threads for arithmetic, as the launcher gives those of a run. If not, re-executes the program
+/// in the same process with the same arguments.
 pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
     let threads = threads.to_string();
     if std::env::var(THREADS).is_ok_and(|it| it == threads) {
@@ -25,8 +25,8 @@ pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
     again.context("starting this program again with other threads")
 }
 
-/// Starts this program with other arguments, for driml-ada on bigfish, preset `paper` and the settings `sets`, and its log in `folder`;
-/// waits until it listens at `endpoint`. It ends when the result is dropped.
+/// Starts this program with `args` for driml-ada on bigfish, with the preset `paper`, the settings `sets` and its log in `folder`. Waits
+/// until it listens at `endpoint`. Dropping the result ends the process.
 pub(super) fn start(
     name: &str,
     args: &[&str],

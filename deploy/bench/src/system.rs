@@ -1,5 +1,5 @@
-//! Whole runs of `driml local` with their real processes, watched from outside as any client could: one to its end, or more and
-//! more actors, each number for some seconds. It changes nothing about a run but its end, and does not judge how well it learns.
+//! Measures whole runs of `driml local` with real processes, observed as by any client: one run to its end, or growing numbers of actors,
+//! each for some seconds. The bench only ends the runs, and does not judge how well they learn.
 
 use std::{
     thread,
@@ -25,21 +25,21 @@ use crate::{
 
 /// Frames of the run, and of a quick one.
 const FRAMES: (u64, u64) = (12_000, 5_000);
-/// Updates before the first that counts: by then all threads run and all memory is taken.
+/// The number of updates before the measurement: by then all threads run and all memory is allocated.
 const WARMUP_UPDATES: u64 = 10;
-/// How often a run is looked at.
+/// The time between two requests for the statuses of a run.
 const POLL: Duration = Duration::from_millis(100);
-/// How long what is waited for may take, a run's end too.
+/// The time-out of each wait, including that for the end of a run.
 const WAIT_MAX: Duration = Duration::from_secs(300);
 /// Exit code of a run that was interrupted.
 const INTERRUPTED: i32 = 130;
-/// Actor processes that are measured.
+/// The numbers of actor processes to measure.
 const ACTORS: [u32; 6] = [1, 2, 4, 8, 16, 32];
-/// Replay ratios, and how far either side may run ahead at each, in transitions: at the first the actors wait for the learner, at
-/// the second they are what limits.
+/// Replay ratios, and at each how far either side may run ahead, in transitions. At the first ratio the actors wait for the learner, at the
+/// second they limit the run.
 const RATIOS: [(f64, u64); 2] = [(8.0, 256), (0.1, 10_000)];
 
-/// Updates and frames a second of a run, the share of time in which the learner computes, and the highest memory of each process.
+/// Measures updates and frames per second of a run, the share of time in which the learner computes, and each process's peak memory.
 pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     procgen_sys::Engine::install(&mut console::line)?;
     let frames = frames.unwrap_or(match bench.flags.quick {
@@ -69,7 +69,7 @@ pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Res
     Ok(())
 }
 
-/// Runs at both ratios with more and more actors, as figures and as a table.
+/// Measures runs at both ratios with growing numbers of actors, as figures and as a table.
 pub(super) fn scale(
     actors: &[u32],
     seconds: Option<u32>,
@@ -109,7 +109,7 @@ pub(super) fn scale(
     Ok(())
 }
 
-/// A row of the table of actors: what is seen of a run with so many, from its start until it has been watched for `seconds`.
+/// Returns a row of the table: what was measured of a run with `actors` actors, from its start until it was watched for `seconds`.
 fn columns(
     actors: u32,
     ratio: f64,
@@ -160,13 +160,13 @@ fn columns(
     Ok(columns)
 }
 
-/// What `count` counts from the first moment to the last, a second.
+/// Returns the growth of `count` per second from the first moment to the last.
 fn rate([first, last]: &[Moment; 2], count: fn(&Moment) -> u64) -> f64 {
     let seconds = (last.at - first.at).as_secs_f64();
     (count(last) - count(first)) as f64 / seconds
 }
 
-/// What the processes report, and when.
+/// The statuses of the processes, and when they were read.
 #[derive(Clone)]
 struct Moment {
     at: Instant,
@@ -174,7 +174,7 @@ struct Moment {
     learner: LearnerStatus,
 }
 
-/// A run of bigfish with driml-ada, which ends when this is dropped.
+/// A run of bigfish with driml-ada. Dropping the value ends the run.
 struct Run {
     launcher: ManagedProcess,
     poller: Poller,
@@ -198,7 +198,7 @@ impl Run {
         })
     }
 
-    /// What the processes report now; none while they do not answer, as they start after the replay server and end before it.
+    /// Requests the statuses; `None` while a process does not answer, as they start after the replay server and end before it.
     fn look(&mut self) -> anyhow::Result<Option<Moment>> {
         if self.launcher.end().is_some() {
             bail!("{}", self.launcher.exit_report());
@@ -214,7 +214,7 @@ impl Run {
         }))
     }
 
-    /// The first moment that is as `wanted`.
+    /// Waits for the first moment that satisfies `wanted`.
     fn wait_until(&mut self, wanted: impl Fn(&Moment) -> bool) -> anyhow::Result<Moment> {
         let started = Instant::now();
         loop {
@@ -230,10 +230,10 @@ impl Run {
         }
     }
 
-    /// The first moment after the learner's warm-up, and the last one at which both sides were still at work.
+    /// Returns the first moment after the learner's warm-up, and the last one at which both sides were still at work.
     fn watch_to_end(&mut self) -> anyhow::Result<[Moment; 2]> {
         let (mut first, mut last) = (None, None);
-        // The run ends by itself; then it can no longer be looked at.
+        // The run ends by itself; then it no longer answers.
         while let Ok(moment) = self.look() {
             thread::sleep(POLL);
             let Some(moment) = moment else { continue };
@@ -255,7 +255,7 @@ impl Run {
         }
     }
 
-    /// Waits for the run's end, with this exit code, and gives its summary.
+    /// Waits until the run ends with this exit code, and returns its summary.
     fn finish(mut self, code: i32) -> anyhow::Result<Summary> {
         self.poller.close();
         let deadline = Instant::now() + WAIT_MAX;

@@ -1,11 +1,11 @@
-//! A world of one's own: an island with a treasure on it, at another place in each episode.
+//! A custom world: an island with a treasure on it, at another place in each episode.
 
 use driml_envs::{Built, EnvError, Environment, FrameShape, StepEnd, WorldSettings};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
-/// Pixels a side of a field.
+/// The side of a field, in pixels.
 const FIELD: usize = 2;
 
 /// What each action adds to row and column.
@@ -15,11 +15,11 @@ const MOVES: [(isize, isize); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct IslandConfig {
-    /// Fields a side, 2 to 32.
+    /// The side of the island, in fields: 2 to 32.
     side: usize,
     /// Env steps after which an episode is cut off, at least 1.
     step_limit: u32,
-    /// What the treasure earns.
+    /// The reward of the treasure.
     reward: f32,
 }
 
@@ -60,7 +60,7 @@ struct Island {
 }
 
 impl Island {
-    /// An island depends on the seed and its own number alone, so that it is the same whatever the others are.
+    /// Makes the island number `env`. It depends on the seed and this number alone, whatever the other islands are.
     fn new(seed: u64, env: usize, side: usize) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(env as u64);

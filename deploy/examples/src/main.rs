@@ -1,6 +1,6 @@
-//! `driml` with a custom world and a custom auxiliary loss: `cargo run --release -p driml-examples -- local --env island --agent predictive`.
-//! What it adds stands in two files beside this one; nothing of the project is changed. A package of yours looks the same, with
-//! dependencies on the crates by their git address. The launcher starts every process from this same program, so all know of both.
+//! `driml` with a custom world and auxiliary loss: `cargo run --release -p driml-examples -- local --env island --agent predictive`.
+//! The additions are in two files beside this one; the project itself is unchanged. Your own package looks the same, with git dependencies
+//! on the crates. The launcher starts every process from this same program, so all have both additions.
 
 mod island;
 mod prediction;

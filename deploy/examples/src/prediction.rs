@@ -1,6 +1,6 @@
 //! A custom auxiliary loss with an extra layer: features of s_t predict those of s_{t+1}.
-//! With nothing to hold them apart all features would become one: its weight stays small, and the return keeps them useful.
-//! Source: the latent dynamics of DeepMDP (Gelada et al. 2019), without the action; no gradient through what is predicted.
+//! Alone, this loss would make all features equal: its weight stays small, and the loss of the return keeps the features useful.
+//! Source: the latent dynamics of DeepMDP (Gelada et al. 2019), without the action; no gradient flows through the predicted features.
 
 use candle_core::{D, DType, Tensor};
 use driml_learner::{
@@ -13,7 +13,7 @@ use driml_learner::{
 use driml_model::{LossLayer, ModelConfig};
 use serde::Deserialize;
 
-/// Its line of the menu: `learner.update.auxiliary_loss = "prediction"`, one later state a row, one column `prediction` in
+/// The menu entry of the loss: `learner.update.auxiliary_loss = "prediction"`, one later state per row, and one column `prediction` in
 /// `metrics.csv`.
 pub(crate) static PREDICTION: MenuItem = MenuItem {
     name: NAME,
@@ -25,7 +25,7 @@ pub(crate) static PREDICTION: MenuItem = MenuItem {
 /// The name of the loss, and of its layer.
 const NAME: &str = "prediction";
 
-/// Its own table, `[learner.update.prediction]`.
+/// The settings of the loss, in the table `[learner.update.prediction]`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PredictionSettings {
@@ -50,7 +50,7 @@ struct Prediction {
 }
 
 impl AuxiliaryLoss for Prediction {
-    /// From the features of s_t to those of s_{t+1}.
+    /// Returns the one layer, from the features of s_t to those of s_{t+1}.
     fn layers(&self, model: &ModelConfig) -> Vec<LossLayer> {
         vec![LossLayer {
             name: NAME.to_owned(),
@@ -70,7 +70,7 @@ impl AuxiliaryLoss for Prediction {
         batch.positive_states(state_bytes)
     }
 
-    /// The mean over the rows with a next state of |W f4(s_t) + b - f4(s_{t+1})|^2 / D, D the width of f4; 0 if no row has one.
+    /// Returns the mean over the rows with a next state of |W f4(s_t) + b - f4(s_{t+1})|^2 / D, D the width of f4; 0 if no row has one.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());

@@ -17,7 +17,7 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
     let last: f64 = last.parse().expect("it is a number");
     assert!(last.is_finite() && last >= 0.0, "{last}");
 
-    // The settings hold all that another run needs.
+    // The settings of a run contain all that repeats it.
     let hashes = [("first", flags), ("again", "--config first/config.toml")].map(|(name, args)| {
         let trained = system.train(&format!("--lockstep {args}"), name);
         trained.weights_sha256

@@ -30,7 +30,7 @@ pub(crate) struct ActorArgs {
     pub(crate) join: JoinFlags,
 }
 
-/// An actor's number, given as such or by the name of the variable that holds it.
+/// Parses an actor's number, or `env:NAME`, where the environment variable NAME holds the number.
 fn actor_id(text: &str) -> Result<u32, String> {
     let Some(name) = text.strip_prefix("env:") else {
         return text.parse().map_err(|_| {

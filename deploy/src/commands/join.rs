@@ -1,4 +1,4 @@
-//! What the commands that take part in a run share: how they reach it, and what they leave when they end.
+//! Code of all commands that join a run: how they reach the run, and how they clean up when they exit.
 
 use std::{io, path::PathBuf, sync::Arc};
 
@@ -11,7 +11,7 @@ use driml_protocol::{
     tls::{Credentials, Role},
 };
 
-/// How a process reaches the run.
+/// Flags for how a process reaches the run.
 #[derive(Debug, Args)]
 pub(crate) struct JoinFlags {
     /// Prefix of the run's keys
@@ -22,7 +22,7 @@ pub(crate) struct JoinFlags {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// When a replay server or a learner ends.
+/// The flag for when a replay server or a learner exits.
 #[derive(Debug, Args)]
 pub(crate) struct KeepAliveFlag {
     /// After the run, keep answering until Ctrl-C or a signal
@@ -30,7 +30,7 @@ pub(crate) struct KeepAliveFlag {
     pub(super) keep_alive: bool,
 }
 
-/// With which certificate a process takes part.
+/// The flag for the certificates of a process.
 #[derive(Debug, Args)]
 pub(crate) struct TlsFlags {
     /// Use mutual TLS with the certificates in DIR, made by deploy/certs.sh; endpoints are then quic/HOST:PORT (over UDP) or unix
@@ -40,7 +40,7 @@ pub(crate) struct TlsFlags {
     pub(crate) tls_dir: Option<PathBuf>,
 }
 
-/// Whether every client that can connect is trusted.
+/// The flag to trust every client that can connect.
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
     /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run
@@ -60,7 +60,7 @@ impl TlsFlags {
     }
 }
 
-/// Checks how a process reaches the run, and starts to `listen` for signals.
+/// Checks the flags, and calls `listen` to listen for signals.
 pub(super) fn join<T>(
     flags: &JoinFlags,
     listen: fn(Option<u32>) -> io::Result<T>,

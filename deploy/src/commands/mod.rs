@@ -1,4 +1,4 @@
-//! One file a command: its flags and what it does with them.
+//! One file per command: its flags, and what the command does with them.
 
 pub(crate) mod actor;
 pub(crate) mod completions;

@@ -1,4 +1,4 @@
-//! `driml parity`: the learner's arithmetic beside updates that were computed elsewhere in float64.
+//! `driml parity`: compares the learner's arithmetic with updates that were computed elsewhere in float64.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! `driml presets`: what there is to start from, or all settings of one game and agent with their sources.
+//! `driml presets`: lists worlds, agents and presets, or prints all settings of one game and agent with their sources.
 
 use clap::Args;
 use driml_launch::console::print;
@@ -18,7 +18,7 @@ pub(crate) struct PresetsArgs {
     pub(crate) preset: Option<String>,
 }
 
-/// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` takes.
+/// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` accepts.
 pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.env.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);

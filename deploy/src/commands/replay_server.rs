@@ -1,4 +1,4 @@
-//! `driml replay-server`: the replay server of a run, which hands its settings to the others.
+//! `driml replay-server`: the replay server of a run, which sends the settings to the other processes.
 
 use std::path::PathBuf;
 

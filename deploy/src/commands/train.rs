@@ -1,5 +1,5 @@
-//! `driml train`: settings, plan, engine, run folder, and then the processes, as processes or in lockstep.
-//! Starting and ending them is for `driml_launch::launcher`.
+//! `driml train`: prepares settings, plan, engine and run folder, and then runs as separate processes or in lockstep.
+//! `driml_launch::launcher` starts and ends the processes.
 
 use std::path::PathBuf;
 
@@ -22,9 +22,9 @@ use driml_settings::{
 
 use super::join::{NetworkFlag, TlsFlags};
 
-/// Characters of a world's name that stand in the name of a run's folder.
+/// The most characters of a world's name in the name of a run folder.
 const WORLD_CHARS_MAX: usize = 40;
-/// What a run that is resumed has from its folder.
+/// The arguments that a resumed run takes from its folder.
 const RESUMED: &str = "env agent preset config actors replay_shards envs seed run_dir lockstep";
 
 #[derive(Debug, Args)]
@@ -73,7 +73,7 @@ pub(crate) struct TrainArgs {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// The presets' `learner.checkpoint_period_updates`, but for `smoke`, whose is a divisor of it.
+/// The `learner.checkpoint_period_updates` of all presets except `smoke`, whose period divides this one.
 const CHECKPOINT_PERIOD: u64 = 1_000;
 
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
@@ -90,7 +90,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     if let Some(every) = args.eval_interval {
         let episodes = args.eval_episodes;
         if !every.is_multiple_of(CHECKPOINT_PERIOD) {
-            // Before what the user sets: checkpoints may be more frequent.
+            // Insert this before the user's settings, which may make checkpoints more frequent.
             sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
         }
         sets.push(format!(
@@ -114,7 +114,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         }
         None => {
             let (mut config, from) = resolve(&args.run, &machine)?;
-            // Of the run that a file's settings are of.
+            // `since` belongs to the run from which the file's settings come.
             config.replay.since = None;
             (config, from, None)
         }
@@ -127,7 +127,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             "--tls-dir is for processes on other machines, which need an endpoint: add --listen quic/HOST:PORT"
         ));
     }
-    // Errors in them are reported before anything is made.
+    // Report errors in the certificates before anything is created.
     args.tls.credentials(Role::ReplayServer)?;
     ready_for(config.local.learner_device)?;
     check(&config, args.lockstep)?;
@@ -156,7 +156,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
 }
 
-/// Whether this program can start the run: as processes, or in lockstep, which is one process and keeps its replay whole.
+/// Checks that this program can start the run: as processes, or in lockstep, which is one process with one replay for all actors.
 fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
     let (replay, actors) = (&config.replay, config.local.actors);
     let shards = replay.shards;
@@ -165,7 +165,7 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
             "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
         ));
     }
-    // All actors are started here: the ladder of epsilons is theirs, no rung empty.
+    // All actors are started here, so the ladder of epsilons must have exactly one rung for each.
     if let Some(ladder) = &config.actor.epsilon_ladder
         && ladder.actors != actors
     {
@@ -198,7 +198,7 @@ fn default_run_dir(run: &RunSpec) -> PathBuf {
     PathBuf::from(format!("runs/{world}-{agent}-seed{seed}-{time}"))
 }
 
-/// A world's name as a part of a file's: the command of `exec:` has blanks and slashes, and any length.
+/// Converts a world's name to a part of a file name. The command of `exec:` may have blanks, slashes and any length.
 fn file_name_of(world: &str) -> String {
     let is_kept = |it: char| it.is_ascii_alphanumeric() || "._-".contains(it);
     let chars = world.chars().map(|it| if is_kept(it) { it } else { '-' });

@@ -1,4 +1,4 @@
-//! `driml watch` and `driml status`: how a run goes, on whatever machines its processes are and however they were started.
+//! `driml watch` and `driml status`: show the state of a run, wherever its processes are and however they were started.
 
 use std::path::PathBuf;
 
@@ -13,7 +13,7 @@ use driml_protocol::tls::Role;
 
 use super::join::TlsFlags;
 
-/// Which run is looked at.
+/// Flags that select a run.
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("whose").required(true))]
 pub(crate) struct LookFlags {
@@ -65,7 +65,7 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
 }
 
 impl LookFlags {
-    /// A connection to the run, or how it stands if it cannot be asked.
+    /// Opens a connection to the run, or returns the run's state if it cannot be asked.
     fn open(&self) -> anyhow::Result<Asked<Poller>> {
         check_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
@@ -74,7 +74,7 @@ impl LookFlags {
             Err(over) => return Ok(Err(over)),
         };
         let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
-        // It may have ended meanwhile.
+        // The run may have ended meanwhile.
         if opened.is_err()
             && let Err(over) = self.endpoints()?
         {

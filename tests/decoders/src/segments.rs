@@ -57,7 +57,7 @@ fn open(dir: &Path) -> Result<Replay, String> {
         mark: None,
     };
     let config = Config {
-        // With 0 there is no thread that flushes.
+        // 0 starts no thread that flushes.
         fsync_ms: Some(0),
         ..Config::unlimited(CAPACITY)
     };

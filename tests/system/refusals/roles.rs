@@ -1,4 +1,4 @@
-//! A certificate permits the messages of its own role and number, and nothing else, whatever its holder sends.
+//! A certificate permits the messages of one role and number, and nothing else, whatever its holder sends.
 //! Which clients are admitted at all is in `tls`.
 
 use std::sync::{

@@ -1,5 +1,5 @@
-//! `driml bench peers`: ours and theirs in turn, round after round, and the ratio of each pair beside its goal.
-//! What is compared with what is in `pairs`; a goal that is missed is shown and is not an error.
+//! `driml bench peers`: measures our program and its peers in turn, round after round, and shows each ratio beside its goal.
+//! `pairs` lists the comparisons. A goal that is missed is shown and is not an error.
 
 mod pairs;
 mod script;
@@ -25,16 +25,16 @@ use crate::{
     report::{self, Figures},
 };
 
-/// The load above which something else is running, which slows the two sides unequally.
+/// The load above which another program is running, which slows the two sides unequally.
 const LOAD_MAX: f64 = 0.5;
-/// Rounds, and those of a quick comparison.
+/// The number of rounds, and that of a quick comparison.
 const ROUNDS: (u32, u32) = (5, 1);
 
-/// A component's figures, and its peer's or why there are none.
+/// A component's figures, and those of its peer or the reason why there are none.
 #[derive(Debug, Default)]
 struct Sides {
     ours: Figures,
-    /// Values of the rounds.
+    /// The values of each figure in the order of the rounds.
     theirs: BTreeMap<String, Vec<f64>>,
     peer: String,
     absent: Option<String>,
@@ -53,13 +53,13 @@ struct Row {
     peer: String,
     /// Median over the rounds; none if skipped.
     theirs: Option<f64>,
-    /// Median over the rounds of ours by theirs, as the machine's speed drifts from round to round.
+    /// The median over the rounds of ours / theirs, taken in each round because the machine's speed drifts from round to round.
     ratio: Option<f64>,
-    /// That of each round.
+    /// The ratio in each round.
     ratios: Vec<f64>,
-    /// The least ratio that is wanted, if one is.
+    /// The goal: the lowest ratio that is wanted, if any.
     goal: Option<f64>,
-    /// Why there is nothing of the peer's.
+    /// The reason why the peer has no figure.
     skipped: Option<String>,
 }
 
@@ -69,7 +69,7 @@ struct Comparison {
     rounds: u32,
     quick: bool,
     threads: u32,
-    /// Before the first measurement.
+    /// The machine, as it was before the first measurement.
     machine: MachineNote,
     rows: Vec<Row>,
 }
@@ -146,14 +146,14 @@ impl Sides {
         }
     }
 
-    /// Measures on without the peer.
+    /// Continues the measurements without the peer.
     fn skip(&mut self, why: String) {
         console::line(&format!("skipped: {why}"));
         self.absent = Some(why);
     }
 }
 
-/// Medians and ratio of one pair; none if ours was not measured, as in a precision that was not asked for.
+/// Returns medians and ratio of one pair; `None` if ours was not measured, as in a precision that was not selected.
 fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     let (ours, unit) = sides.ours.of(&pair.ours)?;
     let what = &pair.theirs;
@@ -172,7 +172,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
         Some(why) => why.clone(),
         None => format!("{peer} was not measured"),
     };
-    // In a later round: what it measured before is not the whole comparison.
+    // A peer may fail in a later round; its earlier values are not the whole comparison.
     let failed = pair.of_ours.is_none() && sides.absent.is_some();
     Some(Row {
         component: pair.component.name(),
@@ -188,7 +188,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     })
 }
 
-/// The table, and below it why rows were skipped.
+/// Returns the table, and below it the reasons why rows were skipped.
 fn describe(comparison: &Comparison) -> String {
     let heads = ["what", "ours", "theirs", "", "", "ratio", "goal", ""];
     let mut cells = vec![heads.map(String::from).to_vec()];

@@ -1,5 +1,5 @@
-//! Which figure of ours is compared with which of theirs, and the ratio that is wanted.
-//! It measures nothing; names are those of the benches and of the scripts in `deploy/bench/peers/`.
+//! The list of comparisons: a figure of ours, a figure of theirs, and the ratio that is wanted.
+//! This file measures nothing. The names are those of the benches and of the scripts in `deploy/bench/peers/`.
 
 use crate::{
     env,
@@ -19,9 +19,9 @@ pub(super) struct Pair {
     pub(super) ours: String,
     /// The name of the figure that it is compared with.
     pub(super) theirs: String,
-    /// None if that is the peer's; else another one of ours, and what it stands for.
+    /// `None` if `theirs` is a figure of the peer. Else it is another figure of ours, and this describes it.
     pub(super) of_ours: Option<&'static str>,
-    /// The least ratio of ours to theirs that is wanted; none where it is only of interest.
+    /// The lowest ratio of ours to theirs that is wanted; `None` without a goal.
     pub(super) goal: Option<f64>,
 }
 
@@ -41,7 +41,7 @@ pub(super) fn pairs() -> Vec<Pair> {
             goal,
         });
     };
-    // In bf16 beside the faster of PyTorch's f32 and bf16 autocast; that goal is for AVX512_BF16, with AMX it is 3.
+    // The peer in bf16 is the faster of PyTorch's f32 and bf16 autocast. The goals in bf16 are for AVX512_BF16; with AMX the goal is 3.
     for (case, f32, bf16) in [
         ("C51", None, None),
         ("C51 + global-global DIM", Some(1.3), Some(1.6)),
@@ -77,14 +77,14 @@ pub(super) fn pairs() -> Vec<Pair> {
         ("tcp", 12.0, 1.5),
     ] {
         for chunk in CHUNKS {
-            // What an actor sends.
+            // Only the chunk that an actor sends has a goal.
             let goal = (chunk.transitions() == 256).then_some(insert);
             let name = insert_name(chunk.transitions(), wire);
             add(Replay, &name, "insert", goal);
         }
         let name = format!("batch of 3 states, {wire}");
         add(Replay, &name, "batch of 3 states", Some(batch));
-        // With k chosen by the client, as only a sequence allows it there.
+        // In Reverb the client can choose k only within a sequence.
         let sequences = "batch of sequences of 8 states";
         add(Replay, &name, sequences, None);
     }

@@ -1,5 +1,5 @@
 //! Both sides of a comparison as processes: this program's bench, and Python scripts that do the same work.
-//! It installs nothing, and says what is missing.
+//! This file installs nothing, and reports what is missing.
 
 use std::{
     collections::BTreeMap,
@@ -16,7 +16,7 @@ use crate::{
     report::{Measurement, Report},
 };
 
-/// The scripts, which this program carries, so that it can be started anywhere.
+/// The scripts, which are embedded in the program so that it can be started anywhere.
 pub(super) const FILES: [(&str, &str); 6] = [
     ("measure.py", include_str!("../../peers/measure.py")),
     ("driml_net.py", include_str!("../../../python/driml_net.py")),
@@ -35,13 +35,13 @@ pub(super) const FILES: [(&str, &str); 6] = [
     ("gym3_steps.py", include_str!("../../peers/gym3_steps.py")),
 ];
 
-/// A component's peer: its script and how it is called.
+/// The script of a component's peer, and its arguments.
 pub(super) struct Script {
     /// The peer's name in tables and messages.
     pub(super) peer: &'static str,
-    /// The Python module that it takes.
+    /// The Python module that the script needs.
     module: &'static str,
-    /// Its name in that of its requirements and of the flag for its interpreter.
+    /// The peer's short name, in the name of its requirements file and of the flag for its interpreter.
     short: &'static str,
     python: PathBuf,
     file: &'static str,
@@ -52,14 +52,14 @@ pub(super) struct Script {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Answer {
-    /// Name and version.
+    /// The peer's name and version.
     peer: String,
-    /// By what was measured, as ours.
+    /// The figures by their names, which match ours.
     figures: BTreeMap<String, f64>,
 }
 
 impl Script {
-    /// The script that does a component's work; `frames` is the file that Reverb's frames come from.
+    /// Returns the script that does a component's work; `frames` is the file with the frames for Reverb.
     pub(super) fn new(
         component: Component,
         args: &BenchPeersArgs,
@@ -92,7 +92,7 @@ impl Script {
         }
     }
 
-    /// Whether the interpreter is there and finds the peer's module; else why there are no figures, for the table.
+    /// Checks that the interpreter exists and finds the peer's module. The error says, for the table, why there are no figures.
     pub(super) fn check(&self) -> Result<(), String> {
         let find =
             "import importlib.util, sys; sys.exit(importlib.util.find_spec(sys.argv[1]) is None)";
@@ -113,7 +113,7 @@ impl Script {
         }
     }
 
-    /// Runs the script in `folder` and gives its peer's name with version, and its figures. Its progress goes to stderr.
+    /// Runs the script in `folder`. Returns the peer's name with version, and its figures. Progress goes to stderr.
     pub(super) fn run(&self, folder: &Path) -> anyhow::Result<(String, BTreeMap<String, f64>)> {
         let mut command = Command::new(&self.python);
         command.arg(folder.join(self.file)).args(&self.args);
@@ -126,7 +126,7 @@ impl Script {
     }
 }
 
-/// Runs this program for a component's figures. Its progress goes to stderr.
+/// Runs this program's bench of a component and returns the figures. Progress goes to stderr.
 pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
     let mut command = Command::new(process_env::program());
     command.args(["bench", &component.name(), "--json", "-"]);
@@ -140,7 +140,7 @@ pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<V
     Ok(report.figures)
 }
 
-/// What a process writes to stdout.
+/// Runs a process and returns its standard output.
 fn output(mut command: Command, what: &str) -> anyhow::Result<String> {
     command.stdin(Stdio::null()).stderr(Stdio::inherit());
     let output = command.output();

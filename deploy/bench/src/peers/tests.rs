@@ -73,7 +73,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
 #[test]
 fn every_peer_s_figure_is_named_in_its_script() {
     for pair in pairs() {
-        // Names that a script puts together are checked by running it; the precision is one it appends.
+        // Names that a script composes are checked by running it. The script also appends the precision.
         let name = pair.theirs.as_str();
         let name = name.strip_suffix(", bf16").unwrap_or(name);
         let is_whole = matches!(pair.component, Component::Learner | Component::Replay);

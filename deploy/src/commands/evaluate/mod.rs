@@ -1,5 +1,5 @@
-//! `driml evaluate`: whole episodes with a run's weights or an exported network's, and a random policy's beside them; a film of them on
-//! request.
+//! `driml evaluate`: plays whole episodes with the weights of a run or an exported network, and with a random policy for comparison. Makes
+//! a film of them on request.
 
 mod recording;
 mod tile;
@@ -126,7 +126,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::line)?;
-    // Before an hour of playing, after which what it holds is replaced.
+    // Open the file before an hour of playing; its content is replaced only after that.
     let table = args.returns.as_ref().map(|path| {
         let file = File::options().create(true).append(true).open(path);
         let file = file.with_context(|| format!("--returns {}", path.display()))?;
@@ -208,7 +208,7 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     ))
 }
 
-/// What an evaluation says of the run's best checkpoint.
+/// Returns how the checkpoint compares with the run's best one, as the end of a sentence.
 fn verdict(judged: &Judged) -> String {
     match &judged.best_before {
         _ if judged.is_best => ", the most so far".into(),
@@ -225,7 +225,7 @@ fn describe(name: &str, returns: &[f64]) -> String {
     format!("{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n")
 }
 
-/// Who played, and the returns of the episodes.
+/// The name of a policy, and the returns of its episodes.
 type Played<'a> = (&'a str, Vec<f64>);
 
 fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {

@@ -1,5 +1,5 @@
 //! A film of what the agent plays: which environments, for how long, and what stands beside each frame.
-//! It watches: nothing that is played depends on it.
+//! Filming does not change what is played.
 
 use std::{collections::VecDeque, path::PathBuf};
 
@@ -15,7 +15,7 @@ use driml_protocol::Horizon;
 
 use super::tile::{Layout, Local, Shot};
 
-/// Times as long as others that the last picture of an episode is shown, where one environment is.
+/// How many times longer than others the last picture of an episode is shown, if one environment is filmed.
 const PAUSE: f64 = 8.0;
 
 #[derive(Debug, Args)]
@@ -41,14 +41,14 @@ pub(crate) struct Recording {
     path: PathBuf,
     film: Film,
     layout: Layout,
-    /// Asked what the network makes of the states, if that is shown.
+    /// Computes the network's outputs for the states, if they are shown.
     viewer: Option<Viewer>,
-    /// The newest of each environment; the last one stays once all its episodes are filmed.
+    /// The newest shot of each environment. The last one stays once all episodes of the environment are filmed.
     shots: Vec<Shot>,
     episodes_max: u32,
     steps_max: u32,
     steps: u32,
-    /// Steps that are not drawn yet, as local DIM is asked what came after them.
+    /// Steps that are not drawn yet, because local DIM compares them with later states.
     waiting: VecDeque<Moment>,
     failed: Option<anyhow::Error>,
 }
@@ -62,7 +62,7 @@ struct Moment {
 }
 
 impl Recording {
-    /// Begins the film of an evaluation of so many episodes, if one is asked for. One that is dropped leaves no file.
+    /// Begins the film of an evaluation of `episodes` episodes, if the flags ask for one. Dropping an unfinished film leaves no file.
     pub(crate) fn begin(
         args: &RecordArgs,
         player: &Player,
@@ -88,7 +88,7 @@ impl Recording {
         let layout = Layout::new(&player.config, envs, viewer.is_some(), local);
         let rate = player.config.world.steps_per_second();
         let film = Film::create(path, layout.size, rate).map_err(cannot)?;
-        // As if an episode had ended before the first.
+        // Start as if an episode had ended before the first.
         let before = Shot {
             is_last: true,
             ..Shot::default()
@@ -124,7 +124,7 @@ impl Recording {
         let frames = step.frames.chunks_exact(step.frames.len() / played);
         let mut seen = None;
         if let Some(viewer) = &mut self.viewer {
-            // Other environments than the filmed are what local DIM tells a state from.
+            // Local DIM tells a state from those of all environments, not only of the filmed ones.
             let looked_at = match self.layout.local {
                 Some(_) => played,
                 None => self.shots.len(),
@@ -152,12 +152,12 @@ impl Recording {
         Ok(())
     }
 
-    /// Steps from one to that of which local DIM is asked; 0 where it is not.
+    /// Returns the number of steps from a state to the later state that local DIM is asked about; 0 without local DIM.
     fn ahead(&self) -> usize {
         self.layout.local.as_ref().map_or(0, |it| it.k)
     }
 
-    /// Draws the step that waits longest, with what local DIM says of the one [`ahead`](Self::ahead) of it, if that was played.
+    /// Draws the oldest waiting step, with local DIM's result for the state [`ahead`](Self::ahead) of it if that was played.
     fn draw_next(&mut self) -> anyhow::Result<()> {
         let Some(moment) = self.waiting.pop_front() else {
             return Ok(());
@@ -174,7 +174,7 @@ impl Recording {
         let (width, height) = self.layout.size;
         let mut picture = Picture::new(width, height)?;
         for (i, shot) in moment.shots.iter().enumerate() {
-            // The end of an episode lies between a state and the one looked for: there is nothing to know.
+            // If the episode ends between a state and the later one, local DIM has nothing to recognise.
             let mut before = self.waiting.iter().take(between).chain([&moment]);
             let continues = !shot.is_last && before.all(|it| it.ends[i] == StepEnd::Running);
             let matches = matches.as_deref().filter(|_| continues);
@@ -185,7 +185,7 @@ impl Recording {
         Ok(())
     }
 
-    /// Ends the film, and says what it shows.
+    /// Ends the film, and returns a sentence about its content.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
         while self.failed.is_none() && !self.waiting.is_empty() {
             self.failed = self.draw_next().err();
@@ -205,7 +205,7 @@ impl Shot {
         self.is_last && self.episode == episodes_max
     }
 
-    /// Takes the next step of its environment `i`.
+    /// Updates this shot with the next step of its environment `i`.
     fn follow(&mut self, frame: &[u8], step: &Step<'_>, i: usize) {
         if self.is_last {
             (self.episode, self.step, self.total) = (self.episode + 1, 0, 0.0);
@@ -220,7 +220,7 @@ impl Shot {
     }
 }
 
-/// A film that cannot be begun is a flag that cannot work.
+/// Reports a film that cannot be begun as a wrong flag.
 fn cannot(error: FigureError) -> Usage {
     match &error {
         FigureError::Write { path, source } => {

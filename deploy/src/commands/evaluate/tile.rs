@@ -1,20 +1,20 @@
-//! One filmed environment in a picture: its frame, enlarged, and beside it what the network makes of it. Where things stand, and their words.
-//! It asks no network: it is told.
+//! Layout and texts of one filmed environment in a picture: its enlarged frame, and beside it the network's outputs.
+//! This file does not call the network; it receives the outputs.
 
 use driml_envs::FrameShape;
 use driml_figure::{Image, Ink, Picture, Rect};
 use driml_learner::insight::Seen;
 use driml_settings::config::RunConfig;
 
-/// Pixels that the longer side of a frame is enlarged to, or nearly: each pixel becomes a square of whole pixels.
+/// The approximate length of an enlarged frame's longer side, in pixels. The zoom is a whole number.
 const FRAME_SIDE: usize = 224;
-/// Pixels around and between what is shown.
+/// The margin around and between the elements, in pixels.
 const MARGIN: f64 = 10.0;
-/// Pixels across of the words and bars.
+/// The width of the panel of words and bars, in pixels.
 const PANEL_WIDTH: f64 = 216.0;
-/// Pixels down of the words and bars at least.
+/// The least height of the panel of words and bars, in pixels.
 const PANEL_HEIGHT: f64 = 230.0;
-/// Pixels from line to line.
+/// The distance between lines of text, in pixels.
 const LEADING: f64 = 19.0;
 
 /// An environment's newest step.
@@ -22,7 +22,7 @@ const LEADING: f64 = 19.0;
 pub(super) struct Shot {
     /// The newest frame [H, W, C] in which the action was taken.
     pub(super) frame: Vec<u8>,
-    /// Counted from 1.
+    /// The number of the episode, from 1.
     pub(super) episode: u32,
     pub(super) step: u32,
     /// The episode's return up to this step's reward.
@@ -30,27 +30,27 @@ pub(super) struct Shot {
     pub(super) reward: f64,
     pub(super) action: u8,
     pub(super) is_last: bool,
-    /// None where the network is not asked.
+    /// `None` if the network is not asked.
     pub(super) look: Option<Look>,
 }
 
-/// What the network makes of a state.
+/// The network's outputs for a state.
 #[derive(Clone, Debug)]
 pub(super) struct Look {
-    /// [A].
+    /// Q-values [A].
     q_values: Vec<f32>,
-    /// [N]: of the action that was taken.
+    /// The return distribution [N] of the action that was taken.
     probabilities: Vec<f32>,
 }
 
-/// What local DIM is asked: which places of a later state it knows.
+/// The question to local DIM: which locations of a later state it recognises.
 #[derive(Debug)]
 pub(super) struct Local {
     /// Steps from a state to the later one.
     pub(super) k: usize,
     pub(super) rows: usize,
     pub(super) columns: usize,
-    /// States among which it looks: those of all environments that are played.
+    /// The number of states among which local DIM chooses: those of all environments that are played.
     pub(super) candidates: usize,
 }
 
@@ -58,20 +58,20 @@ pub(super) struct Local {
 pub(super) struct Layout {
     frame: FrameShape,
     zoom: usize,
-    /// Pixels across and down of a frame on the screen, and of all that is shown of an environment.
+    /// Width and height of an enlarged frame, and of the whole tile of an environment, in pixels.
     enlarged: (f64, f64),
     tile: (f64, f64),
     columns: usize,
-    /// Pixels across and down of a picture.
+    /// Width and height of a picture, in pixels.
     pub(super) size: (usize, usize),
-    /// None where the agent has no such loss, or there is nothing to tell a state from.
+    /// `None` if the agent has no such loss, or there are no other states to choose among.
     pub(super) local: Option<Local>,
     action_names: Vec<String>,
     support: Vec<f32>,
 }
 
 impl Layout {
-    /// Of `envs` filmed environments.
+    /// Makes the layout of `envs` filmed environments.
     pub(super) fn new(
         config: &RunConfig,
         envs: usize,
@@ -84,7 +84,7 @@ impl Layout {
         let zoom = ((FRAME_SIDE + longer / 2) / longer).max(1);
         let enlarged = ((width * zoom) as f64, (height * zoom) as f64);
         let mut tile = enlarged;
-        // Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
+        // Without panels, up to four tiles stand side by side; with panels, up to four stand below each other.
         let mut columns = envs.clamp(1, 4);
         if has_panel {
             tile.0 += MARGIN + PANEL_WIDTH;
@@ -111,7 +111,7 @@ impl Layout {
         }
     }
 
-    /// What was `seen` of environment `i`, in which this action was taken.
+    /// Returns the outputs in `seen` for environment `i`, in which `action` was taken.
     pub(super) fn look(&self, seen: &Seen, i: usize, action: u8) -> Look {
         let (actions, atoms) = (self.action_names.len(), self.support.len());
         let taken = i * actions + usize::from(action);
@@ -121,8 +121,8 @@ impl Layout {
         }
     }
 
-    /// Draws the shot of environment `i`, and with which probability local DIM knows each location of the later states [B, L]; none
-    /// where it was not asked.
+    /// Draws the shot of environment `i`. `matches` are the probabilities [B, L] with which local DIM recognises each location of the later
+    /// states; `None` if it was not asked.
     pub(super) fn draw(
         &self,
         picture: &mut Picture,
