@@ -18,7 +18,7 @@ const RECIPES: [(&str, &str); 6] = [
     ("systemd/driml-actor@.service", "actor"),
 ];
 
-/// The values of the place holders in the recipes.
+/// The values of the placeholders in the recipes.
 const VALUES: [(&str, &str); 8] = [
     ("${DRIML_ENV:-procgen:coinrun}", "procgen:coinrun"),
     ("${DRIML_AGENT:-driml-ada}", "driml-ada"),

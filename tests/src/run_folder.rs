@@ -134,7 +134,7 @@ impl RunFolder {
         assert_eq!(rows.len() as u64, summary.episodes, "each has a row");
     }
 
-    /// A process's log.
+    /// Returns the log of a process.
     pub fn log(&self, process: &str) -> String {
         self.text(&format!("logs/{process}.log"))
     }

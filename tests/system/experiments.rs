@@ -290,7 +290,7 @@ fn a_grid_makes_every_combination_once() {
     let system = system();
     let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";
     let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
-    // What cannot work is rejected before anything starts.
+    // A grid that cannot work is rejected before anything starts.
     let unfit = format!("{fixed} --set learner.update.adam.lr=1e-4,fast");
     system.refuses(&unfit, "agent=c51").expect_said("lr=fast");
     let twice = format!("{call} --set learner.update.adam.lr=1");

@@ -135,7 +135,7 @@ fn what_cannot_be_resumed() {
         local --resume kept --frames 2000 --durable => lacks what the run did later
         ",
     );
-    // Nothing was changed.
+    // The rejected calls have changed nothing.
     for run in ["run", "step", "kept", "rainbow"] {
         system.run_ok(&format!("evaluate {run} --episodes 2"));
         system.run_ok(&format!("local --resume {run} --frames 2000"));

@@ -18,7 +18,7 @@ pub(super) const REPLAY: [&str; 5] = [
 ];
 /// The capacity in [`REPLAY`], in transitions.
 pub(super) const CAPACITY: u64 = 20_000;
-/// The agent whose k is drawn along the stored actions.
+/// The agent of most figures, which draws k along the stored actions.
 pub(super) const AGENT: &str = "driml-ada";
 
 /// Returns the settings of a run: world, agent and preset, overridden by single settings.
