@@ -21,8 +21,17 @@ struct Unflushed {
     folder: Option<Arc<File>>,
     /// Segments of which a flush failed. The system says so once, and may then take what it has lost for written.
     lost: BTreeSet<u64>,
+    /// Segments with smaller numbers were removed, perhaps during a flush.
+    oldest: u64,
     /// When the last flush began that succeeded while no segment was lost.
     flushed: Instant,
+}
+
+impl Unflushed {
+    fn forget_removed(&mut self) {
+        self.segments = self.segments.split_off(&self.oldest);
+        self.lost = self.lost.split_off(&self.oldest);
+    }
 }
 
 struct Shared {
@@ -50,6 +59,7 @@ impl Shared {
             unflushed.segments.extend(segments);
             unflushed.folder = unflushed.folder.take().or(folder);
             unflushed.lost.extend(lost);
+            unflushed.forget_removed();
         } else if unflushed.lost.is_empty() {
             unflushed.flushed = begun;
         }
@@ -73,6 +83,7 @@ impl Syncer {
                 segments: BTreeMap::new(),
                 folder: None,
                 lost: BTreeSet::new(),
+                oldest: 0,
                 flushed: Instant::now(),
             }),
             flushing: Mutex::default(),
@@ -112,11 +123,11 @@ impl Syncer {
         }
     }
 
-    /// Segment `number` is gone, and need not be flushed.
+    /// Segment `number`, the oldest, was removed and need not be flushed.
     pub(super) fn removed(&self, number: u64) {
         let mut unflushed = lock(&self.shared.unflushed);
-        unflushed.segments.remove(&number);
-        unflushed.lost.remove(&number);
+        unflushed.oldest = number + 1;
+        unflushed.forget_removed();
     }
 
     /// Whether a flush of segment `number` failed. Where each write is flushed, one that fails is written again.
@@ -191,6 +202,9 @@ mod tests {
         let least = begun.elapsed().as_secs_f64();
         assert!(syncer.flushed_s() >= least);
         syncer.removed(1);
+        // As if the failing flush had begun before it was removed.
+        syncer.opened(1, file("/dev/null".as_ref()));
+        assert!(syncer.flushed().is_err());
         let asked = Instant::now();
         assert!(syncer.flushed().is_ok());
         assert!(syncer.flushed_s() <= asked.elapsed().as_secs_f64());
