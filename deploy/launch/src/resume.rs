@@ -90,7 +90,10 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
         Some(Err(CheckpointError::InUse(_))) => Ok(false),
         locked => locked.transpose().map(|_| true),
     };
-    let why = format!("a learner still saves in {}", checkpoints.display());
+    let why = format!(
+        "a learner still uses {}, and must be stopped if it was kept alive",
+        checkpoints.display()
+    );
     if !wait_until(is_saved, SAVING_MAX, &why)? {
         checkpoint::lock(&checkpoints)?;
     }

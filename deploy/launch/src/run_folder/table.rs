@@ -105,7 +105,11 @@ impl Table {
         for row in std::mem::take(&mut self.rows) {
             let read = row.deserialize(Some(&header)).map_err(|_| {
                 let of = path.file_stem().unwrap_or_default().display();
-                usage!("{}: {row:?} is not a row of {of}", path.display())
+                let row = row.iter().collect::<Vec<_>>().join(",");
+                usage!(
+                    "{}: {row:?} is not a row of {of}: mend or remove it",
+                    path.display()
+                )
             })?;
             match is_kept(read) {
                 true => self.rows.push(row),

@@ -33,7 +33,7 @@ pub(super) fn waits(view: &RunView) -> Vec<String> {
     let limiter = |(_, account): (_, &ProcessesStatus)| match account.waiting {
         Waiting::Neither => None,
         Waiting::Finished => Some(account.waiting.to_string()),
-        waiting => Some(format!("{waiting} since {}", seconds(account.waiting_s))),
+        waiting => Some(format!("{waiting} ({})", seconds(account.waiting_s))),
     };
     let mut waits: Vec<_> = statuses(view).filter_map(limiter).collect();
     waits.dedup();

@@ -153,10 +153,10 @@ fn process_row(process: &ProcessStatus) -> Vec<String> {
     let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", seconds(age)));
     let doing = process.doing.as_ref();
     let doing = doing.map_or("-".into(), |(doing, since, said)| {
-        let doing = format!("{doing} since {}", seconds(*since));
+        let since = seconds(*since);
         match *said > REPORT_AGE_MAX {
-            true => format!("{doing} (reported {} ago)", seconds(*said)),
-            false => doing,
+            true => format!("{doing} ({since}, reported {} ago)", seconds(*said)),
+            false => format!("{doing} ({since})"),
         }
     });
     let version = process.weights_version.map(|it| it.to_string());
