@@ -40,20 +40,20 @@ pub struct RunArgs {
     pub world: Option<WorldName>,
 }
 
-/// Runs one actor until `shutdown`, or until the run has its transitions.
+/// Runs one actor until `shutdown`, or until the run has its transitions; returns whether it has.
 ///
 /// # Errors
 /// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
-pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints::to(args.connect);
     let (credentials, max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
     let opened = session::open_unless(shutdown, endpoints, &keys, credentials, max)?;
     let Some(session) = opened else {
-        return Ok(());
+        return Ok(false);
     };
     let Some(run_info) = join::run_info(&session, &keys, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     let mut settings = ActorSettings::from_toml(&run_info.config_toml)
         .context("the settings that the replay server sent")?;
@@ -81,7 +81,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let alive = client.declare_alive(who.alive());
     let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {
         tracing::warn!(
@@ -94,11 +94,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let clients = vec![client.clone()];
     reporter::start(clients, who, activity.clone(), shutdown.clone())?;
     let Some(first) = weights::first(&client, WEIGHTS_WAIT_MAX, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     // The learner has joined by now, and with it the replay server knows where a resumed run stands.
     let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     let pool = settings.chunk_memory();
     activity.begin("makes its environments");
@@ -130,6 +130,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         // What was played before the world failed is delivered too, without a wait for the rate limiter.
         shutdown.set();
     }
+    let is_over = delivery.progress().finished;
     let produced = collector.produced();
     activity.begin("delivers its last chunks");
     let delivered = delivery.finish();
@@ -141,7 +142,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     tracing::info!("actor {actor} leaves: {stored} transitions delivered");
     drop(alive);
     let closed = client.session().close().wait();
-    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))?;
+    Ok(is_over)
 }
 
 /// Plays and queues what was played until `shutdown`, or until the run needs no more. `chunk_steps` says how many steps a chunk has,

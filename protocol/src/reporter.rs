@@ -26,7 +26,7 @@ const TIMEOUT: Duration = Duration::from_secs(2);
 const FINISHED_MAX: Duration = Duration::from_secs(30);
 
 /// Tells each replay server of `clients` that `who`, the learner, has finished the run after so many updates: until it answers, as long
-/// as it reads its replay back, 30 s where it does not, or `shutdown`.
+/// as it reads its replay back, 30 s where it does not, or once after `shutdown`.
 pub fn say_finished(clients: &[RunClient], who: Participant, updates: u64, shutdown: &Shutdown) {
     let finished = Report {
         finished: Some(updates),

@@ -11,6 +11,7 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_machine::{
+    error::EXIT_INTERRUPTED,
     process_env::program,
     units::{duration, kib},
 };
@@ -103,7 +104,7 @@ impl ManagedProcess {
         let killed = |signal| signal != Signal::SIGABRT as i32;
         let had_run = self.started.elapsed() > AT_ONCE;
         self.end().is_some_and(|status| {
-            status.success() || status.signal().is_some_and(killed) || had_run
+            is_orderly(status) || status.signal().is_some_and(killed) || had_run
         })
     }
 
@@ -190,6 +191,11 @@ impl Drop for ManagedProcess {
     }
 }
 
+/// Whether a process exited because its run is over or because it was asked to stop.
+pub(crate) fn is_orderly(status: ExitStatus) -> bool {
+    status.success() || status.code() == Some(EXIT_INTERRUPTED.into())
+}
+
 /// Asks a child process that was not waited for yet to drain and end.
 pub fn ask_to_stop(child: &Child, name: &str) {
     send(child, name, Signal::SIGTERM);
@@ -218,7 +224,7 @@ pub(crate) fn stop<'a>(
     let mut late = Vec::new();
     for process in processes {
         match process.wait_until(deadline, abort) {
-            Some(status) if status.success() => {}
+            Some(status) if is_orderly(status) => {}
             Some(status) if ask && status.signal() == Some(Signal::SIGTERM as i32) => {}
             Some(_) => late.push(process.exit_report()),
             None => {

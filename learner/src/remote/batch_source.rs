@@ -82,13 +82,10 @@ impl BatchSource {
                 Ok(Fetched::Batch(served)) => return Ok(Next::Batch(served)),
                 Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
-                Err(mpsc::RecvTimeoutError::Timeout) => {
-                    return Ok(Next::NotYet(self.shared.waiting()));
-                }
-                Err(mpsc::RecvTimeoutError::Disconnected) if self.shared.shutdown.is_set() => break,
-                Err(mpsc::RecvTimeoutError::Disconnected) => {
+                Err(mpsc::RecvTimeoutError::Disconnected) if !self.shared.shutdown.is_set() => {
                     return Err(BatchError::ThreadsEnded);
                 }
+                Err(_) => return Ok(Next::NotYet(self.shared.waiting())),
             }
         }
         Ok(Next::Finished)

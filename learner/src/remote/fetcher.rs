@@ -175,7 +175,10 @@ impl Fetcher {
                     }
                     let unreachable_max = self.shared.requests.unreachable_max;
                     if silence.unanswered() <= unreachable_max {
-                        if let Some(more) = self.said.due() {
+                        // At a shutdown the server may be gone already.
+                        if !self.shared.shutdown.is_set()
+                            && let Some(more) = self.said.due()
+                        {
                             tracing::warn!("asking for a batch again: {e}{more}");
                         }
                         self.shared.shutdown.wait_timeout(RETRY_PAUSE);

@@ -53,15 +53,16 @@ pub struct RunArgs {
     pub keep_alive: bool,
 }
 
-/// Runs the learner until the run has no more batches, or `shutdown`. Whatever ends it, it saves what it has learned.
+/// Runs the learner until the run has no more batches, or `shutdown`, and returns whether it was the former. Either way, and after an
+/// error, it saves what it has learned.
 ///
 /// # Errors
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
-pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let credentials = args.credentials.as_ref();
     let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
@@ -106,7 +107,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let progress = (updates, &*progress);
     let joined = shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
     let Some(membership) = joined else {
-        return Ok(());
+        return Ok(false);
     };
     learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
@@ -161,7 +162,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if learned.is_ok() && !learner.publication_is_due() {
         publisher.publish(learner.next_weights()?);
     }
-    learned.and(saved.map_err(Into::into))?;
+    let is_over = learned?;
+    saved?;
     publisher.with_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
     if args.keep_alive {
@@ -173,17 +175,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         let arrived = publisher.priorities.arrived.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
     }
-    if !shutdown.is_set() {
+    if is_over {
         let (updates, who) = (learner.updates(), Participant::Learner(requests.learner));
         reporter::say_finished(&clients, who, updates, shutdown);
     }
     drop(membership);
     let closed = shards.close();
     batches.end();
-    closed
+    closed.map(|()| is_over)
 }
 
-/// Learns from batch after batch, until there are no more or `shutdown`.
+/// Learns from batch after batch until there are no more, which returns true, or until `shutdown`.
 fn learn(
     learner: &mut Learner,
     batches: &mut BatchSource,
@@ -191,7 +193,7 @@ fn learn(
     checkpointer: &mut Checkpointer,
     activity: &Activity,
     shutdown: &Shutdown,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<bool> {
     // A wait is logged after some seconds, then ever more seldom.
     let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
@@ -207,7 +209,7 @@ fn learn(
                 }
                 continue;
             }
-            Next::Finished => break,
+            Next::Finished => return Ok(true),
         };
         activity.begin("learns");
         said_next = SILENT_MAX;
@@ -238,7 +240,7 @@ fn learn(
             checkpointer.save(learner);
         }
     }
-    Ok(())
+    Ok(false)
 }
 
 /// Keeps checkpoints of one learner. A disk that refuses does not end the training: the next period tries again, and only what

@@ -73,8 +73,8 @@ pub struct RunArgs {
     pub config_toml: String,
 }
 
-/// Runs the replay server until its run is over, `args.ending` or `shutdown`.
-pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+/// Runs the replay server until its run is over, `args.ending` or `shutdown`, and returns whether the run is over.
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let settings = Settings::parse(&args.config_toml)?;
     let spec: RunSpec = settings.table("run")?;
     spec.validate()?;
@@ -146,7 +146,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             return match e {
                 PersistError::Stopped => {
                     tracing::info!("replay server stops: {e}");
-                    closed
+                    closed.map(|()| false)
                 }
                 e => Err(e.into()),
             };
@@ -203,7 +203,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             counts.repeated
         );
     }
-    closed
+    closed.map(|()| state.participants.is_over())
 }
 
 /// Ends the answers: without the queryables no more comes, without the session none is sent to a slow client, and the threads end.

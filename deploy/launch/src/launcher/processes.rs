@@ -12,7 +12,7 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     evaluator::Evaluator,
-    managed_process::ManagedProcess,
+    managed_process::{ManagedProcess, is_orderly},
     rendezvous::Rendezvous,
     run_folder::{ResumePoint, RunFolder, RunRecorder},
     view::{Display, Poller},
@@ -177,7 +177,7 @@ impl Launch<'_> {
                 continue;
             };
             let is_actor = matches!(part, Part::Actor(_));
-            if is_actor && status.success() && !actors_are_needed {
+            if is_actor && is_orderly(status) && !actors_are_needed {
                 continue;
             }
             let (name, report) = (&self.names[number], process.exit_report());
