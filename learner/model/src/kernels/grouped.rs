@@ -1,7 +1,7 @@
 //! A fully connected layer of which each row needs one group of outputs: the C51 head for the action that the row took.
 //! This module knows no network and runs on the CPU only.
 //!
-//! All other outputs would be dropped, and their gradients are exactly 0. Rows are sorted by group, so that
+//! Other outputs would be dropped after computing, and their gradients are 0. Rows are sorted by group, so that
 //! each group is one product. Each output is summed in the same order as in the whole layer.
 
 use std::ops::Range;

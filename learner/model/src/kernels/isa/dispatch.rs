@@ -24,7 +24,7 @@ pub(crate) enum AnySimd {
     EmulatedAmx(super::emulated::EmulatedAmx),
 }
 
-/// `with_simd!(simd, s => expression)` evaluates the expression with `s` as the concrete type of the instruction set.
+/// `with_simd!(simd, s => expression)` evaluates the expression with `s` bound to the instruction set, of its concrete type.
 macro_rules! with_simd {
     ($simd:expr, $typed:ident => $body:expr) => {
         match $simd {
