@@ -98,7 +98,7 @@ impl ManagedProcess {
         })
     }
 
-    /// Whether the process ended in a way that a restart may fix: it exited with code 0, a signal other than SIGABRT killed it, or it
+    /// Whether the process ended in a way that a restart may fix: it exited in order, a signal other than SIGABRT killed it, or it
     /// had run for longer than `AT_ONCE`. SIGABRT comes from a broken invariant of our own.
     pub(crate) fn may_be_started_again(&mut self) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;
