@@ -289,7 +289,7 @@ impl Screen {
         lines.into_iter().for_each(|it| self.line(&it));
     }
 
-    /// Shows progress beside the bar, or every ten seconds in a plain line; `text` is told whether its result stands beside the bar.
+    /// Shows progress beside the bar, or every ten seconds in a plain line. The argument of `text` is true for text beside the bar.
     pub fn show(&mut self, position: u64, text: impl FnOnce(bool) -> String) {
         let now = Instant::now();
         if let Some(bar) = &self.bar {

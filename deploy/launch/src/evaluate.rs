@@ -153,7 +153,7 @@ impl Player {
         play_with(config, policy, world, episodes, epsilon, seed, watch)
     }
 
-    /// The number of environments that play so many episodes: one each, up to `COPIES_MAX`.
+    /// The number of environments that play `episodes` episodes: one each, up to `COPIES_MAX`.
     pub fn envs(episodes: usize) -> usize {
         episodes.min(COPIES_MAX)
     }

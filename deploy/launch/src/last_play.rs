@@ -1,4 +1,4 @@
-//! Plays a finished run's weights greedily, and a random policy beside them: their returns are the number that the run was for.
+//! Plays a finished run's weights greedily, and a random policy for comparison. The return is the number that the run was for.
 //! A failure in this module does not fail the run: it is reported as a line on stderr.
 
 use std::time::{Duration, Instant};

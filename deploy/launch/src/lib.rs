@@ -1,7 +1,7 @@
 //! Starts, watches and ends a run on this machine, and writes and reads the files in its folder.
 //!
-//! Start with [`launcher::run`], which trains with replay servers, learner and actors as processes, or [`lockstep::run`], which
-//! runs all of them in this process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
+//! Start with [`launcher::run`], which trains with replay servers, learner and actors as processes. [`lockstep::run`] runs all of
+//! them in this process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
 //!
 //! ```
 //! use driml_launch::run_folder::{RunFolder, Summary, progress};

@@ -78,7 +78,7 @@ mod tests {
                 fs::copy(env::current_exe().unwrap(), &copy).unwrap();
                 assert!(status(copy).success());
             }
-            // The child process already runs again, from the removed file.
+            // The first child removed this file, and then started this second child.
             Some(_) if fs::remove_file(env::current_exe().unwrap()).is_err() => {}
             Some(_) => assert!(status(program()).success()),
         }

@@ -35,7 +35,7 @@ pub fn kib(table: &str, name: &str) -> Option<u64> {
     line.trim().strip_suffix("kB")?.trim().parse().ok()
 }
 
-/// Formats a number with three significant digits, or with all digits before the point if it has more.
+/// Formats a number with three significant digits, but with all digits before the point and at most three decimals.
 pub fn number(value: f64) -> String {
     match value.abs() {
         size if size >= 99.95 => format!("{value:.0}"),

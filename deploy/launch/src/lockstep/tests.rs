@@ -82,7 +82,7 @@ fn where_states_are_augmented_frames_stay_whole() {
     weights(&config);
 }
 
-/// Begins a run, and saves it after so many rounds.
+/// Begins a run, and saves it after `rounds` rounds.
 fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lockstep) {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());

@@ -7,8 +7,8 @@ use driml_protocol::Played;
 use super::*;
 use crate::testing::with;
 
-/// A shard of `frames` frames in which so many episodes have `ended`. The server keeps those after the first `let_go`, thirty per
-/// answer. The return of an episode is `first` plus its number.
+/// A shard with `frames` frames and `ended` episodes that have ended. The server keeps the episodes after the first `let_go`, thirty
+/// per answer. The return of an episode is `first` plus its number.
 #[derive(Clone, Copy)]
 struct Shard {
     frames: u64,

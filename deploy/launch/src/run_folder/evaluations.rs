@@ -62,7 +62,7 @@ impl Evaluated {
         Ok(of_best.max_by_key(|it| it.episodes))
     }
 
-    /// An evaluation after so many updates, with the run's time and frames at the checkpoint. They come from the row of metrics at or
+    /// An evaluation of the checkpoint after `updates`. The run's time and frames at that point come from the row of metrics at or
     /// before the checkpoint, or else from the first row, which is written within about a second.
     pub(crate) fn at(
         folder: &RunFolder,
@@ -184,7 +184,7 @@ impl Candidate {
 mod tests {
     use super::*;
 
-    /// Judges a checkpoint of so many updates, which the learner deletes while it is played.
+    /// Judges a checkpoint after `updates`, which the learner deletes while it is played.
     fn judge(folder: &RunFolder, updates: u64, mean: f64, episodes: u32) -> anyhow::Result<bool> {
         let path = folder.checkpoints().join(format!("checkpoint-{updates}"));
         fs::create_dir_all(&path).unwrap();

@@ -110,7 +110,7 @@ impl RunRecorder {
         })
     }
 
-    /// Notes that the run took at least so many seconds before this recorder started.
+    /// Notes that the run took at least this many seconds before this recorder started.
     pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
         self.is_late = true;
         self.seconds_before = self.seconds_before.max(seconds);
@@ -144,8 +144,8 @@ impl RunRecorder {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Records the episodes that ended since the last call. `ask` requests the episodes of a shard after the first so many; it returns
-    /// none if the shard does not answer. Returns warnings as [`Self::record`] does, which must follow.
+    /// Records the episodes that ended since the last call. `ask(shard, count)` requests the episodes of a shard after the first
+    /// `count`; none if the shard does not answer. Returns warnings as [`Self::record`] does; call that method next.
     pub(crate) fn record_episodes(
         &mut self,
         view: &RunView,

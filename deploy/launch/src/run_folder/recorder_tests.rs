@@ -44,7 +44,7 @@ fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
     testing::view(plan, replay, Some(learner))
 }
 
-/// The view of a run after so many frames, updates of 16 rows, and episodes.
+/// The view of a run after this many frames, updates of 16 rows, and episodes.
 fn after(frames: u64, updates: u64, episodes: u64, k_histogram: [u64; 3]) -> RunView {
     let replay = ReplayStatus {
         transitions_inserted: frames,

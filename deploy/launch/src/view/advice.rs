@@ -12,7 +12,7 @@ use crate::run_view::{RunView, ServerAnswer};
 
 /// How long an actor may send nothing before it counts as unresponsive.
 const UNRESPONSIVE_S: f64 = 30.0;
-/// How long a replay server or the learner may leave questions unanswered before a note says so.
+/// How long a replay server or the learner may leave requests unanswered before a note says so.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
 

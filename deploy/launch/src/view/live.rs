@@ -58,7 +58,7 @@ pub(crate) struct Display {
 }
 
 impl Display {
-    /// The display of a run of so many frames that began at `began`, and has done `updates_before` updates.
+    /// The display of a run of `frames` frames that began at `began` and has done `updates_before` updates.
     pub(crate) fn new(frames: u64, began: Instant, updates_before: u64) -> Self {
         Self {
             screen: Screen::new(frames, TEMPLATE),

@@ -1,5 +1,5 @@
 //! The poller: asks the processes of a run for their status, as any client could, and keeps the answers in a [`RunView`].
-//! It judges nothing and changes nothing.
+//! This module judges nothing and changes nothing.
 
 use std::time::Duration;
 

@@ -124,7 +124,7 @@ fn once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits until the replay servers have read their replay back and a learner has joined, however long it takes. Prints the progress.
+/// Waits until the replay servers have read their replay back and a learner has joined. Prints the progress; fails if they are silent.
 fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let mut said = LogLimiter::default();
