@@ -108,8 +108,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         after_updates: run_info.after_updates,
         earlier_incarnations: welcome.earlier_incarnations,
     };
-    let (version, safetensors) = (first.header.version, &first.safetensors);
-    let mut collector = Collector::new(&settings, pool.clone(), life, version, safetensors)?;
+    let version = first.header.version;
+    // A world in its own process may take minutes to start.
+    let made = {
+        let (settings, pool) = (settings.clone(), pool.clone());
+        let make = move || Collector::new(&settings, pool, life, version, &first.safetensors);
+        shutdown.unless_set("environments", make)?
+    };
+    let Some(collector) = made else {
+        return Ok(false);
+    };
+    let mut collector = collector?;
     let newest = weights::watch(client.clone(), version, shutdown.clone())?;
     let (actor, config) = (args.actor, &settings.actor);
     let (inserted, limits) = (run_info.inserted_total, DeliveryLimits::of(config));
