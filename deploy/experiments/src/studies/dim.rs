@@ -1,5 +1,5 @@
 //! The learner's network and optimiser with the auxiliary loss DIM alone, which both studies train.
-//! There are no returns, actions or replay.
+//! Returns, actions and a replay are not used.
 
 use anyhow::Context;
 use candle_core::{DType, Device, Tensor};

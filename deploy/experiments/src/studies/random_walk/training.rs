@@ -1,5 +1,5 @@
 //! The global DIM heads on one-hot states, trained with InfoNCE on pairs of successive states.
-//! Heads, loss and optimiser are those of the learner. There is no torso, action or return.
+//! Heads, loss and optimiser are those of the learner. Torso, actions and returns are not used.
 
 use candle_core::{Device, Tensor};
 use driml_learner::{AdamSettings, Lambda, auxiliary::dim::Dim};
@@ -50,7 +50,7 @@ pub(super) struct Settings {
 /// How the training pairs are sampled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sampling {
-    /// Independent pairs, with the first state from the stationary distribution: there is no mixing time.
+    /// Independent pairs, with the first state from the stationary distribution, so that nothing has to mix.
     Stationary,
     /// Many walkers that all start in the lowest state. Update t learns from their t-th step, as in the paper's proposition.
     FromOneEnd,

@@ -33,7 +33,7 @@ pub(super) struct Loss {
     pub(super) column: &'static str,
     #[serde(skip)]
     pub(super) points: Points,
-    /// The means of the last fifth and of the whole run; `None` if there is no value.
+    /// The means of the last fifth and of the whole run; `None` without values.
     pub(super) last: Option<f64>,
     pub(super) whole: Option<f64>,
     pub(super) episodes: f64,
