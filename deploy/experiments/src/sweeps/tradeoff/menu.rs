@@ -222,7 +222,7 @@ impl Settings {
         asked.any(|it| it.points().contains(&point))
     }
 
-    /// Returns the base beside which a point is timed, whichever dial requests it: the base of its level, or the point if it is only a base.
+    /// Returns the base beside which a point is timed, whichever dial requests it: the base of its level, or itself if it is only a base.
     pub(super) fn base_of<'a>(&'a self, point: &'a Point) -> &'a Point {
         let level = self.levels.iter().find(|it| it.point == *point);
         level.map_or(point, |it| &it.base)
