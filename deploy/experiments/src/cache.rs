@@ -49,7 +49,7 @@ struct Kept<T> {
     result: T,
 }
 
-/// An experiment under way.
+/// The open folder of an experiment, with its progress and the time of its pieces.
 #[derive(Debug)]
 pub(crate) struct Session {
     folder: PathBuf,
@@ -190,7 +190,7 @@ impl Session {
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        // A piece that cannot be read is made again.
+        // A piece that cannot be read is made again, like a missing one.
         if let Some(kept) = self.read::<T>(key).filter(|kept| kept.of == of) {
             self.progress.find(units);
             self.seconds += kept.seconds;

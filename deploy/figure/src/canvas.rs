@@ -96,7 +96,7 @@ impl TextStyle {
 /// How letters are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Letters {
-    /// As text, in a font of the viewer.
+    /// As text, in a font that the viewer has.
     Text,
     /// As outlines, in the built-in font.
     Outlines,

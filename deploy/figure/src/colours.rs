@@ -42,7 +42,7 @@ pub const GREY: Colour = Colour::new(120, 126, 135);
 pub(super) const CELL_DARK: Colour = Colour::new(38, 42, 48);
 pub(super) const CELL_LIGHT: Colour = Colour::new(246, 247, 249);
 pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
-/// A cell of a heat map without a value.
+/// A heat map cell without a value.
 const NO_VALUE: Colour = Colour::new(220, 222, 226);
 
 /// The number of series colours.
@@ -91,7 +91,7 @@ pub(super) fn heat_colour(share: f64) -> Colour {
     Colour::new(mix(0), mix(1), mix(2))
 }
 
-/// Black or white, whichever reads better on `colour`.
+/// Returns dark or light ink, whichever is easier to read on `colour`.
 pub(super) fn ink_on(colour: Colour) -> Colour {
     let [r, g, b] = colour.rgb.map(f64::from);
     let brightness = 0.299 * r + 0.587 * g + 0.114 * b;

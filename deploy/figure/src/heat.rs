@@ -189,7 +189,7 @@ impl Heat {
     }
 }
 
-/// Draws an outline over a map of square cells.
+/// Draws a marking frame over a map of square cells. `cell` is the drawn length of a unit of the outline.
 pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
     let Outline { left, top, side } = outline;
     let [left, top, side] = [left, top, side].map(|length| length * cell);

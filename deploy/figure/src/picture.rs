@@ -162,7 +162,7 @@ mod tests {
         assert_eq!([at(0, 1), at(1, 0)], [[255; 3]; 2]);
         assert_eq!([at(1, 1), at(3, 3)], [[1, 2, 3]; 2]);
         assert_eq!([at(4, 1), at(4, 3)], [[40, 50, 60]; 2]);
-        // One byte a pixel is grey.
+        // An image with one channel is drawn as grey.
         let grey = Image {
             pixels: &[7],
             height: 1,

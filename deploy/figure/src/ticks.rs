@@ -8,7 +8,7 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
         return vec![low];
     }
     let power = 10f64.powf(raw.log10().floor());
-    // The round step nearest to the one asked for, by ratio.
+    // Choose the round step whose ratio to `raw` is closest to 1.
     let off = |step: &f64| (step / raw).ln().abs();
     let steps = [1.0, 2.0, 5.0, 10.0].map(|times| times * power);
     let nearest = steps.into_iter().min_by(|a, b| off(a).total_cmp(&off(b)));

@@ -16,7 +16,7 @@ pub(super) const SPREAD_OF_K: &str = "sd_k";
 /// The columns right before and right after those of the auxiliary losses.
 pub(super) const C51_LOSS: &str = "c51_kl";
 const TOTAL_LOSS: &str = "total_loss";
-/// Columns of `metrics.csv` that hold words.
+/// The columns of `metrics.csv` that hold words instead of numbers.
 const WORDS: [&str; 1] = ["waiting"];
 
 /// Settings as text, by their full dotted names.

@@ -227,7 +227,7 @@ mod tests {
         for (yes, no, expected) in [
             (&[2.0, 3.0][..], &[0.0, 1.0][..], Some(1.0)),
             (&[1.0], &[1.0], Some(0.5)),
-            // Of the six pairs 2 > 1, 4 > 1, 4 > 3 are in order, 2 < 3 is not, and 2 = 2, 4 > 2.
+            // Of the six pairs four are in order (2 > 1, 4 > 1, 4 > 3, 4 > 2), one is not (2 < 3), and one is a tie (2 = 2).
             (&[2.0, 4.0], &[1.0, 3.0, 2.0], Some(4.5 / 6.0)),
             (&[], &[1.0], None),
         ] {

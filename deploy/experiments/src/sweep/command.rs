@@ -37,7 +37,7 @@ struct Settings {
     preset: Option<String>,
 }
 
-/// Makes a run for each combination of settings and each seed that is not there yet, then the table and the plot.
+/// Makes the missing runs of every combination of settings and every seed, then the table and the plot.
 ///
 /// # Errors
 /// As [`crate::run`].

@@ -35,7 +35,7 @@ struct Length {
     preset: String,
     /// The number of seeds of each level.
     seeds: u32,
-    /// Played with each run's weights.
+    /// The number of greedy episodes played with the weights of each run.
     episodes: u32,
     /// The frames of a run; `None` takes those of the world.
     frames: Option<u64>,
@@ -48,7 +48,7 @@ struct Length {
 #[serde(deny_unknown_fields)]
 struct WorldBase {
     frames: u64,
-    /// In the form of `--set`.
+    /// Settings in the form of `--set`.
     sets: Vec<String>,
 }
 
@@ -167,7 +167,7 @@ pub(super) struct Common {
     pub(super) sets: Vec<String>,
     /// The number of frames of each run.
     pub(super) frames: u64,
-    /// Played with each run's weights.
+    /// The number of greedy episodes played with the weights of each run.
     pub(super) episodes: u32,
     /// The number of concurrent runs. It decides the threads of each run, and so what wall-clock time means.
     pub(super) jobs: u32,
