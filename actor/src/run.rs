@@ -1,5 +1,5 @@
-//! One actor process: join, act, deliver, until told to stop or no longer needed.
-//! The acting itself is `collect`, which knows no network.
+//! Runs one actor process: joins the run, acts, and delivers chunks until it is told to stop or the run has enough transitions.
+//! The acting itself is in `collect`, which uses no network.
 
 use std::{sync::Arc, time::Duration};
 
@@ -19,24 +19,24 @@ use crate::{
     weights::{self, NewestWeights},
 };
 
-/// How long an actor waits for a learner with weights.
+/// How long an actor waits for the learner's first weights.
 const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 
-/// What an actor is told at its start; everything else comes from the replay server.
+/// The arguments of one actor process. All other settings come from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
     /// Endpoints of the replay server.
     pub connect: Vec<String>,
-    /// With which certificate it takes part; none without TLS.
+    /// The actor's TLS certificate and key; `None` without TLS.
     pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
-    /// Which actor this is; unique in the run.
+    /// The actor's number, unique in the run.
     pub actor: u32,
-    /// Environments, if not as many as the settings say.
+    /// The number of environments, if it differs from the run's settings.
     pub envs: Option<u32>,
-    /// The world as this machine has it, where it is code outside this program: nothing else of that kind is started
-    /// or loaded, whatever the replay server says.
+    /// The world's name on this machine, if the world is code outside this program (a command or a library). The actor
+    /// starts or loads no other such code, whatever the replay server sends.
     pub world: Option<WorldName>,
 }
 
@@ -76,7 +76,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         actor: join.actor,
         incarnation: join.incarnation,
     };
-    // Before it joins, so that no other process can take its place from then on.
+    // Declared before joining, so that no other process can join as this actor from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client.declare_alive(who.alive());
     let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
@@ -96,7 +96,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let Some(first) = weights::first(&client, WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(false);
     };
-    // The learner has joined by now, and with it the replay server knows where a resumed run stands.
+    // The learner has joined by now, so the replay server knows after how many updates a resumed run continues.
     let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
         return Ok(false);
     };
@@ -125,7 +125,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let delivery = Delivery::start(client.clone(), inserted, limits, pool, shutdown.clone())?;
     let envs = config.envs;
     tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
-    // At the start not all are connected yet.
+    // At the start, not all planned actors are connected yet.
     let chunk_steps = |actors: u32| config.chunk_steps(actors.max(settings.actors_planned));
     let played = play(
         &mut collector,
@@ -136,7 +136,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         shutdown,
     );
     if played.is_err() {
-        // What was played before the world failed is delivered too, without a wait for the rate limiter.
+        // Chunks from before the failure are still delivered, without a wait for the rate limiter.
         shutdown.set();
     }
     let is_over = delivery.progress().finished;
@@ -155,8 +155,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     Ok(is_over)
 }
 
-/// Plays and queues what was played until `shutdown`, or until the run needs no more. `chunk_steps` says how many steps a chunk has,
-/// of the number of actors in the run.
+/// Collects and queues chunks until `shutdown`, or until the run needs no more. `chunk_steps` maps the number of actors
+/// in the run to the number of steps in a chunk.
 fn play(
     collector: &mut Collector,
     chunk_steps: impl Fn(u32) -> u32,
