@@ -40,7 +40,7 @@ pub struct RunArgs {
     pub world: Option<WorldName>,
 }
 
-/// Runs one actor until `shutdown`, or until the run has its transitions; returns whether it has.
+/// Runs one actor until `shutdown`, or until the run has all its transitions; returns whether the run has them.
 ///
 /// # Errors
 /// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
