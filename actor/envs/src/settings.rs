@@ -20,8 +20,8 @@ pub type Built = Result<Box<dyn Environment>, EnvError>;
 
 /// The settings of one world.
 ///
-/// They are read from TOML, where unknown keys are errors, and have no defaults. A world implements the methods that
-/// have no body here, and overrides those whose default does not fit it.
+/// They are read from TOML, where unknown keys are errors and only optional fields have defaults. A world implements
+/// the methods that have no body here, and overrides those whose default does not fit it.
 pub trait WorldSettings {
     /// # Errors
     /// A setting is invalid; the message names it and says which values work.

@@ -60,11 +60,11 @@ pub struct ProcgenWorld {
     steps_taken: Vec<u32>,
     /// Steps after which the engine ends an episode.
     time_limit_steps: u32,
-    /// What keeps sequential levels in their set; `None` where the engine does so itself.
+    /// Keeps sequential levels in their set; `None` without sequential levels, where the engine does so itself.
     levels: Option<LevelSet>,
-    /// The shape of a frame as it leaves this world.
+    /// The shape of this world's frames.
     shape: FrameShape,
-    /// What makes frames smaller or grey; `None` where they leave as the engine drew them.
+    /// Makes frames smaller or grey; `None` if this world's frames are the engine's.
     shrink: Option<Shrink>,
 }
 
@@ -116,7 +116,7 @@ impl ProcgenWorld {
         })
     }
 
-    /// What the last step ended in environment `env`, whose steps were counted including it.
+    /// What the last step ended in environment `env`; `steps_taken` must already count that step.
     fn end_of(&self, env: usize) -> StepEnd {
         let completed = self.game.prev_level_complete()[env] != 0;
         match (self.game.first()[env] != 0, completed) {
