@@ -1,5 +1,5 @@
 //! Memory at a fixed address that a C library writes to.
-//! It does not synchronise anything: its owner says when the library may write.
+//! It does not synchronise anything: its owner decides when the library may write.
 
 use std::cell::Cell;
 use std::ptr;
@@ -15,7 +15,7 @@ impl<T: Copy> Pinned<T> {
         Pinned(vec![Cell::new(value); len])
     }
 
-    /// Address of element `index` and of those after it, for the library to keep.
+    /// The address of element `index`, followed by the later elements, for the library to keep.
     pub(crate) fn address(&self, index: usize) -> *mut T {
         self.0[index..].as_ptr().cast_mut().cast()
     }
