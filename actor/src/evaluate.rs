@@ -35,7 +35,7 @@ pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]) -> ControlFlow<()>;
 /// so that short episodes do not count more because they end first.
 ///
 /// # Errors
-/// The policy or the world failed, or episodes have not ended after `steps_max` steps an environment.
+/// The policy or the world failed, or episodes have not ended after `steps_max` steps per environment.
 pub fn episode_returns(
     world: Box<dyn Environment>,
     policy: &mut dyn Policy,

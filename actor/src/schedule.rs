@@ -38,8 +38,7 @@ impl Schedule {
         }
     }
 
-    /// Returns epsilon after `frames` frames of the run, with an error of at most [`Schedule::ERROR`]. It stays between
-    /// start and end, and changes in one direction only.
+    /// Returns epsilon after `frames` frames of the run, to within [`Schedule::ERROR`]: between start and end, and monotonic in `frames`.
     pub fn epsilon(&self, frames: u64) -> f64 {
         match *self {
             Self::Fixed(epsilon) => epsilon,

@@ -27,7 +27,7 @@ const PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(5);
 
-/// A slot for the newest weights. Each [`Self::take_within`] allows one pull; there are others every [`PULL_ANYWAY`].
+/// A slot for the newest weights. Each [`Self::take_within`] allows one pull; one more every [`PULL_ANYWAY`] covers lost announcements.
 #[derive(Clone, Debug)]
 pub(crate) struct NewestWeights {
     shared: Arc<(Mutex<State>, Condvar)>,

@@ -1,5 +1,4 @@
-//! The code that all worlds share: a generator for each environment, checks of the caller's buffers, and `Envs`, a world whose
-//! environments are stepped one by one.
+//! The code that worlds share: a generator per environment, checks of the caller's buffers, and worlds stepped one environment at a time.
 //! It holds no game rules.
 
 use rand::SeedableRng;

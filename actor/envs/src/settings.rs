@@ -60,14 +60,13 @@ pub trait WorldSettings {
         None
     }
 
-    /// Maps each action to one that does the same in this world; of a group that does the same, one maps to itself.
+    /// Returns for each action one that does the same in this world. One action of each such group maps to itself.
     fn visible_actions(&self) -> Vec<u8> {
         let count = self.action_names().len();
         (0..count).map(|action| action as u8).collect()
     }
 
-    /// Whether a run in this world can be resumed, which begins new episodes: false if one episode's state influences
-    /// the next episode.
+    /// Whether a run in this world can be resumed, with new episodes: false if one episode's state influences the next.
     fn is_resumable(&self) -> bool {
         true
     }

@@ -41,8 +41,7 @@ impl Cache {
     }
 }
 
-/// Checks that only this user and root can change the file or folder, as the engine is code that runs as this user. A
-/// missing path passes.
+/// Checks that only this user and root can change the file or folder, as the engine runs as this user. A missing path passes.
 pub(crate) fn check_private(path: &Path) -> Result<(), ProcgenError> {
     let Ok(data) = fs::metadata(path) else {
         return Ok(());

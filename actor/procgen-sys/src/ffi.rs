@@ -47,7 +47,7 @@ pub(crate) struct LibenvOptions {
     pub(crate) count: i32,
 }
 
-/// Where the engine reads and writes. Pointer arrays are indexed by `tensor * num_envs + env`.
+/// The buffers that the engine reads and writes. Pointer arrays are indexed by `tensor * num_envs + env`.
 #[repr(C)]
 pub(crate) struct LibenvBuffers {
     pub(crate) ob: *mut *mut c_void,

@@ -4,7 +4,7 @@
 use std::cell::Cell;
 use std::ptr;
 
-/// Values that never move while this is alive, even when it is moved itself.
+/// Values whose addresses stay the same, even when this struct is moved.
 ///
 /// A `Vec` keeps its elements where they are, and what is in a `Cell` may be written through other pointers.
 pub(crate) struct Pinned<T>(Vec<Cell<T>>);

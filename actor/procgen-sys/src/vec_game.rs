@@ -43,7 +43,7 @@ impl State {
     }
 }
 
-/// N environments of one game. One thread at a time may use it; different ones may be used by different threads.
+/// N environments of one game. One thread at a time may use a `VecGame`; different threads may use different ones.
 pub struct VecGame {
     api: &'static Api,
     handle: Handle,

@@ -283,7 +283,7 @@ impl DeliveryWorker {
         }
     }
 
-    /// Pauses before the next try, for as long during a shutdown, when `wait_timeout` would return at once.
+    /// Pauses before the next try. Sleeps during a shutdown, when `wait_timeout` would return at once.
     fn pause(&self) {
         match self.shutdown.is_set() {
             true => std::thread::sleep(RETRY_PAUSE),

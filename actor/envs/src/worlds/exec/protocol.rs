@@ -1,5 +1,4 @@
-//! The settings of a world that runs in its own process, the protocol between it and the actor, and the memory that
-//! they share.
+//! The settings of a world in its own process, the protocol between process and actor, and the memory that they share.
 //! It checks what the process sends; `process` starts and ends the process.
 //!
 //! The process is the command of `--env "exec:COMMAND"`, run by `sh`. Requests and answers:
@@ -61,7 +60,7 @@ pub struct ExecConfig {
     pub height: usize,
     /// Columns of a frame, as declared.
     pub width: usize,
-    /// Bytes a pixel, as declared: 1 is grey, 3 are colours.
+    /// Bytes per pixel, as declared: 1 is grey, 3 are colours.
     pub channels: usize,
     /// The names of the actions, as declared.
     pub actions: Vec<String>,

@@ -22,7 +22,7 @@ use crate::settings::{Built, Variants, WorldSettings};
 /// Longest side of a frame, in pixels.
 const SIDE_MAX: usize = 4096;
 
-/// Most bytes a pixel.
+/// The most bytes per pixel.
 const CHANNELS_MAX: usize = 16;
 
 /// Most actions of a world: the wire numbers them with a byte.

@@ -62,7 +62,7 @@ impl Game {
         check(self.background.len() == render::FRAME_BYTES, "a frame")
     }
 
-    /// One step of one game; it does not reset. Returns what was earned and what ended.
+    /// Plays one step, without a reset. Returns its reward and its end.
     pub(super) fn step(&mut self, config: &PacmanConfig, action: u8) -> (f32, StepEnd) {
         let (agent_before, boosted_before) = (self.agent, self.boost_left > 0);
         self.episode_step += 1;

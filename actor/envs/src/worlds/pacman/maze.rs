@@ -130,7 +130,7 @@ impl Maze {
         self.pixels[usize::from(place)].into()
     }
 
-    /// Where one move leads; a wall leaves the mover where it is.
+    /// Returns the cell to which one move leads. A move into a wall stays in its cell.
     pub(crate) fn next(&self, place: Place, direction: Direction) -> Place {
         self.next[usize::from(place)][usize::from(direction)]
     }

@@ -1,11 +1,10 @@
 //! The simplified Ms. PacMan of the paper: a yellow square eats pellets in a maze and is hunted by four ghosts.
 //! It has no levels, no lives and no fruit, and it does not stack or enlarge frames.
 //!
-//! One step, everyone at once: the agent moves and eats what lies there; each ghost moves by what it saw before the
-//! step; then contacts count, and crossing (agent and ghost changing places) is one. A lethal ghost in contact ends the
-//! episode, or, while the agent is boosted, goes back to its start and earns `reward_ghost`. A harmless ghost in contact
-//! with a boosted agent goes back too, for the same behaviour, but has no link to the reward. The episode also ends when
-//! the last pellet is eaten, before any contact of that step. Boosts need not be eaten.
+//! In one step all move at once. The agent moves and eats what lies in its new cell; each ghost moves by what it saw before the step. Then
+//! contacts count, and crossing (agent and ghost changing places) is one. A lethal ghost in contact ends the episode. If the agent is
+//! boosted, the ghost goes back to its start instead and earns `reward_ghost`. A harmless ghost in contact with a boosted agent goes back
+//! too, without a reward. The episode also ends when the last pellet is eaten, before any contact of that step. Boosts need not be eaten.
 //!
 //! Source: the paper's appendix on Ms. PacMan; what it leaves open (maze, colours, rewards, order within a step, how a
 //! ghost finds its way) is decided here and in `config`.

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use super::maze::{GHOSTS, HEIGHT, Item, MAZE, Place, WIDTH};
 
-/// Bytes a pixel.
+/// Bytes per pixel.
 pub(crate) const CHANNELS: usize = 3;
 pub(crate) const FRAME_BYTES: usize = HEIGHT * WIDTH * CHANNELS;
 

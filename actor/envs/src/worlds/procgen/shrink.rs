@@ -14,7 +14,7 @@ const LUMA_SUM: u32 = 1000;
 /// Shrinks a frame [64, 64, 3] to `side` x `side` pixels, in colour or grey.
 ///
 /// A pixel is the mean over the area that it covers, pixels at its edges counted in proportion, rounded to the nearest number, halves
-/// up; its grey is the luma of that mean before rounding. All of it is exact in 32 bits.
+/// up; its grey is the luma of that mean before rounding. The arithmetic is exact in 32 bits.
 pub(super) struct Shrink {
     shape: FrameShape,
     /// For each pixel along a side, the first engine pixel that it covers, and how much of each it covers, in units of `1 / side`.
