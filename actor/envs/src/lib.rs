@@ -15,7 +15,6 @@
 //!
 //! [`WorldConfig`] holds the settings of any of these worlds (`kind` says which) and builds the world. [`WorldName`]
 //! reads the names above from a command line. [`FrameStack`] stacks frames without crossing the end of an episode.
-//!
 //! [`RestrictedWorld`] gives a world fewer actions and smaller frames.
 //!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a

@@ -198,8 +198,7 @@ fn kept(text: &str) -> &'static str {
 }
 
 impl WorldName {
-    /// All names: each of Procgen's games, then the other worlds, then those that the program registered. Names with a
-    /// text that the user chooses, such as a command, are not included.
+    /// All names without a text that the user chooses: each of Procgen's games, then the other worlds, then the registered ones.
     pub fn all() -> impl Iterator<Item = WorldName> {
         let ours = KINDS.iter().flat_map(|(kind, variants)| {
             let Variants { names, is_open, .. } = variants();

@@ -1,6 +1,5 @@
 //! A world restricted to some of its actions, and to frames without the right and bottom borders that no layer reads.
-//! Those borders are neither kept nor sent. Each world says which of its actions do the same; the caller says which part of a frame is
-//! read.
+//! Those borders are neither kept nor sent. Each world says which actions do the same; the caller says which part of a frame is read.
 
 use serde::{Deserialize, Serialize};
 

@@ -38,8 +38,7 @@ pub trait WorldSettings {
         10.0
     }
 
-    /// Builds `num_envs` environments. Environment i depends on (`seed`, i) and its actions only. `threads` is how many threads
-    /// the world may start, 0 for none.
+    /// Builds `num_envs` environments; environment i depends on (`seed`, i) and its actions only. The world may start `threads` threads.
     fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built;
 
     /// The variants of this world that have their own names on a command line, such as a suite's games.

@@ -60,8 +60,7 @@ impl Delivery {
         *self.state.progress()
     }
 
-    /// How long the actor may wait for newer weights before it begins its next chunk. While the rate limiter holds its
-    /// chunks, the actor loses nothing by waiting for the newest weights.
+    /// How long the actor may wait for newer weights before its next chunk: while the rate limiter holds its chunks, waiting is free.
     pub fn fresh_weights_max(&self) -> Duration {
         match self.progress().is_held {
             true => FRESH_WEIGHTS_MAX,

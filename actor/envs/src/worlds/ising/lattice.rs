@@ -123,8 +123,7 @@ impl IsingLattice {
         Ok(())
     }
 
-    /// One Metropolis proposal at each site, first those with even row + column, then the odd ones; then one more at a
-    /// site drawn uniformly.
+    /// One Metropolis proposal at each site, those with even row + column first; then one more at a site drawn uniformly.
     ///
     /// A proposal that does not raise the energy is always taken, so at low temperature a sweep is nearly a function of
     /// the spins: at T = 0.4 an inner site's smallest rise, 4, is taken with probability exp(-10). The last proposal is

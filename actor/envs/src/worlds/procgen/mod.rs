@@ -75,8 +75,7 @@ struct LevelSet {
 }
 
 impl ProcgenWorld {
-    /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`procgen_sys::Engine::install`] for how to do that
-    /// beforehand and watch it.
+    /// Makes `num_envs` environments. Fetches the engine unless it is installed; [`procgen_sys::Engine::install`] does so beforehand.
     ///
     /// `seed` decides which levels are drawn; `threads` is the number of threads that step, 0 for the calling one.
     pub fn new(
