@@ -1,6 +1,6 @@
-//! Draws and assembles a batch: `rows` draws the anchors, `episodes` computes each row, and frame stacks share frames, so each is sent
-//! once. Compressed frames leave the replay compressed, and are unpacked without a lock. The rate limiter decides whether a batch may be
-//! drawn.
+//! Draws and assembles a batch: `rows` draws the anchors, `episodes` computes each row, and stacked states share their frames.
+//! Compressed frames leave the replay compressed, and are unpacked without a lock.
+//! The rate limiter decides whether a batch may be drawn.
 
 use std::{collections::HashMap, iter, ops::Range, sync::Arc};
 

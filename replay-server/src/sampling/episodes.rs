@@ -1,6 +1,6 @@
-//! Makes a row of a batch from a stored episode: decides which transitions can be anchors, finds the steps after an anchor and the frames
-//! of a state, and computes the row's scalars: a_t, a_{t+1}, the n-step return, and the distances to s_{t+n} and s_{t+k}. Draws each k. It
-//! does not choose the anchor and reads no frame.
+//! Makes a row of a batch from a stored episode: decides which transitions can be anchors, finds an anchor's steps and a state's frames,
+//! and computes the row's scalars: a_t, a_{t+1}, the n-step return, and the distances to s_{t+n} and s_{t+k}. Draws each k.
+//! It does not choose the anchor and reads no frame.
 
 use driml_protocol::{End, FRAME_STACK_MAX, Horizon, NO_ACTION, RowScalars, RunSpec, TimeoutRule};
 use rand::Rng;
