@@ -262,7 +262,7 @@ impl Journal {
         keep
     }
 
-    /// Begins a new segment with `snapshot`. If the disk rejects it, the newest segment grows on.
+    /// Begins a new segment with `snapshot`. If the disk rejects it, the newest segment keeps growing.
     pub(super) fn rotate(&mut self, snapshot: &Snapshot) {
         // Pending records belong before the end of the old segment.
         if !self.write_pending() {

@@ -55,7 +55,7 @@ impl Reading {
     }
 }
 
-/// What was found in the folder of a log.
+/// The result of reading a log.
 #[derive(Clone, Debug, Default)]
 pub struct Recovery {
     /// Whether the folder held a replay.

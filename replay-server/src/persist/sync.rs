@@ -12,7 +12,7 @@ use std::{
 
 use driml_protocol::{LogLimiter, Shutdown, fail_point, lock};
 
-/// Segments that wait to be flushed; with one more they are flushed before anything else is written.
+/// Maximum segments that wait for a flush. One more causes a flush before anything else is written.
 const WAITING_MAX: usize = 32;
 
 struct Unflushed {
@@ -130,7 +130,7 @@ impl Syncer {
         unflushed.forget_removed();
     }
 
-    /// Whether a flush of segment `number` failed. Where each write is flushed, one that fails is written again.
+    /// Whether a flush of segment `number` failed. Always false if each write is flushed, as a failed write is then repeated.
     pub(super) fn has_lost(&self, number: u64) -> bool {
         self.thread.is_some() && lock(&self.shared.unflushed).lost.contains(&number)
     }

@@ -66,7 +66,7 @@ pub struct KeptReplay {
 }
 
 impl KeptReplay {
-    /// Locks the folder, and checks that a log in it belongs to this run. Takes the same time for a log of any size.
+    /// Locks the folder, and checks that a log in it belongs to this run. Does not read the log, which may take long.
     pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
         config.check_on_disk()?;
         let folder = LogFolder::open(&args.dir)?;

@@ -54,8 +54,8 @@ impl Episodes {
 
     /// Whether the held transition `t` can be an anchor; if so, `window` is its window.
     ///
-    /// It can if its stack's frames are held and `reach` steps follow it or its episode ends before. With
-    /// `TimeoutRule::Bootstrap` a timed-out transition has no return at all, so it cannot.
+    /// `t` can be an anchor if its stack's frames are held, and `reach` steps follow it or its episode ends before. With
+    /// `TimeoutRule::Bootstrap` a timed-out transition has no return, so it cannot be an anchor.
     pub(crate) fn walk(&self, ring: &Ring, t: u64, window: &mut Window) -> bool {
         window.steps.clear();
         let mut index = t;

@@ -58,7 +58,7 @@ pub struct RunArgs {
     pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
-    /// Which of the replay's shards this is, from 0.
+    /// The number of this shard of the replay, from 0.
     pub shard: u32,
     /// Bytes of one version of the weights, which the replay server cannot compute. Uploads of more than about twice as many are rejected.
     pub weights_bytes_max: usize,

@@ -14,7 +14,7 @@ use crate::{
     storage::ring::{Link, Ring},
 };
 
-/// What became of the priorities that the learner has sent, counted in rows.
+/// Counts, in rows, of what became of the priorities that the learner has sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PriorityCounts {
     /// Rows whose priority was set.

@@ -16,12 +16,11 @@ use crate::{
     storage::ring::{Link, Ring},
 };
 
-/// The constant added to a priority before it is raised to alpha, so that each transition can still be drawn. Dopamine (Castro et al.
-/// 2018) adds the same to the loss.
+/// The constant added to a priority before it is raised to alpha, so that each transition can still be drawn. Dopamine adds the same to
+/// the loss (Castro et al. 2018).
 pub const PRIORITY_MIN: f64 = 1e-10;
 
-/// Maximum relative error of a row's probability in a batch: half of an f32's last place. A probability below 1.2e-38 is sent as
-/// 1.2e-38.
+/// Maximum relative error of a row's probability in a batch: half of an f32's last place. Probabilities below 1.2e-38 are sent as 1.2e-38.
 pub const CHANCE_ERROR: f64 = 6.1e-8;
 
 /// The highest priority before the first update, as in Dopamine. Any value would do, as all priorities are equal then.
