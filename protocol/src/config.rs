@@ -35,7 +35,7 @@ pub fn describe(error: &toml::de::Error) -> String {
     error.to_string().trim_end().replace('\n', ", ")
 }
 
-/// The `[transport]` table: how messages travel.
+/// The `[transport]` table: how messages are sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransportConfig {

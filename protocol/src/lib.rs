@@ -1,5 +1,5 @@
 //! The interface between the processes of a run: the run spec, the messages, their encoding, and the connections that carry them.
-//! It has no algorithm and no state of a run; `deploy/docs/src/reference/protocol.md` has the table of messages.
+//! This crate has no algorithm and no state of a run; `deploy/docs/src/reference/protocol.md` has the table of messages.
 //!
 //! Start at [`RunClient`], which queries, fetches, publishes and subscribes, and at [`QueryWorkers`], which reply. A [`Message`] is a
 //! header and perhaps a payload; [`codec`] encodes and decodes both, and rejects damaged, foreign and unexpected messages. All processes of

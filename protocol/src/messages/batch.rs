@@ -94,7 +94,7 @@ impl Batch {
     /// [`Batch::merged_header`].
     ///
     /// # Panics
-    /// If there is no such header, or the memory is of another size.
+    /// If the parts have no common header, or the memory is of another size.
     pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);

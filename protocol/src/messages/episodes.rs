@@ -20,7 +20,7 @@ pub struct EpisodesRequest {
 /// An episode that ended: by the rules of the world, or by its step limit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EndedEpisode {
-    /// Transitions that the run had stored after the chunk with the episode's end.
+    /// Transitions that the run had stored once it had stored the chunk with the episode's end.
     pub frames: u64,
     /// The actor that played it.
     pub actor: u32,

@@ -65,7 +65,7 @@ pub enum JoinReply {
     },
 }
 
-/// What the replay server tells a process that it admits.
+/// The replay server's information for a process that it admits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Welcome {
     /// Transitions that the run has stored.

@@ -62,7 +62,7 @@ pub struct Report {
 pub struct Warning {
     /// The line, cut to 400 bytes.
     pub text: String,
-    /// Its age, seconds.
+    /// The warning's age, seconds.
     pub age_s: f64,
 }
 

@@ -107,7 +107,7 @@ pub struct ReplayStatus {
     pub rows_sampled: u64,
     /// Rows served to a learner that died before it saved what it learned from them; not counted as sampled.
     pub rows_unlearned: u64,
-    /// Updates since the start of the run, from the learner's last request.
+    /// Updates since the start of the run, as the learner last reported.
     pub updates: u64,
     /// Updates that were repeated because the learner resumed from an older checkpoint.
     pub updates_relearned: u64,

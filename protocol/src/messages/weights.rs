@@ -23,7 +23,7 @@ pub struct WeightsVersion {
 pub struct WeightsHeader {
     /// Counts up from 1.
     pub version: u64,
-    /// Updates that made these weights.
+    /// Number of updates that led to these weights.
     pub updates: u64,
     /// SHA-256 of the safetensors file.
     pub sha256: [u8; 32],
@@ -32,7 +32,7 @@ pub struct WeightsHeader {
 /// One version of the learner's weights, whole.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Weights {
-    /// What they say of themselves.
+    /// The description of the weights.
     pub header: WeightsHeader,
     /// The networks' parameters, a safetensors file.
     pub safetensors: Vec<u8>,
@@ -43,7 +43,7 @@ pub struct Weights {
 pub struct WeightsUpload {
     /// The sender's number, as in its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
-    /// What they say of themselves.
+    /// The description of the weights.
     pub weights: WeightsHeader,
 }
 
@@ -62,7 +62,7 @@ pub enum WeightsRequest {
     Piece {
         /// The version of the weights, from the header of the first piece.
         version: u64,
-        /// First byte in the safetensors file, a multiple of [`PIECE_BYTES`].
+        /// Position of the piece in the safetensors file, bytes: a multiple of [`PIECE_BYTES`].
         offset: u64,
     },
 }
@@ -80,7 +80,7 @@ pub enum WeightsReply {
         weights: WeightsHeader,
         /// Bytes of the whole safetensors file.
         bytes: u64,
-        /// Byte at which the piece starts.
+        /// Position of the piece in the safetensors file, bytes.
         offset: u64,
     },
 }
@@ -170,7 +170,7 @@ impl Assembly {
         Ok(())
     }
 
-    /// Byte at which the next piece starts.
+    /// Position at which the next piece starts, bytes.
     pub const fn next_offset(&self) -> u64 {
         self.have.len() as u64
     }

@@ -78,7 +78,7 @@ impl Shutdown {
     }
 }
 
-/// Tells a process that others need while they exit when to exit itself.
+/// Flags that tell a process when to exit if others need it while they exit themselves.
 #[derive(Clone, Debug, Default)]
 pub struct GracefulShutdown {
     /// Raised when the process should exit as soon as the others have left.

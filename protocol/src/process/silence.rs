@@ -8,8 +8,8 @@ const LOOK_MAX: Duration = Duration::from_secs(15);
 
 /// The time for which another process has not answered.
 ///
-/// Of a time in which this process is stopped (Ctrl-Z, a paused container), at most 15 s and one attempt's time-out count. It could not
-/// ask, and the other process may have been stopped too.
+/// While this process is stopped (Ctrl-Z, a paused container), at most 15 s and one attempt's time-out count: it could not ask, and the
+/// other process may have been stopped too.
 #[derive(Clone, Copy, Debug)]
 pub struct Silence {
     length: Duration,

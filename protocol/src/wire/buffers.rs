@@ -233,7 +233,7 @@ mod tests {
         assert_ne!(again.as_ptr(), address);
         assert_eq!(sent.to_bytes(), &b"abcde"[..]);
         drop((sent.clone(), again, sent));
-        // One piece is kept: the first that came back.
+        // The pool keeps one buffer, the first that came back.
         assert_eq!(pool.0.spare.lock().unwrap().len(), 1);
         assert_eq!(pool.take_own(3).len(), 3);
     }
