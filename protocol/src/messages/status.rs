@@ -153,8 +153,7 @@ pub struct ReplayStatus {
 }
 
 impl ReplayStatus {
-    /// Merges the statuses of all shards of a replay. The newest returns of all shards are listed shard after shard; the mean age is
-    /// weighted by rows.
+    /// Merges the statuses of all shards. The newest returns of the shards follow one another; the mean age is weighted by rows.
     pub fn merged(shards: &[Self]) -> Self {
         let Some((first, others)) = shards.split_first() else {
             return Self::default();

@@ -188,8 +188,7 @@ fn open_with(
     let not_driml = |what: &str| {
         let connect = endpoints.connect.join(", ");
         SessionError::Failed(match endpoints.connect.iter().any(|it| is_quic(it)) {
-            // zenoh does not report whether there is no listener or one side rejects the other's certificate. Its log on the rejecting side
-            // tells.
+            // zenoh does not tell a missing listener from a rejected certificate; its log on the rejecting side does.
             true => format!(
                 "no replay server lets this process in on {connect}: is it running, with --tls-dir, and is the endpoint right (its port is \
                  one of UDP)? If so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay \

@@ -29,8 +29,7 @@ pub enum SessionError {
     NoAnswerer { key: String },
     #[error("{key}: no answer within {within_ms} ms")]
     NoReply { key: String, within_ms: u128 },
-    /// The replay server runs, but is still reading its replay back from disk and answers afterwards. A caller may wait for this without a
-    /// limit.
+    /// The replay server runs, but still reads its replay back from disk. It answers afterwards, so a caller may wait without a limit.
     #[error("{0}")]
     Recovering(Recovering),
     #[error("{key}: {why}")]

@@ -1,6 +1,5 @@
-//! The roles of processes, each the common name of a certificate, and their rights, as rules for zenoh's access control at the replay
-//! server. All else is denied. The rules consider only a message's key and its sender's common name; the process that answers checks the
-//! content.
+//! The roles of processes, each a certificate's common name, and their rights as rules for zenoh's access control, which denies all else.
+//! The rules see only a message's key and its sender's common name; the process that answers checks the content.
 
 use crate::{
     messages::{
@@ -17,8 +16,7 @@ use crate::{
     wire::keys::{Keys, ProcessName},
 };
 
-/// Number of actors that certificates can name, from 0. A replay server makes the access rules of all of them at its start, which takes
-/// memory.
+/// Number of actors that certificates can name, from 0. A replay server makes the rules of all at its start, which takes memory.
 pub const ACTORS_MAX: u32 = 1024;
 
 /// The role of a process, and the common name of its certificate.

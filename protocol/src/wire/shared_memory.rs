@@ -81,8 +81,7 @@ impl Trust {
     }
 }
 
-/// Bytes of shared memory for `count` buffers of `bytes` each, plus a quarter and 64 KiB for the allocator's metadata and the gaps that it
-/// leaves.
+/// Bytes of shared memory for `count` buffers of `bytes` each, plus a quarter and 64 KiB for the allocator's metadata and gaps.
 pub const fn pool_bytes(count: usize, bytes: usize) -> usize {
     count.saturating_mul(bytes) / 4 * 5 + (1 << 16)
 }
