@@ -148,11 +148,8 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let actor = |flags: &str| system.start_process(&system.connected(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");
     // One whose world takes long to start stops at once.
-    let starting = actor("--id 2 --env 'exec:exec sleep 100'");
-    wait_until("the world's start", || {
-        let mut args = system.survivors().into_iter().flat_map(|it| it.args);
-        args.any(|it| it == "sleep")
-    });
+    let mut starting = actor("--id 2 --env 'exec:echo starts >&2; exec sleep 100'");
+    starting.wait_for_stderr("starts");
     starting.stop().expect_code(130);
     // The same world by another command, as another machine may have it; it will hang.
     let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
