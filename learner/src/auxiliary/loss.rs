@@ -123,7 +123,7 @@ pub struct OnlineFeatures {
 }
 
 impl OnlineFeatures {
-    /// Passes the states of `batch` that `loss` needs through `network`. No state of an augmented batch is shared, as each has its own draw.
+    /// Passes the states of `batch` that `loss` needs through `network`. Augmented batches are not deduplicated: each state has its draw.
     pub fn new(
         network: &Network,
         model: &ModelConfig,
