@@ -188,7 +188,7 @@ impl Agent {
         self.average.as_ref()
     }
 
-    /// Copies the averaged weights, if there are any, into torso and head of the online network, to play with. Returns whether there were.
+    /// Copies the averaged weights, if any, into torso and head of the online network, for evaluation. Returns whether there were any.
     pub fn take_average(&mut self) -> Result<bool, UpdateError> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online().get(name) {

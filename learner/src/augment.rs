@@ -264,7 +264,7 @@ fn taps(from: usize, to: usize) -> Vec<Tap> {
     (0..to).map(tap).collect()
 }
 
-/// Changes brightness, contrast, saturation and hue of a state in place. A pixel holds several frames of `frame_channels` channels.
+/// Changes brightness, contrast, saturation and hue of a state in place. A pixel has `frame_channels` channels of each stacked frame.
 ///
 /// Let b and c be the factors of brightness and contrast, m the mean of all bytes, and M the matrix that turns hues and scales
 /// distances from grey. A pixel x becomes b c M x + b (1 - c) m, rounded and clamped once. Grey is the mean of the three channels

@@ -84,7 +84,7 @@ impl Insight {
         })
     }
 
-    /// Probabilities [B, L] with which local DIM finds the state that followed, which InfoNCE raises; 1 / B is chance. DIM is given the
+    /// Probabilities [B, L], which InfoNCE raises, that local DIM identifies the state that followed; 1 / B is chance. DIM is given the
     /// features of location l in state b of `now` and the action taken there, and picks among location l of all B states in `later`.
     /// `None` if the agent does not compare local features.
     ///

@@ -180,7 +180,7 @@ impl Learner {
         status.q_mean = report.q_mean;
     }
 
-    /// Makes the next weights' version larger than `version`. Actors accept only newer weights than theirs, and may have some of a
+    /// Makes the next weights' version larger than `version`. Actors accept only weights newer than theirs, which may be those of a
     /// learner that crashed after its last checkpoint.
     pub fn publish_above(&mut self, version: u64) {
         self.state.weights_version = self.state.weights_version.max(version);

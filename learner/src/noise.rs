@@ -21,7 +21,7 @@ pub struct UpdateNoise {
 impl UpdateNoise {
     /// Draws the noise of the update that follows `updates` updates. The same arguments give the same noise.
     pub fn draw(model: &ModelConfig, seed: [u8; 32], updates: u64) -> Self {
-        // ChaCha counts: its output is a function of seed, stream and position.
+        // ChaCha is counter-based: its output is a function of seed, stream and position.
         let mut rng = ChaCha8Rng::from_seed(seed);
         rng.set_stream(updates);
         let mut noise = || HeadNoise::draw(model, &mut rng);

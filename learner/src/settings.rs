@@ -36,7 +36,7 @@ pub struct UpdateSettings {
     pub lambda: Lambda,
     /// Bound c of the auxiliary scores' soft clip `c * tanh(x / c)`, from 1e-30 to 1e30; the largest clips nothing.
     pub tanh_clip: f64,
-    /// Global 2-norm to which gradients are clipped, from 1e-6 to 1e15; the largest clips nothing that Adam can square.
+    /// Global 2-norm to which gradients are clipped, from 1e-6 to 1e15; the largest in effect turns clipping off.
     pub max_grad_norm: f64,
     /// Adam's settings.
     pub adam: AdamSettings,
@@ -45,9 +45,9 @@ pub struct UpdateSettings {
     /// Share of the online network in a move of the target network, from 1e-5 to 1. Parameters are f32, so that the target stops moving
     /// within a relative distance of 6e-8 / tau from the online network: 6e-4 at 1e-4, and 6e-3 at 1e-5.
     pub target_tau: f64,
-    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; absent: none is kept. In
-    /// the first 1 / average_tau updates, the share of update t is 1 / t, which gives a plain mean. Checkpoints contain the averaged
-    /// network, and `evaluate` plays it; training does not use it.
+    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; absent: no averaged network. In the first
+    /// 1 / average_tau updates, the share of update t is 1 / t, which gives a plain mean. Checkpoints contain the averaged network, and
+    /// `evaluate` plays it; training does not use it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub average_tau: Option<f64>,
     /// The auxiliary loss's own settings, in a table of its name such as `[learner.update.curl]`; empty if the loss has none.

@@ -123,7 +123,7 @@ pub struct OnlineFeatures {
 }
 
 impl OnlineFeatures {
-    /// Passes the states of `batch` that `loss` needs through `network`. Augmented batches are not deduplicated: each state has its draw.
+    /// Passes the states of `batch` that `loss` needs through `network`. It does not deduplicate augmented batches: each state has a draw.
     pub fn new(
         network: &Network,
         model: &ModelConfig,

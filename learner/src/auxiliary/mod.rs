@@ -21,7 +21,7 @@ use settings::AuxiliarySettings;
 
 use crate::error::UpdateError;
 
-/// Every auxiliary loss; a new one gets its line here.
+/// All auxiliary losses of this crate; a new one adds a line here.
 pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
 
 /// The losses that the program registered.

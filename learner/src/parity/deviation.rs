@@ -22,7 +22,7 @@ pub struct ErrorOfUpdate {
     pub reference_loss: f64,
     /// |total - reference| / |reference|.
     pub loss: f64,
-    /// 2-norm of the gradients' difference over that of the reference, all parameters together; 0 where both are 0.
+    /// 2-norm of the difference of the gradients over that of the reference's gradients, all parameters together; 0 if both are 0.
     pub gradient: f64,
     /// 1 - cosine of the angle between the gradients.
     pub angle: f64,

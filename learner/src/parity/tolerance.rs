@@ -6,14 +6,14 @@ use driml_model::{Kernels, Precision, TorsoName};
 /// The largest errors at which the quantities of an update pass.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tolerances {
-    /// Values of s_t, in units of return, as a share of the support's width.
+    /// Values of s_t, as a share of the support's width.
     pub(super) q_values: f64,
     /// Share of rows with another greedy action in s_{t+n}: of two values that are nearly the same, either may be larger.
     pub(super) next_action_rows: f64,
     /// Each probability of the projected target distributions, in rows with the same greedy action.
     pub(super) projection: f64,
     pub(super) loss: f64,
-    /// Losses, relative, where scores saturate.
+    /// Losses, relative, if scores saturate.
     pub(super) saturated_loss: f64,
     pub(super) least_loss: f64,
     /// Gradients, as a share of the tensor's own 2-norm; `gradient_of_global` is added.

@@ -311,7 +311,7 @@ fn the_networks_say_what_they_are_and_need_not() {
     assert_eq!(bytes(&resume(folder.path())), bytes(&run));
 }
 
-/// Against float64; the average does not affect learning.
+/// Compares the averaged weights with float64. The average does not affect learning.
 #[test]
 fn averaged_weights_follow_and_are_saved_and_played() {
     const TAU: f64 = 0.25;
