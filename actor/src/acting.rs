@@ -1,5 +1,5 @@
-//! The acting loop: a policy in a world, one step of all environments at a time.
-//! It does not send, count or stop; recording, delivery and limits consume what it yields.
+//! The acting loop: each step asks the policy for actions and steps all environments of a world.
+//! It does not send, count or stop: callers record, deliver and limit the steps.
 
 use driml_envs::{EnvError, Environment, FrameStack, StepEnd};
 use rand_chacha::ChaCha8Rng;
@@ -12,17 +12,17 @@ use crate::{error::ActError, policy::Policy};
 pub struct Step<'a> {
     /// Frames [N, frame bytes] in which the actions were taken, unstacked.
     pub frames: &'a [u8],
-    /// The same with the frames before them [N, state bytes], as the policy saw them.
+    /// The same frames stacked with the frames before them [N, state bytes], as the policy saw them.
     pub states: &'a [u8],
     /// Actions [N].
     pub actions: &'a [u8],
-    /// Rewards [N] that they earned.
+    /// Rewards [N] of the actions.
     pub rewards: &'a [f32],
-    /// What they ended [N].
+    /// What each action ended, if anything [N].
     pub ends: &'a [StepEnd],
 }
 
-/// A world in motion.
+/// A running world, its frame stack, and the generator for exploration.
 pub struct Acting {
     world: Box<dyn Environment>,
     stack: FrameStack,
@@ -34,12 +34,12 @@ pub struct Acting {
     first: Vec<bool>,
 }
 
-/// How a world in motion stands between two steps.
+/// The state of an [`Acting`] between two steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActingState {
     world: Vec<u8>,
     stacked: Vec<u8>,
-    /// Of each environment, whether its next frame is the first of an episode or level.
+    /// Whether each environment's next frame is the first of an episode or level [N].
     first: Vec<bool>,
     rng: ChaCha8Rng,
 }
@@ -64,7 +64,7 @@ impl Acting {
         })
     }
 
-    /// Lets `policy` act once in every environment. After an error the world must not be stepped again.
+    /// Steps every environment once with an action from `policy`. After an error the world must not be stepped again.
     pub fn step(&mut self, policy: &mut dyn Policy, epsilon: f64) -> Result<Step<'_>, ActError> {
         self.world.observe(&mut self.frames);
         self.stack.push(&self.frames, &self.first);
@@ -84,7 +84,7 @@ impl Acting {
         })
     }
 
-    /// How it stands.
+    /// Returns the state between two steps.
     pub fn state(&mut self) -> Result<ActingState, EnvError> {
         Ok(ActingState {
             world: self.world.save()?,
@@ -94,7 +94,7 @@ impl Acting {
         })
     }
 
-    /// Restores a snapshot taken with the same world.
+    /// Restores a state saved with the same world.
     pub fn go_on_from(&mut self, state: ActingState) -> Result<(), EnvError> {
         if state.first.len() != self.first.len() {
             let (found, own) = (state.first.len(), self.first.len());

@@ -1,5 +1,5 @@
-//! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
-//! The processes and the lockstep mode run this same code; it neither sends nor waits.
+//! An actor without its network connections: acts with the weights that it was given and returns chunk after chunk.
+//! Actor processes and the lockstep mode both run this code; it neither sends nor waits.
 
 use driml_envs::RestrictedWorld;
 use driml_protocol::{BufferPool, Chunk, RunSpec};
@@ -16,29 +16,29 @@ use crate::{
     schedule::Schedule,
 };
 
-/// One life of an actor, from its start to its end; a restarted actor is another incarnation.
+/// One incarnation of an actor, from its start to its end. A restarted actor is a new incarnation.
 #[derive(Clone, Copy, Debug)]
 pub struct Incarnation {
-    /// Its number, unique in the run.
+    /// The actor's number, unique in the run.
     pub actor: u32,
-    /// Tells it from the others of its actor; it does not influence what is computed.
+    /// Distinguishes the incarnations of one actor. It does not influence any computation.
     pub id: u64,
-    /// Updates from which the run resumes: a resumed run does not play the episodes of its start again.
+    /// Updates from which the run resumes. It is part of the seeds: a resumed run does not repeat its first episodes.
     pub after_updates: u64,
-    /// Lives of this actor before this one: one that follows a dead one does not play its episodes again.
+    /// Earlier incarnations of this actor. It is part of the seeds: a restarted actor does not repeat its episodes.
     pub earlier_incarnations: u32,
 }
 
 impl Incarnation {
-    /// The seed of one of its generators. Lives that differ in `actor`, `after_updates` or `earlier_incarnations` have others,
-    /// whatever these counts are.
+    /// Returns the seed of the generator for `used_for`. Incarnations that differ in `actor`, `after_updates` or
+    /// `earlier_incarnations` get different seeds, whatever the values of these fields.
     pub fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
         let mut used_for = used_for.to_owned();
         if self.earlier_incarnations > 0 {
             used_for += &format!(" after {} lives", self.earlier_incarnations);
         }
-        // What the index has no room for.
+        // The high bits of `after_updates`, which do not fit into the index.
         let beyond = self.after_updates >> u32::BITS;
         if beyond > 0 {
             used_for += &format!(" after {beyond} times 2^32 updates");
@@ -47,7 +47,7 @@ impl Incarnation {
     }
 }
 
-/// An actor that collects.
+/// Steps a world with a policy and returns the transitions in chunks.
 pub struct Collector {
     schedule: Schedule,
     acting: Acting,
@@ -56,7 +56,7 @@ pub struct Collector {
     weights_version: u64,
 }
 
-/// How a collector stands between two chunks; the weights it acts with are not in it.
+/// The state of a collector between two chunks, without its weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CollectorState {
     acting: ActingState,
@@ -64,7 +64,7 @@ pub struct CollectorState {
 }
 
 impl Collector {
-    /// Makes the world and the policy with its first weights; chunks lie in memory of `pool`.
+    /// Builds the world, and the policy with its first weights. Chunks take their memory from `pool`.
     ///
     /// # Errors
     /// An actor beyond the ladder of epsilons, a world that cannot be made or does not fit the run spec, weights that do not fit
@@ -116,25 +116,25 @@ impl Collector {
         })
     }
 
-    /// Acts with other weights from the next chunk on; on an error the old ones stay.
+    /// Replaces the weights from the next chunk on. On an error, the old weights stay.
     pub fn set_weights(&mut self, version: u64, safetensors: &[u8]) -> Result<(), ActError> {
         self.policy.load(safetensors)?;
         self.weights_version = version;
         Ok(())
     }
 
-    /// Transitions of all chunks so far.
+    /// The number of transitions in all chunks so far.
     pub const fn produced(&self) -> u64 {
         self.recorder.produced()
     }
 
-    /// Acts until one chunk of `steps` steps is full. `frames` is the run's count so far, which fixes epsilon for the chunk.
+    /// Acts until one chunk of `steps` steps is full. `frames`, the run's frame count so far, sets epsilon for the whole chunk.
     pub fn collect(&mut self, frames: u64, steps: u32) -> Result<Chunk, ActError> {
         let chunk = self.collect_unless(|| false, frames, steps)?;
         Ok(chunk.expect("it is never over"))
     }
 
-    /// The same, or none once it `is_over`, with a chunk that is never filled: this must not collect any more.
+    /// Like `collect`, but returns `None` once `is_over` is true. The chunk stays unfinished: do not collect again.
     pub(crate) fn collect_unless(
         &mut self,
         is_over: impl Fn() -> bool,
@@ -154,7 +154,7 @@ impl Collector {
         Ok(None)
     }
 
-    /// How it stands between two chunks.
+    /// Returns the state between two chunks.
     pub fn state(&mut self) -> Result<CollectorState, ActError> {
         Ok(CollectorState {
             acting: self.acting.state()?,
@@ -162,7 +162,7 @@ impl Collector {
         })
     }
 
-    /// Restores a snapshot taken with the same settings: with the same weights it gives the same chunks.
+    /// Restores a state saved with the same settings. With the same weights, the next chunks are the same.
     pub fn go_on_from(&mut self, state: CollectorState) -> Result<(), ActError> {
         self.acting.go_on_from(state.acting)?;
         self.recorder.go_on_at(state.next_chunk);
@@ -256,7 +256,7 @@ mod tests {
         assert_eq!(collector.produced(), 0);
     }
 
-    /// The actions of a life's first chunk.
+    /// The actions of an incarnation's first chunk.
     fn actions(settings: ActorSettings, incarnation: Incarnation) -> Vec<u8> {
         let mut collector = collector(settings, incarnation).unwrap();
         let chunk = collector.collect(0, STEPS).unwrap();
@@ -301,7 +301,7 @@ mod tests {
             assert!(!seen.iter().any(repeats), "{incarnation:?}");
             seen.push(new);
         }
-        // The first life has the seeds that it has always had.
+        // The first incarnation seeds its world by the actor's number as the index, as in earlier versions.
         assert_eq!(FIRST.seed(&spec, "world"), spec.seed_for("world", 3));
     }
 

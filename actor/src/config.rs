@@ -1,5 +1,5 @@
-//! The actor's settings, and what it takes from the run's other tables.
-//! It fills in no number: presets do, with their sources.
+//! The actor's settings, and the other tables of a run's settings that an actor reads.
+//! No number has a default here: presets give each one, with its source.
 
 use std::{
     fmt::Display,
@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::ActError;
 
-/// Most actors on a ladder of epsilons; settings beyond it are refused.
+/// The most actors on a ladder of epsilons; settings with more are rejected.
 const ACTORS_MAX: u32 = 65_536;
 
 /// The `[actor]` table.
@@ -26,22 +26,22 @@ const ACTORS_MAX: u32 = 65_536;
 pub struct Config {
     /// Environments in one actor process, stepped together.
     pub envs: u32,
-    /// Steps of every environment in one chunk: how often an actor sends, and takes newer weights.
+    /// Steps of every environment in one chunk. After each chunk, the actor sends it and takes newer weights.
     pub steps_per_chunk: u32,
-    /// Transitions that one chunk of every actor of the run has together, at most: where there are many actors, chunks get
-    /// shorter than `steps_per_chunk`, so that no actor waits long to send what it has and to take newer weights. None, and in
-    /// lockstep: chunks are always `steps_per_chunk` long.
+    /// The most transitions in one chunk of each actor, summed over the run's actors. With many actors, chunks get
+    /// shorter than `steps_per_chunk`, so that no actor waits long to send its chunk and to take newer weights. Without
+    /// this setting, and in lockstep, chunks always have `steps_per_chunk` steps.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub round_transitions_max: Option<u64>,
-    /// Chunks waiting to be acknowledged; at this many the actor stops stepping until one is.
+    /// The most unacknowledged chunks; at this many the actor stops stepping until one is acknowledged.
     pub chunks_in_flight_max: u32,
-    /// In which numbers the network's products are computed. Settings of earlier versions do not have it: f32.
+    /// The number format of the network's products. Settings of earlier versions lack this field and mean f32.
     #[serde(default)]
     pub precision: driml_model::Precision,
-    /// Which of the world's actions are chosen among. Settings of earlier versions do not have it: all.
+    /// The actions among which the policy chooses. Settings of earlier versions lack this field and mean all.
     #[serde(default)]
     pub actions: driml_envs::ActionSet,
-    /// Threads that step the environments of Procgen, which alone uses them; 0 steps them in the acting thread.
+    /// Threads that step Procgen's environments; other worlds do not use them. 0 steps in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
     pub epsilon_start: f64,
@@ -49,15 +49,15 @@ pub struct Config {
     pub epsilon_end: f64,
     /// Frames of the whole run, all actors together, over which epsilon falls linearly.
     pub epsilon_decay_frames: u64,
-    /// Fixed epsilons, one an actor, instead of the one that falls; not there: it falls.
+    /// Fixed epsilons, one per actor, instead of an epsilon that falls. If absent, epsilon falls.
     pub epsilon_ladder: Option<EpsilonLadder>,
-    /// How long one try to deliver a chunk may take, milliseconds; then it is tried again.
+    /// Time-out of one attempt to deliver a chunk, in milliseconds; then the actor retries.
     pub ack_timeout_ms: u64,
-    /// How long the replay server or learner may be out of reach, milliseconds, before the actor gives up.
+    /// How long the replay server may be out of reach, in milliseconds, before the actor gives up.
     pub unreachable_max_ms: u64,
 }
 
-/// Fixed epsilons, from rung to rung smaller: actor i of N explores with `base^(1 + alpha * i / (N - 1))` for the whole run.
+/// Fixed epsilons that decrease with the actor's number: actor i of N explores with `base^(1 + alpha * i / (N - 1))` for the whole run.
 ///
 /// Source: Horgan et al. 2018 (Ape-X), with base 0.4 and alpha 7.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -65,32 +65,32 @@ pub struct Config {
 pub struct EpsilonLadder {
     /// Epsilon of actor 0, above 0 and below 1.
     pub base: f64,
-    /// How far down the ladder goes, at least 0: the last actor's epsilon is `base^(1 + alpha)`.
+    /// How fast epsilons decrease, at least 0: the last actor's epsilon is `base^(1 + alpha)`.
     pub alpha: f64,
-    /// Actors on the ladder, N, at least 2; `local.actors` where a person does not say it.
+    /// N, the number of actors on the ladder, at least 2; `local.actors` if the user does not set it.
     pub actors: u32,
 }
 
-/// Everything an actor needs to know of a run.
+/// The settings of a run that an actor needs.
 #[derive(Clone, Debug)]
 pub struct ActorSettings {
-    /// What all processes agree on.
+    /// The run spec, on which all processes agree.
     pub spec: RunSpec,
-    /// The world that its environments are of.
+    /// The settings of the world that the actor steps.
     pub world: driml_envs::WorldConfig,
-    /// The size at which the network sees it.
+    /// The size at which the network sees the world's frames.
     pub input: driml_model::InputSize,
     /// The network that chooses actions.
     pub model: driml_model::ModelConfig,
-    /// The actor's own.
+    /// The `[actor]` table.
     pub actor: Config,
-    /// How messages travel.
+    /// The transport of messages: whether chunks go through shared memory.
     pub transport: TransportConfig,
-    /// Actors that a launcher starts; 1 where none does.
+    /// The number of actors that the launcher starts; 1 without a launcher.
     pub actors_planned: u32,
 }
 
-/// What an actor needs to know of the `[local]` table, which is the launcher's.
+/// The part of the launcher's `[local]` table that an actor reads.
 #[derive(Deserialize)]
 struct Planned {
     actors: u32,
@@ -116,10 +116,10 @@ impl ActorSettings {
         Ok(this)
     }
 
-    /// Steps `envs` environments instead of those that the settings say.
+    /// Replaces the number of environments in the settings by `envs`.
     ///
     /// # Errors
-    /// Too many, or chunks that are longer than those of this run may be; what to do.
+    /// Too many environments, or chunks longer than this run allows; the message says what to do.
     pub fn set_envs(&mut self, envs: u32) -> Result<(), ConfigError> {
         let (steps, round) = (self.actor.steps_per_chunk, self.actor.round_transitions_max);
         let most = transitions_max(self.actor.envs, steps, round);
@@ -133,10 +133,10 @@ impl ActorSettings {
         })
     }
 
-    /// Takes the world's code from `world`, which a person on this machine has named, and not from the run's settings.
+    /// Takes the world's code from `world`, the name given on this machine, and not from the run's settings.
     ///
     /// # Errors
-    /// A world with code that was not named on this machine, or the name of another world.
+    /// The world needs code outside this program and `world` is `None`, or `world` names another world.
     pub fn set_world(&mut self, world: Option<WorldName>) -> Result<(), EnvError> {
         let name = self.world.name();
         match world {
@@ -169,8 +169,8 @@ impl ActorSettings {
         self.spec.frame_bytes() + TRANSITION_BYTES
     }
 
-    /// Memory for the chunks of one actor: one that is filled, and those that are not acknowledged. Shared memory is for chunks
-    /// as long as they are with the actors that are planned; longer ones lie in the process's own.
+    /// Returns the buffers for an actor's chunks: one being filled, and those not yet acknowledged. Buffers in shared
+    /// memory have the chunk size for `actors_planned` actors; longer chunks use the process's own memory.
     pub fn chunk_memory(&self) -> BufferPool {
         let count = self.actor.chunks_in_flight_max as usize + 1;
         let steps = self.actor.chunk_steps(self.actors_planned);
@@ -184,7 +184,7 @@ impl ActorSettings {
 }
 
 impl Config {
-    /// Steps of the next chunk where so many actors are connected to the run.
+    /// Returns the number of steps of the next chunk when `actors` actors are connected to the run.
     pub fn chunk_steps(&self, actors: u32) -> u32 {
         let Some(round) = self.round_transitions_max else {
             return self.steps_per_chunk;
@@ -220,7 +220,7 @@ impl Config {
     }
 }
 
-/// Checks the range of the value of a key of the `[actor]` table.
+/// Checks that the value of a key of the `[actor]` table lies in `range`.
 fn within<T: PartialOrd + Display>(
     key: &str,
     value: T,

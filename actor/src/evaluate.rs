@@ -1,4 +1,4 @@
-//! How well a policy plays: whole episodes, undiscounted returns.
+//! Evaluates a policy: plays whole episodes and sums their rewards without discount.
 //! It stores and sends nothing.
 
 use std::ops::ControlFlow;
@@ -12,30 +12,30 @@ use crate::{
     policy::Policy,
 };
 
-/// How much is played, and how.
+/// The size and the settings of an evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct Evaluation {
-    /// Frames that a state is made of.
+    /// The number of frames stacked in a state.
     pub frame_stack: usize,
     /// Probability of a random action.
     pub epsilon: f64,
-    /// Whole episodes of all environments together.
+    /// The number of whole episodes, of all environments together.
     pub episodes: usize,
-    /// Steps of each environment after which it is given up.
+    /// Steps of each environment after which the evaluation fails.
     pub steps_max: u64,
 }
 
-/// Is shown every step and the returns so far; says whether to play on.
+/// A callback that gets every step and the returns so far, and decides whether to continue.
 pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]) -> ControlFlow<()>;
 
-/// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone. They are fewer
-/// where `watch` breaks.
+/// Plays whole episodes of `policy` in `world`. Returns their returns in the order in which they ended, fewer of them
+/// if `watch` breaks. `rng` is for exploration alone.
 ///
-/// Each environment contributes the same number of episodes (the last round's surplus is dropped by environment order), so that short
-/// episodes are not favoured by being over first.
+/// Each environment contributes the same number of episodes (the last round's surplus is dropped by environment order),
+/// so that short episodes do not count more because they end first.
 ///
 /// # Errors
-/// The policy or the world failed, or episodes have not ended after `steps_max` steps an environment.
+/// The policy or the world failed, or episodes have not ended after `steps_max` steps per environment.
 pub fn episode_returns(
     world: Box<dyn Environment>,
     policy: &mut dyn Policy,
@@ -85,7 +85,7 @@ mod tests {
 
     use super::*;
 
-    /// A world whose environments play what is written down for each, over and over.
+    /// A world whose environments repeat a script of rewards and ends.
     struct Scripted {
         scripts: Vec<Vec<(f32, StepEnd)>>,
         step: usize,
@@ -122,7 +122,7 @@ mod tests {
         }
     }
 
-    /// Writes down the epsilons it is given.
+    /// Records the epsilons that it gets.
     #[derive(Default)]
     struct Tape(Vec<f64>);
 
@@ -148,7 +148,7 @@ mod tests {
         play_until(usize::MAX, scripts, episodes, steps_max)
     }
 
-    /// The same, broken off where as many as `ended` episodes have ended.
+    /// Like `play`, but breaks after `ended` episodes.
     fn play_until(
         ended: usize,
         scripts: &[&[(f32, StepEnd)]],
@@ -194,7 +194,7 @@ mod tests {
         assert_eq!(play(&[cut_off], 2, 100).unwrap(), [5.0, 5.0]);
     }
 
-    /// Taken as they end, the first four episodes would all be the short environment's.
+    /// In the order in which they end, the first four episodes would all be the short environment's.
     #[test]
     fn every_environment_plays_its_share_of_the_episodes() {
         let all = play(&[SHORT, LONG], 4, 100).unwrap();

@@ -1,8 +1,8 @@
-//! An actor: a policy in many environments, whose transitions go to the replay server.
-//! It never sees a batch and never learns; weights come from the learner.
+//! An actor steps many environments with a policy and sends the transitions to the replay server.
+//! It never sees a batch and never learns; its weights come from the learner.
 //!
-//! Start at [`run`], a whole actor process, or at [`Collector`], the same without a network connection. Below them [`Acting`]
-//! steps a world with a [`Policy`], [`ChunkRecorder`] makes chunks of the steps, and [`Delivery`] brings them to the replay server.
+//! Start at [`run`], a whole actor process, or at [`Collector`], an actor without a network connection. [`Acting`] steps a world
+//! with a [`Policy`], [`ChunkRecorder`] packs the steps into chunks, and [`Delivery`] sends the chunks to the replay server.
 //!
 //! ```
 //! use driml_actor::{ActError, Acting, ChunkRecorder, RandomPolicy};

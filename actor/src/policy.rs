@@ -1,5 +1,5 @@
-//! Who chooses actions: the network with epsilon-greedy exploration, or chance alone.
-//! It does not know the schedule of epsilon nor where weights come from.
+//! The policies that choose actions: the network with epsilon-greedy exploration, and uniformly random actions.
+//! They do not know the schedule of epsilon, nor where weights come from.
 
 use driml_model::{Enlarge, ModelConfig, PolicyNetwork, Precision};
 use rand::Rng;
@@ -19,7 +19,7 @@ pub trait Policy: Send {
     ) -> Result<(), ActError>;
 }
 
-/// Uniform over the actions, whatever the state.
+/// Draws actions uniformly, whatever the state.
 #[derive(Debug)]
 pub struct RandomPolicy {
     num_actions: u8,
@@ -45,16 +45,16 @@ impl Policy for RandomPolicy {
     }
 }
 
-/// Greedy in the expected return of the C51 network, but for epsilon and the noise of noisy layers.
+/// Takes the action with the highest expected return of the C51 network, apart from epsilon and the noise of noisy layers.
 ///
-/// Which actions are random is drawn first: states in which chance decides do not pass through the network.
+/// Draws first which actions are random. States with a random action do not pass through the network.
 pub struct NetworkPolicy {
     network: PolicyNetwork,
     enlarge: Option<Enlarge>,
     num_actions: u8,
     noise: bool,
-    /// The environments in which the network decides, their states if these are not all, at the network's size if that is another,
-    /// and their actions: memory to use again.
+    /// Reused buffers: the environments in which the network chooses the action; their states, if these are not all;
+    /// those states enlarged, if the network's input is larger; and the chosen actions.
     deciding: Vec<usize>,
     states: Vec<u8>,
     enlarged: Vec<u8>,
@@ -62,8 +62,8 @@ pub struct NetworkPolicy {
 }
 
 impl NetworkPolicy {
-    /// A policy with the weights of a safetensors file; `enlarge` makes the network's input of a state, if that is not it. Its
-    /// products are computed in `precision`.
+    /// Creates a policy with the weights of a safetensors file. `enlarge` resizes states to the network's input; `None`
+    /// if the sizes are equal. The network computes its products in `precision`.
     pub fn new(
         model: &ModelConfig,
         enlarge: Option<Enlarge>,
@@ -85,8 +85,8 @@ impl NetworkPolicy {
         })
     }
 
-    /// The same, exploring by the noise of the network's noisy layers, if it has some: drawn anew in each step, and the same for all
-    /// environments, as they pass through the network together. Without this their means act.
+    /// Turns on exploration by the network's noisy layers, if it has any. Each step draws new noise, the same for all
+    /// environments, as they pass through the network together. Without noise, the layers use their mean weights.
     ///
     /// Source: Fortunato et al. 2018, section 3.2 (a) and algorithm 1: a new sample before every action.
     #[must_use]
@@ -223,7 +223,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// As if the network had decided in every state and chance had then overruled it: the same numbers drawn, the same actions.
+    /// The actions and the random numbers drawn are the same as if the network chose in every state before random actions replaced some.
     #[test]
     fn states_in_which_chance_decides_need_no_network() {
         let rng = &mut ChaCha8Rng::seed_from_u64(3);
@@ -278,7 +278,7 @@ pub(crate) mod tests {
         let first = steps(&mut noisy, rng);
         let others = first.iter().filter(|actions| **actions != greedy[0]);
         assert!(others.count() > 25, "{first:?}");
-        // It depends on the generator's state alone, not on noise drawn before.
+        // The noise depends on the generator's state alone, not on earlier noise.
         let mut again = policy_with(head, 1).with_noise();
         let saved = rng.clone();
         let second = steps(&mut noisy, rng);

@@ -1,11 +1,11 @@
-//! Turns steps into numbered chunks, writing each frame once, straight to where it travels from.
-//! It does not send them.
+//! Packs steps into numbered chunks, writing each frame once, straight into the memory from which it is sent.
+//! It does not send the chunks.
 
 use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use serde::{Deserialize, Serialize};
 
-/// What a world ended, in the words of the wire.
+/// Converts the end of a step to its wire format.
 const fn end_on_the_wire(end: StepEnd) -> End {
     match end {
         StepEnd::Running => End::Running,
@@ -15,26 +15,26 @@ const fn end_on_the_wire(end: StepEnd) -> End {
     }
 }
 
-/// Which chunk of an actor's life it is, and how many transitions were before it.
+/// The number of a chunk in its incarnation, and the number of transitions before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkNumbers {
     sequence: u64,
     first_transition: u64,
 }
 
-/// Fills chunk after chunk.
+/// Records steps into one chunk after another.
 #[derive(Debug)]
 pub struct ChunkRecorder {
     pool: BufferPool,
-    /// Of the chunk being filled, or of the next one.
+    /// The header of the chunk being filled, or of the next one.
     header: ChunkHeader,
-    /// None between two chunks.
+    /// The chunk being filled; `None` between two chunks.
     chunk: Option<Chunk>,
     filled_steps: u32,
 }
 
 impl ChunkRecorder {
-    /// A recorder for `streams` environments; how long its chunks are is for [`ChunkRecorder::begin`].
+    /// Creates a recorder for `streams` environments. [`ChunkRecorder::begin`] sets the length of each chunk.
     pub fn new(
         pool: BufferPool,
         actor: u32,
@@ -58,7 +58,7 @@ impl ChunkRecorder {
         }
     }
 
-    /// Says which weights act in the next chunk and how many steps it has; only before its first step.
+    /// Sets the weights' version and the number of steps of the next chunk, before its first step.
     ///
     /// # Panics
     /// If a chunk is being filled.
@@ -71,12 +71,12 @@ impl ChunkRecorder {
         self.header.steps = steps;
     }
 
-    /// Transitions of all chunks that were filled.
+    /// The number of transitions in all completed chunks.
     pub const fn produced(&self) -> u64 {
         self.header.first_transition
     }
 
-    /// The numbers of the next chunk, between two of them.
+    /// Returns the numbers of the next chunk, between two chunks.
     ///
     /// # Panics
     /// If a chunk is being filled.
@@ -94,9 +94,9 @@ impl ChunkRecorder {
         self.header.first_transition = next.first_transition;
     }
 
-    /// Records one step of every environment: frames [N, frame bytes] in which `actions` [N] were taken, and what came of it.
+    /// Records one step of every environment: the `frames` [N, frame bytes] in which `actions` [N] were taken, `rewards` and `ends` [N].
     ///
-    /// Gives the chunk that this step completed, if it did.
+    /// Returns the chunk that this step completed, if any.
     pub fn record(
         &mut self,
         frames: &[u8],

@@ -1,5 +1,5 @@
-//! One actor process: join, act, deliver, until told to stop or no longer needed.
-//! The acting itself is `collect`, which knows no network.
+//! Runs one actor process: joins the run, acts, and delivers chunks until it is told to stop or the run has enough transitions.
+//! The acting itself is in `collect`, which uses no network.
 
 use std::{sync::Arc, time::Duration};
 
@@ -19,41 +19,41 @@ use crate::{
     weights::{self, NewestWeights},
 };
 
-/// How long an actor waits for a learner with weights.
+/// How long an actor waits for the learner's first weights.
 const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 
-/// What an actor is told at its start; everything else comes from the replay server.
+/// The arguments of one actor process. All other settings come from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
     /// Endpoints of the replay server.
     pub connect: Vec<String>,
-    /// With which certificate it takes part; none without TLS.
+    /// The actor's TLS certificate and key; `None` without TLS.
     pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
-    /// Which actor this is; unique in the run.
+    /// The actor's number, unique in the run.
     pub actor: u32,
-    /// Environments, if not as many as the settings say.
+    /// The number of environments, if it differs from the run's settings.
     pub envs: Option<u32>,
-    /// The world as this machine has it, where it is code outside this program: nothing else of that kind is started
-    /// or loaded, whatever the replay server says.
+    /// The world's name on this machine, if the world is code outside this program (a command or a library). The actor
+    /// starts or loads no other such code, whatever the replay server sends.
     pub world: Option<WorldName>,
 }
 
-/// Runs one actor until `shutdown`, or until the run has its transitions.
+/// Runs one actor until `shutdown`, or until the run has all its transitions; returns whether the run has them.
 ///
 /// # Errors
 /// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
-pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints::to(args.connect);
     let (credentials, max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
     let opened = session::open_unless(shutdown, endpoints, &keys, credentials, max)?;
     let Some(session) = opened else {
-        return Ok(());
+        return Ok(false);
     };
     let Some(run_info) = join::run_info(&session, &keys, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     let mut settings = ActorSettings::from_toml(&run_info.config_toml)
         .context("the settings that the replay server sent")?;
@@ -76,12 +76,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         actor: join.actor,
         incarnation: join.incarnation,
     };
-    // Before it joins, so that no other process can take its place from then on.
+    // Declared before joining, so that no other process can join as this actor from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client.declare_alive(who.alive());
     let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {
         tracing::warn!(
@@ -94,11 +94,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let clients = vec![client.clone()];
     reporter::start(clients, who, activity.clone(), shutdown.clone())?;
     let Some(first) = weights::first(&client, WEIGHTS_WAIT_MAX, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
-    // The learner has joined by now, and with it the replay server knows where a resumed run stands.
+    // The learner has joined by now, so the replay server knows after how many updates a resumed run continues.
     let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     let pool = settings.chunk_memory();
     activity.begin("makes its environments");
@@ -108,15 +108,24 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         after_updates: run_info.after_updates,
         earlier_incarnations: welcome.earlier_incarnations,
     };
-    let (version, safetensors) = (first.header.version, &first.safetensors);
-    let mut collector = Collector::new(&settings, pool.clone(), life, version, safetensors)?;
+    let version = first.header.version;
+    // A world in its own process may take minutes to start.
+    let made = {
+        let (settings, pool) = (settings.clone(), pool.clone());
+        let make = move || Collector::new(&settings, pool, life, version, &first.safetensors);
+        shutdown.unless_set("environments", make)?
+    };
+    let Some(collector) = made else {
+        return Ok(false);
+    };
+    let mut collector = collector?;
     let newest = weights::watch(client.clone(), version, shutdown.clone())?;
     let (actor, config) = (args.actor, &settings.actor);
     let (inserted, limits) = (run_info.inserted_total, DeliveryLimits::of(config));
     let delivery = Delivery::start(client.clone(), inserted, limits, pool, shutdown.clone())?;
     let envs = config.envs;
     tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
-    // At the start not all are connected yet.
+    // At the start, not all planned actors are connected yet.
     let chunk_steps = |actors: u32| config.chunk_steps(actors.max(settings.actors_planned));
     let played = play(
         &mut collector,
@@ -127,9 +136,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shutdown,
     );
     if played.is_err() {
-        // What was played before the world failed is delivered too, without a wait for the rate limiter.
+        // Chunks from before the failure are still delivered, without a wait for the rate limiter.
         shutdown.set();
     }
+    let is_over = delivery.progress().finished;
     let produced = collector.produced();
     activity.begin("delivers its last chunks");
     let delivered = delivery.finish();
@@ -141,11 +151,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     tracing::info!("actor {actor} leaves: {stored} transitions delivered");
     drop(alive);
     let closed = client.session().close().wait();
-    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))?;
+    Ok(is_over)
 }
 
-/// Plays and queues what was played until `shutdown`, or until the run needs no more. `chunk_steps` says how many steps a chunk has,
-/// of the number of actors in the run.
+/// Collects and queues chunks until `shutdown`, or until the run needs no more. `chunk_steps` maps the number of actors
+/// in the run to the number of steps in a chunk.
 fn play(
     collector: &mut Collector,
     chunk_steps: impl Fn(u32) -> u32,

@@ -1,5 +1,5 @@
-//! The probability with which an actor acts at random: one that falls over the run, or one fixed for each actor.
-//! It does not count frames: the caller says how many the run has.
+//! Epsilon, the probability of a random action: falling over the run, or fixed for each actor.
+//! The schedule does not count frames: the caller passes the run's frame count.
 
 use crate::{
     config::{Config, EpsilonLadder},
@@ -11,22 +11,22 @@ use crate::{
 pub enum Schedule {
     /// Linear over the frames of the whole run, then constant. Source: table of parameters in the paper's appendix.
     Falling {
-        /// At the run's first frame.
+        /// Epsilon at the run's first frame.
         start: f64,
-        /// From `decay_frames` on.
+        /// Epsilon from `decay_frames` on.
         end: f64,
-        /// Frames of all actors together.
+        /// Frames over which epsilon falls, of all actors together.
         decay_frames: u64,
     },
-    /// The same throughout. Source: Horgan et al. 2018.
+    /// The same epsilon for the whole run. Source: Horgan et al. 2018.
     Fixed(f64),
 }
 
 impl Schedule {
-    /// Largest error of an epsilon, a probability, for any counts of frames.
+    /// The largest absolute error of [`Schedule::epsilon`], for any number of frames.
     pub const ERROR: f64 = 1e-15;
 
-    /// The schedule of actor number `actor`.
+    /// Returns the schedule of actor number `actor`.
     pub fn new(config: &Config, actor: u32) -> Result<Self, ActError> {
         match &config.epsilon_ladder {
             Some(ladder) => ladder_epsilon(ladder, actor).map(Self::Fixed),
@@ -38,8 +38,7 @@ impl Schedule {
         }
     }
 
-    /// Epsilon after `frames` frames of the run, right to [`Schedule::ERROR`]; it never leaves the range from start to end, and never
-    /// goes back.
+    /// Returns epsilon after `frames` frames of the run, to within [`Schedule::ERROR`]: between start and end, and monotonic in `frames`.
     pub fn epsilon(&self, frames: u64) -> f64 {
         match *self {
             Self::Fixed(epsilon) => epsilon,
@@ -52,7 +51,7 @@ impl Schedule {
                 decay_frames,
             } => {
                 let epsilon = start + (end - start) * (frames as f64 / decay_frames as f64);
-                // Just before the end rounding may take it past it.
+                // Just before `decay_frames`, rounding may carry epsilon past `end`.
                 epsilon.clamp(start.min(end), start.max(end))
             }
         }
@@ -124,7 +123,7 @@ mod tests {
                 assert!((found - wanted).abs() < 1e-12, "{actor}: {found}");
             }
         }
-        // The ends are the same whatever the number of actors.
+        // The first and the last epsilon do not depend on the number of actors.
         for actors in [2, 3, 360] {
             for (actor, power) in [(0, 1), (actors - 1, 8)] {
                 let schedule = Schedule::new(&with_ladder(actors), actor).unwrap();

@@ -1,5 +1,5 @@
-//! Keeps the newest weights: learns of a new version, then pulls it from the replay server; a late joiner pulls at once.
-//! It keeps one set alone, and the learner has no part in a pull.
+//! Keeps the newest weights: pulls each announced version from the replay server. An actor that joins late pulls at once.
+//! It keeps one version alone, and the learner takes no part in a pull.
 
 use std::{
     collections::VecDeque,
@@ -14,20 +14,20 @@ use driml_protocol::{
     session::SessionError,
 };
 
-/// How long one piece may take to come.
+/// Time-out of the request for one piece.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Pieces on their way at once.
+/// Pieces requested at the same time.
 const PIECES_IN_FLIGHT: usize = 4;
-/// How often to look for a new version although none was announced, in case the announcement was lost.
+/// How often to pull without an announcement, in case an announcement was lost.
 const PULL_ANYWAY: Duration = Duration::from_secs(10);
-/// How often a thread that has nothing to pull looks whether it should end.
+/// How often a thread that has nothing to pull checks for shutdown.
 const TICK: Duration = Duration::from_millis(200);
-/// Pause between two questions for the first weights.
+/// Pause between two requests for the first weights.
 const PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(5);
 
-/// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
+/// A slot for the newest weights. Each [`Self::take_within`] allows one pull; one more every [`PULL_ANYWAY`] covers lost announcements.
 #[derive(Clone, Debug)]
 pub(crate) struct NewestWeights {
     shared: Arc<(Mutex<State>, Condvar)>,
@@ -35,19 +35,19 @@ pub(crate) struct NewestWeights {
 
 #[derive(Debug)]
 struct State {
-    /// Newest version that was announced.
+    /// The newest version that was announced.
     announced: u64,
-    /// The same when the last pull began.
+    /// The value of `announced` when the last pull began.
     sought: u64,
-    /// Version of the last ones that were pulled.
+    /// The version that was pulled last.
     pulled: u64,
     slot: Option<Weights>,
-    /// The actor has asked since the last pull.
+    /// Whether the actor has asked for weights since the last pull began.
     is_wanted: bool,
 }
 
 impl NewestWeights {
-    /// Nothing yet, where weights of `version` are in use.
+    /// An empty slot for an actor that uses the weights `version`.
     fn after(version: u64) -> Self {
         let state = State {
             announced: version,
@@ -65,8 +65,8 @@ impl NewestWeights {
         lock(&self.shared.0)
     }
 
-    /// Takes the newest weights, if they came since the last call, and asks for newer ones; those that were announced are waited
-    /// for, at most for `wait_max`.
+    /// Takes the newest weights, if some came since the last call, and asks for newer ones. Waits up to `wait_max` for
+    /// weights that were announced but not yet pulled.
     pub(crate) fn take_within(&self, wait_max: Duration) -> Option<Weights> {
         let (mut state, changed) = (self.state(), &self.shared.1);
         state.is_wanted = true;
@@ -83,7 +83,7 @@ impl NewestWeights {
         self.shared.1.notify_all();
     }
 
-    /// Waits until newer weights are to be pulled, at most for `wait_max`; the version that they are to be newer than.
+    /// Waits up to `wait_max` until newer weights are wanted. Returns the version that was pulled last; `None` on a time-out.
     fn wait_until_wanted(&self, wait_max: Duration) -> Option<u64> {
         let idle = |state: &mut State| !(state.is_wanted && state.announced > state.pulled);
         let changed = &self.shared.1;
@@ -97,7 +97,7 @@ impl NewestWeights {
         Some(state.pulled)
     }
 
-    /// Puts what a pull gave in its place.
+    /// Stores the result of a pull; `None` if it brought no newer weights.
     fn put(&self, weights: Option<Weights>) {
         let mut state = self.state();
         match weights {
@@ -105,7 +105,7 @@ impl NewestWeights {
                 state.pulled = weights.header.version;
                 state.slot = Some(weights);
             }
-            // The process that announced them did not have them. Later ones may have been announced meanwhile.
+            // The announced version does not exist: forget it, unless a later one was announced during the pull.
             None if state.announced == state.sought => state.announced = state.pulled,
             None => {}
         }
@@ -113,7 +113,7 @@ impl NewestWeights {
     }
 }
 
-/// Pulls the first weights, waiting until the learner has sent some; `None` if told to stop before.
+/// Pulls the first weights, waiting until the learner has sent some. Returns `None` on `shutdown`.
 ///
 /// # Errors
 /// No weights within `wait_max`, not counting the time in which the replay server reads its replay back from disk.
@@ -156,7 +156,7 @@ pub(crate) fn first(
     }
 }
 
-/// Watches until `shutdown`, on its own thread.
+/// Starts a thread that pulls newer weights until `shutdown`; weights `version` are in use.
 pub(crate) fn watch(
     client: RunClient,
     version: u64,
@@ -173,7 +173,7 @@ pub(crate) fn watch(
         .map_err(|e| anyhow!("listening for new weights: {e}"))?;
     let slot = newest.clone();
     let work = move || {
-        // For as long as the thread lives.
+        // The subscription lasts as long as the thread.
         let _announcements = announcements;
         let mut looked = Instant::now();
         while !shutdown.is_set() {
@@ -189,7 +189,7 @@ pub(crate) fn watch(
             looked = Instant::now();
             match pull(&client, version) {
                 Ok(weights) => slot.put(weights),
-                // The actor leaves: its session closes under this thread.
+                // The actor is leaving and has closed its session.
                 Err(_) if client.session().is_closed() => return,
                 Err(e) => {
                     tracing::warn!("keeping weights {version}, newer ones did not come: {e}");
@@ -204,7 +204,7 @@ pub(crate) fn watch(
     Ok(newest)
 }
 
-/// The newest weights, piece by piece; none if they are not newer than `version`.
+/// Pulls the newest weights, piece by piece. Returns `None` if they are not newer than `version`.
 fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
     let pool = BufferPool::new(PIECES_IN_FLIGHT);
     let first = ask(client, WeightsRequest::NewerThan(version))?;
@@ -280,12 +280,12 @@ mod tests {
             2
         );
         assert_eq!(wanted(), Some(2));
-        // Announced while a pull was on its way, which found nothing.
+        // A version that is announced during a pull, which finds nothing.
         newest.announce(1 << 60);
         newest.put(None);
         assert!(newest.take_within(Duration::ZERO).is_none());
         assert_eq!(wanted(), Some(2));
-        // It was foreign: nothing newer exists, and nothing waits for it.
+        // The announcement was false: no newer version exists, and `take_within` does not wait for one.
         newest.put(None);
         assert!(newest.take_within(Duration::from_secs(3600)).is_none());
         assert_eq!(wanted(), None);

@@ -1,5 +1,5 @@
-//! The augmentation of a batch's states: 256 frames of 64x64x3, cropped, jittered, both and neither.
-//! Updates are measured by `driml bench learner`.
+//! Measures the augmentation of a batch's states: 256 frames of 64x64x3, cropped, jittered, both and neither.
+//! `driml bench learner` measures updates.
 
 #![allow(missing_docs, reason = "criterion's macros make public functions")]
 

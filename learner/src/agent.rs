@@ -1,5 +1,5 @@
-//! One update: the gradients of a batch, clipped, through Adam; then the target network's turn.
-//! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
+//! One update: computes the gradients of a batch, clips them, takes an Adam step and moves the target network.
+//! It does not fetch batches, publish weights or save checkpoints, and communicates with no other process.
 
 use std::collections::HashMap;
 
@@ -24,24 +24,24 @@ use crate::{
     tensors::{flat, states},
 };
 
-/// The parameters of all networks that a learner has.
+/// The parameters of all networks of an agent.
 #[derive(Debug)]
 pub struct NetworkParameters {
     /// The network that learns.
     pub online: Parameters,
     /// C51's target network: torso and head.
     pub target: Parameters,
-    /// CURL's key encoder: torso and Psi_4; there for that auxiliary loss and for no other.
+    /// The key encoder, torso and Psi_4; `None` unless the auxiliary loss has one, as CURL does.
     pub key: Option<Parameters>,
 }
 
-/// The learner: online and target network, CURL's key encoder, optimiser, count of updates.
+/// An agent: online and target network, key encoder, optimiser, count of updates.
 #[derive(Debug)]
 pub struct Agent {
     networks: Networks,
     target: Parameters,
     key: Option<Parameters>,
-    /// Torso and head of the averaged network; there after the first update, if the settings ask for one.
+    /// Torso and head of the averaged network; `None` before the first update, and without `average_tau`.
     average: Option<Parameters>,
     noise_seed: [u8; 32],
     pub(crate) adam: Adam,
@@ -49,10 +49,10 @@ pub struct Agent {
 }
 
 impl Agent {
-    /// A learner with initial weights drawn from `rng`, the same on every device; the slow networks are copies.
+    /// Creates an agent with initial weights drawn from `rng`, the same on every device. The target network and the key encoder are copies.
     ///
     /// # Errors
-    /// Settings out of their ranges, or a model whose heads are not those that the auxiliary loss uses.
+    /// Settings out of their ranges, or a model whose heads and layers are not those that the auxiliary loss uses.
     pub fn new(
         model: ModelConfig,
         settings: UpdateSettings,
@@ -70,7 +70,7 @@ impl Agent {
         Self::from_parameters(model, settings, compute, parameters)
     }
 
-    /// A learner with given weights, on the device of `compute`, before its first update.
+    /// Creates an agent with the given weights, which are on the device of `compute`, before its first update.
     ///
     /// # Errors
     /// As [`Agent::new`], and parameters that do not fit the model.
@@ -136,8 +136,8 @@ impl Agent {
         })
     }
 
-    /// The same; `deduplicate` says whether equal states of a batch are computed once. Without this each is computed, and always on other
-    /// devices than the CPU, whose arithmetic takes less time than the CPU's checksums.
+    /// Sets whether equal states of a batch are computed once; the default is no. This works with the CPU's fused kernels only: a GPU
+    /// computes a state in less time than the CPU needs for its checksum.
     #[must_use]
     pub const fn with_deduplication(mut self, deduplicate: bool) -> Self {
         let kernels = self.networks.compute.kernels;
@@ -145,7 +145,7 @@ impl Agent {
         self
     }
 
-    /// The same, with the noise of noisy layers drawn from this seed and the number of the update. Without this it is the seed 0.
+    /// Sets the seed of the noisy layers' noise, which is a function of the seed and the number of the update. The default seed is 0.
     #[must_use]
     pub const fn with_noise_seed(mut self, noise_seed: [u8; 32]) -> Self {
         self.noise_seed = noise_seed;
@@ -157,12 +157,12 @@ impl Agent {
         &self.networks.model
     }
 
-    /// The settings of its updates.
+    /// The settings of an update.
     pub const fn settings(&self) -> &UpdateSettings {
         &self.networks.settings
     }
 
-    /// Updates taken since the run began, those before a restart included.
+    /// The number of updates since the run began, including those before a restart.
     pub const fn updates(&self) -> u64 {
         self.updates
     }
@@ -177,18 +177,18 @@ impl Agent {
         &self.target
     }
 
-    /// The parameters of CURL's key encoder, if that is the auxiliary loss.
+    /// The parameters of the key encoder, if the auxiliary loss has one.
     pub const fn key(&self) -> Option<&Parameters> {
         self.key.as_ref()
     }
 
-    /// The averaged network's parameters, torso and head, if the settings ask for one and an update was taken. They begin as a copy of
-    /// the online network's; after each later update, number t of the run, they move `max(average_tau, 1 / t)` of the way to those.
+    /// The averaged network's parameters, torso and head; `None` before the first update, and without `average_tau`. They start as a copy
+    /// of the online parameters. Each later update t of the run moves them `max(average_tau, 1 / t)` of the way to the online parameters.
     pub const fn average(&self) -> Option<&Parameters> {
         self.average.as_ref()
     }
 
-    /// Puts the averaged weights, if there are any, into torso and head of the online network, to play with. Says whether there were.
+    /// Copies the averaged weights, if any, into torso and head of the online network, for evaluation. Returns whether there were any.
     pub fn take_average(&mut self) -> Result<bool, UpdateError> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online().get(name) {
@@ -198,7 +198,7 @@ impl Agent {
         Ok(self.average.is_some())
     }
 
-    /// What actors need, torso and head, as safetensors bytes.
+    /// The weights that actors need, torso and head, as safetensors bytes.
     ///
     /// # Errors
     /// A weight that is not finite; a failing serialisation.
@@ -209,7 +209,7 @@ impl Agent {
     /// [`Agent::weights`] with scalars of another type.
     ///
     /// # Errors
-    /// As there, and a weight that is too large for the type.
+    /// As [`Agent::weights`], and a weight that is too large for the type.
     pub fn weights_as(&self, stored: StoredAs) -> Result<Vec<u8>, UpdateError> {
         Ok(self
             .online()
@@ -219,11 +219,11 @@ impl Agent {
     /// Learns from one batch.
     ///
     /// # Errors
-    /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
-    /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
+    /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. [`UpdateError::Diverged`] if the
+    /// step makes a parameter or moment infinite or NaN: the agent can then neither learn nor be published or saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         fail_point::hold(self.updates());
-        // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
+        // Runs on a thread of the pool: from another thread, each matrix product would cost a switch to the pool and back.
         rayon::scope(|_| {
             let evaluation = self.evaluate(batch)?;
             let grad_norm = self.apply(&evaluation.gradients)?;
@@ -240,7 +240,7 @@ impl Agent {
         })
     }
 
-    /// Checks that `batch` is one of this network's and auxiliary loss's.
+    /// Checks that `batch` fits this network and this auxiliary loss.
     pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
         batch.validate(self.model(), self.settings().auxiliary_loss.positives())
     }
@@ -250,7 +250,7 @@ impl Agent {
         UpdateNoise::draw(self.model(), self.noise_seed, self.updates)
     }
 
-    /// Losses and gradients of one batch at the present parameters, with the noise of the next update.
+    /// Losses and gradients of one batch at the current parameters, with the noise of the next update.
     ///
     /// # Errors
     /// A batch that does not fit, or losses that are not finite.
@@ -258,10 +258,10 @@ impl Agent {
         self.evaluate_with(batch, &self.noise())
     }
 
-    /// [`Agent::evaluate`] with this noise of noisy layers.
+    /// [`Agent::evaluate`] with the given noise of the noisy layers.
     ///
     /// # Errors
-    /// As there, and noise for a head without noisy layers.
+    /// As [`Agent::evaluate`], and noise for a head without noisy layers.
     pub fn evaluate_with(
         &self,
         batch: &Batch<'_>,
@@ -271,8 +271,8 @@ impl Agent {
         self.networks.evaluate(batch, noise)
     }
 
-    /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone. Without noise:
-    /// of noisy layers the means serve.
+    /// Q-values [B, A] of the online network in the batch's s_t, by a separate forward pass: an update computes only the values of the
+    /// taken actions. Noisy layers use their means.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
         let networks = &self.networks;
         let states = states(self.model(), batch.states_t, &networks.compute.device)?;
@@ -280,8 +280,8 @@ impl Agent {
         Ok(flat(&networks.online.q_values(&logits)?)?)
     }
 
-    /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
-    /// Returns their global norm before clipping.
+    /// Clips `gradients`, takes one Adam step and moves the slow networks that are due.
+    /// Returns the global norm of the gradients before clipping.
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
         let Networks {
             settings,
@@ -316,7 +316,7 @@ impl Agent {
         self.average = Some(average);
     }
 
-    /// Puts back a state that [`Agent::online`], [`Agent::target`] and [`Adam`] had after `updates` updates.
+    /// Restores the optimiser's state and the count of updates from a checkpoint.
     pub(crate) fn restore_progress(
         &mut self,
         updates: u64,

@@ -1,5 +1,5 @@
-//! Augmentation: what the auxiliary loss sees of a state, cropped and recoloured at random; bytes in, bytes out.
-//! C51 never sees it. It knows neither networks nor losses, and keeps no generator.
+//! Augmentation: crops and recolours states at random for the auxiliary loss, bytes in, bytes out.
+//! C51 always sees the plain states. This module knows neither networks nor losses, and holds no random generator.
 
 use driml_protocol::config::{ConfigError, check};
 use rand::Rng;
@@ -11,27 +11,27 @@ const COLOUR_BITS: u32 = 12;
 /// Weights of neighbouring pixels are whole multiples of 1/256.
 const WHOLE: u16 = 256;
 
-/// Largest error of a byte of a crop that is resized to the whole: half for its rounding, and two weights that are off by a 512th.
+/// Largest error of a byte of a resized crop: 1/2 from rounding, and up to 1/512 in each of two weights.
 pub const CROP_ERROR: f64 = 0.5 + 2.0 * 255.0 / 512.0;
 
-/// Largest error of a recoloured byte: half for its rounding, and three coefficients and what is added to them off by 2^-13.
+/// Largest error of a recoloured byte: 1/2 from rounding, and up to 2^-13 in each of three coefficients and in the addend.
 pub const COLOUR_ERROR: f64 = 0.5 + (3.0 * 255.0 + 1.0) / 8192.0;
 
-/// The `[learner.augment]` table: how strongly states are changed. A state's frames are all changed alike.
+/// The `[learner.augment]` table: how strongly states are changed. All frames of a state are changed in the same way.
 ///
-/// `crop_side` at 1 and the others at 0 leave every byte as it was.
+/// `crop_side` at 1 and the others at 0 leave every byte unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AugmentSettings {
-    /// Share of each side that a crop keeps, above 0, at most 1; the crop is resized to the whole.
+    /// Share of each side that a crop keeps, above 0, at most 1. The crop is resized to the state's size.
     pub crop_side: f64,
-    /// Colours are scaled by a factor from 1 - this to 1 + this, in [0, 1].
+    /// Strength s in [0, 1]: colours are scaled by a factor from 1 - s to 1 + s.
     pub brightness: f64,
-    /// Distances from the state's mean grey are scaled by a factor from 1 - this to 1 + this, in [0, 1].
+    /// Strength s in [0, 1]: distances from the state's mean grey are scaled by a factor from 1 - s to 1 + s.
     pub contrast: f64,
-    /// Distances from a pixel's own grey are scaled by a factor from 1 - this to 1 + this, in [0, 1].
+    /// Strength s in [0, 1]: distances from a pixel's own grey are scaled by a factor from 1 - s to 1 + s.
     pub saturation: f64,
-    /// Hues are turned by -this to this, in turns of the colour circle, in [0, 0.5].
+    /// Largest turn h in [0, 0.5], in turns of the colour circle: hues are turned by -h to h.
     pub hue: f64,
 }
 
@@ -58,7 +58,7 @@ impl AugmentSettings {
     }
 }
 
-/// What is done to one state.
+/// The augmentation of one state: a crop and changes of its colours.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
     /// First row of the crop.
@@ -75,7 +75,7 @@ pub struct View {
     pub hue: f64,
 }
 
-/// The two source pixels of an output pixel along one side, and the second one's share of it in 1/256.
+/// The two source pixels of an output pixel along one axis, and the weight of `far` in 1/256.
 #[derive(Clone, Copy, Debug)]
 struct Tap {
     near: usize,
@@ -83,7 +83,7 @@ struct Tap {
     far_weight: u16,
 }
 
-/// Changes states at random.
+/// Augments states at random.
 #[derive(Debug)]
 pub struct Augment {
     settings: AugmentSettings,
@@ -97,7 +97,7 @@ pub struct Augment {
 }
 
 impl Augment {
-    /// For states [height, width, stack * `frame_channels`]; `settings` are in their ranges, and no size is 0.
+    /// Creates the augmentation of states [height, width, stack * `frame_channels`]. `settings` are in their ranges, and no size is 0.
     ///
     /// A crop has `crop_side` of each side, rounded, and at least one pixel.
     pub fn new(
@@ -125,7 +125,7 @@ impl Augment {
         self.crop
     }
 
-    /// Draws what is done to one state: every place of the crop equally likely, factors and turn uniform in their ranges.
+    /// Draws the augmentation of one state: every position of the crop is equally likely, factors and turn are uniform in their ranges.
     pub fn draw(&self, rng: &mut impl Rng) -> View {
         let AugmentSettings {
             brightness,
@@ -148,9 +148,9 @@ impl Augment {
         }
     }
 
-    /// Writes each of `states` [n, H, W, C], each changed by a separate draw, to `seen`, which gets their length.
+    /// Augments each of `states` [n, H, W, C] with a separate draw. Writes the results to `seen`, resized to the length of `states`.
     ///
-    /// The draws are made in order before the work is spread over the threads, so `rng` alone decides the bytes.
+    /// All draws are made in order before the parallel part, so that the bytes depend on `rng` alone.
     pub fn apply(&self, states: &[u8], seen: &mut Vec<u8>, rng: &mut impl Rng) {
         let (height, width, channels) = self.size;
         let state_bytes = height * width * channels;
@@ -166,12 +166,12 @@ impl Augment {
             );
     }
 
-    /// Room for a line of the crop.
+    /// Allocates a buffer for a line of the crop.
     fn line(&self) -> Vec<u16> {
         vec![0; self.crop.1 * self.size.2]
     }
 
-    /// Writes one state, changed, to `seen`.
+    /// Applies `view` to one state and writes the result to `seen`.
     pub fn apply_view(&self, state: &[u8], view: &View, seen: &mut [u8]) {
         self.change(state, view, seen, &mut self.line());
     }
@@ -193,7 +193,7 @@ impl Augment {
         recolour(seen, view, self.frame_channels);
     }
 
-    /// [`Augment::resize_any`] for states of `C` channels, compiled for them.
+    /// [`Augment::resize_any`] specialised at compile time for states of `C` channels.
     fn resize<const C: usize>(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
         let (outputs, _) = seen.as_chunks_mut::<C>();
         for (tap, outputs) in self.rows.iter().zip(outputs.chunks_exact_mut(self.size.1)) {
@@ -208,11 +208,11 @@ impl Augment {
         }
     }
 
-    /// Resizes the view's crop of `state` to the whole state, bilinearly.
+    /// Resizes the view's crop of `state` to the size of the state, bilinearly.
     ///
-    /// Output pixel d lies at (d + 1/2) * crop / whole - 1/2 of the crop and mixes the two pixels beside it, in shares
-    /// of 1/256 and rounded once: what PyTorch's `interpolate(mode = "bilinear", align_corners = False)` does. Nearest
-    /// neighbours would double every fourth pixel, and the thin objects of a 64 x 64 frame with it.
+    /// Output pixel d lies at (d + 1/2) * crop / whole - 1/2 of the crop. It mixes the two pixels beside it, with weights in 1/256 and
+    /// one rounding, as PyTorch's `interpolate(mode = "bilinear", align_corners = False)` does. Nearest neighbours would double every
+    /// fourth pixel, and with it the thin objects of a 64 x 64 frame.
     fn resize_any(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
         let (_, width, channels) = self.size;
         let outputs = seen.chunks_exact_mut(width * channels);
@@ -227,7 +227,7 @@ impl Augment {
         }
     }
 
-    /// Mixes two rows of the crop into `line`, in 1/256 of a byte, exactly.
+    /// Mixes two rows of the crop into `line`, exactly, in units of 1/256 of a byte.
     fn blend_rows(&self, state: &[u8], view: &View, tap: &Tap, line: &mut [u16]) {
         let (_, width, channels) = self.size;
         let row = |at: usize| {
@@ -242,14 +242,14 @@ impl Augment {
     }
 }
 
-/// Mixes two values in 1/256 of a byte, and rounds to a byte.
+/// Mixes two values in units of 1/256 of a byte, and rounds to a byte.
 fn blend(near: u16, far: u16, far_weight: u16) -> u8 {
     let sum =
         u32::from(near) * u32::from(WHOLE - far_weight) + u32::from(far) * u32::from(far_weight);
     ((sum + (1 << 15)) >> 16) as u8
 }
 
-/// Where each of `to` output pixels lies among `from` source pixels, clamped at the ends.
+/// The position of each of `to` output pixels among `from` source pixels, clamped at the ends.
 fn taps(from: usize, to: usize) -> Vec<Tap> {
     let tap = |at: usize| {
         let place = (at as f64 + 0.5) * from as f64 / to as f64 - 0.5;
@@ -264,13 +264,13 @@ fn taps(from: usize, to: usize) -> Vec<Tap> {
     (0..to).map(tap).collect()
 }
 
-/// Changes brightness, contrast, saturation and hue of a state in place; pixels are frames of `frame_channels` side by side.
+/// Changes brightness, contrast, saturation and hue of a state in place. A pixel has `frame_channels` channels of each stacked frame.
 ///
-/// With b, c, s the factors, m the mean of all bytes and M the turned and scaled distance from grey, a pixel x becomes
-/// b c M x + b (1 - c) m, rounded and clamped once; grey is the mean of the three channels, and a hue is turned about the axis
-/// of greys, so that the four changes commute and their order does not matter. (torchvision's `ColorJitter` draws an order,
-/// clamps in between, weighs the channels and turns hues in HSV.) Where a frame does not have three channels there is no
-/// saturation and no hue.
+/// Let b and c be the factors of brightness and contrast, m the mean of all bytes, and M the matrix that turns hues and scales
+/// distances from grey. A pixel x becomes b c M x + b (1 - c) m, rounded and clamped once. Grey is the mean of the three channels
+/// and hues turn about the axis of greys, so that the four changes commute and their order does not matter. (torchvision's
+/// `ColorJitter` draws an order, clamps in between, weights the channels and turns hues in HSV.) Frames that do not have three
+/// channels keep their saturation and hue.
 fn recolour(state: &mut [u8], view: &View, frame_channels: usize) {
     let unit = f64::from(1u32 << COLOUR_BITS);
     let sum: u64 = state.iter().map(|&byte| u64::from(byte)).sum();

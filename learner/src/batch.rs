@@ -1,12 +1,12 @@
-//! A batch as one update reads it: borrowed planes, checked before anything is computed.
-//! It does not travel (the protocol's batch does) and is not sampled here.
+//! The batch that one update reads: borrowed columns, checked before anything is computed.
+//! It is not the format on the wire (`driml_protocol::Batch` is), and no rows are sampled here.
 
 use driml_model::ModelConfig;
 use driml_protocol::NO_ACTION;
 
 use crate::{auxiliary::positives::Positives, error::UpdateError};
 
-/// Rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), plane by plane; B rows each.
+/// B rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), stored column by column.
 ///
 /// For CURL, whose positive is not a later state, `anchors` and `states_k` are two views of s_t.
 #[derive(Clone, Copy, Debug)]
@@ -15,13 +15,13 @@ pub struct Batch<'a> {
     pub rows: usize,
     /// s_t [B, H, W, C].
     pub states_t: &'a [u8],
-    /// s_t as the auxiliary loss sees it, augmented [B, H, W, C]; `None` where that is `states_t`.
+    /// Augmented s_t for the auxiliary loss [B, H, W, C]; `None` if the loss sees `states_t`.
     pub anchors: Option<&'a [u8]>,
-    /// Positives of a row, P; 0 where the agent has no use for any.
+    /// The number of positives per row, P; 0 if the agent uses none.
     pub positives: usize,
-    /// s_{t+k} as the auxiliary loss sees it [P, B, H, W, C]; or of those positives alone that rows have, in this order.
+    /// s_{t+k} as the auxiliary loss sees it [P, B, H, W, C], or only the states of valid positives, in this order.
     pub states_k: &'a [u8],
-    /// s_{t+n} [B, H, W, C]; or of those rows alone that bootstrap.
+    /// s_{t+n} [B, H, W, C], or only the states of rows that bootstrap, in this order.
     pub states_n: &'a [u8],
     /// a_t [B].
     pub action: &'a [u8],
@@ -31,14 +31,14 @@ pub struct Batch<'a> {
     pub n_step_return: &'a [f32],
     /// gamma^n, or 0 where the episode ended within the n steps [B], in [0, 1].
     pub bootstrap_discount: &'a [f32],
-    /// 0 where the row has no such positive [P, B].
+    /// Whether the row has this positive [P, B]: 0 if not.
     pub positive_valid: &'a [u8],
-    /// What each row's C51 loss is multiplied by [B], from 0 on, where rows were not drawn equally likely. The auxiliary losses are
-    /// not weighted: they compare a batch's rows with one another, and none is the mean of a loss a row.
+    /// Factor on each row's C51 loss [B], 0 or above; `None` if rows were drawn equally likely. The auxiliary losses are not weighted:
+    /// they compare a batch's rows with one another, so that they are not means of a loss per row.
     pub importance_weight: Option<&'a [f32]>,
 }
 
-/// The planes of a [`Batch`] in memory of their own, named as there.
+/// The columns of a [`Batch`] as owned vectors, under the same names.
 #[derive(Clone, Debug, Default)]
 #[allow(missing_docs, reason = "Batch has them")]
 pub struct OwnedBatch {
@@ -55,7 +55,7 @@ pub struct OwnedBatch {
 }
 
 impl OwnedBatch {
-    /// The batch; it has as many rows as actions.
+    /// Borrows the columns as a batch, with as many rows as `action` has entries.
     pub fn batch(&self) -> Batch<'_> {
         let rows = self.action.len();
         Batch {
@@ -158,20 +158,20 @@ impl<'a> Batch<'a> {
         discounts.filter_map(|(row, &discount)| (discount != 0.0).then_some(row))
     }
 
-    /// s_{t+n} of [`Batch::bootstraps`], of a batch that is valid with states of this length; none is missing.
+    /// s_{t+n} of the rows that bootstrap, each `Some`. The batch must be valid for states of `state_bytes` bytes.
     pub(crate) fn next_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
         let bootstraps = self.bootstrap_discount.iter().map(|&it| it != 0.0);
         let states = in_places(self.states_n, state_bytes, bootstraps);
         states.filter(Option::is_some).collect()
     }
 
-    /// s_{t+k} [P, B] of a batch that is valid with states of this length; none where a row has no such positive.
+    /// s_{t+k} [P, B]; `None` if the row lacks this positive. The batch must be valid for states of `state_bytes` bytes.
     pub fn positive_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
         let valid = self.positive_valid.iter().map(|&it| it != 0);
         in_places(self.states_k, state_bytes, valid).collect()
     }
 
-    /// The pairs (a_t, a_{t+1}) of those of `rows` that have both; some may come twice.
+    /// The pairs (a_t, a_{t+1}) of `rows`, which may contain a row twice. Rows without a_{t+1} are skipped.
     pub fn action_pairs(&self, rows: impl IntoIterator<Item = usize>) -> Vec<(u8, u8)> {
         let pairs = rows
             .into_iter()
@@ -180,7 +180,7 @@ impl<'a> Batch<'a> {
     }
 }
 
-/// The state of each place, none where it is not `there`. `states` has one for each place, or for those alone that are there.
+/// Yields a state for each true entry of `there` and `None` for the others. `states` holds one state per entry or per true entry.
 fn in_places(
     states: &[u8],
     state_bytes: usize,

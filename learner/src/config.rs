@@ -1,5 +1,5 @@
-//! The learner's settings, and what it takes from the run's other tables.
-//! It fills in no number: presets do, with their sources.
+//! The learner's settings, and the other tables of the run's settings that a learner reads.
+//! No number has a default here: presets give all of them, with their sources.
 
 use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
 use driml_protocol::{
@@ -26,13 +26,13 @@ use crate::{
 pub struct Config {
     /// Rows of one update, B.
     pub batch_size: u32,
-    /// In which numbers an update's products are computed; weights, moments, losses and sums are f32 in either.
+    /// Number format of an update's matrix products. Weights, moments, losses and sums are f32 in either format.
     pub precision: Precision,
     /// Whether equal states of a batch are computed once.
     pub deduplicate_states: bool,
-    /// Batches asked for ahead of the one being learned from.
+    /// Batches requested ahead of the one being learned from.
     pub batches_in_flight: u32,
-    /// What the scalars of published weights are.
+    /// Number format of published weights.
     pub publish_dtype: StoredAs,
     /// Updates from one version of the weights to the next.
     pub publish_period_updates: u64,
@@ -40,13 +40,13 @@ pub struct Config {
     pub checkpoint_period_updates: u64,
     /// Checkpoints kept; older ones are removed.
     pub checkpoints_kept: u32,
-    /// How long the replay server may be out of reach, milliseconds, before the learner saves and gives up.
+    /// How long the replay server may be unreachable, in milliseconds, before the learner saves a checkpoint and exits.
     pub unreachable_max_ms: u64,
     /// Losses, optimiser and target network.
     pub update: UpdateSettings,
-    /// What is done to the states that the auxiliary loss sees; nothing if it is not there.
+    /// Augmentation of the states that the auxiliary loss sees; none if this table is absent.
     pub augment: Option<AugmentSettings>,
-    /// How the action affinity A is estimated, if the horizon follows it.
+    /// How the action affinity A is estimated, if the horizon depends on it.
     pub affinity: AffinityConfig,
 }
 
@@ -54,7 +54,7 @@ pub struct Config {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EstimatorKind {
-    /// No affinity is estimated; the horizon does not follow it.
+    /// No affinity is estimated; the horizon does not depend on it.
     None,
     /// By a small network (the paper).
     Learned,
@@ -66,13 +66,13 @@ pub enum EstimatorKind {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AlphabetKind {
-    /// All that the world takes.
+    /// All actions that the environment accepts.
     Raw,
-    /// Those that differ in what they do.
+    /// One of each group of actions with the same effect.
     Visible,
 }
 
-/// The `[learner.affinity]` table; an estimator that is not chosen needs no numbers.
+/// The `[learner.affinity]` table. The tables of estimators that are not chosen may be absent.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AffinityConfig {
@@ -80,19 +80,19 @@ pub struct AffinityConfig {
     pub estimator: EstimatorKind,
     /// Which actions A tells apart.
     pub alphabet: Option<AlphabetKind>,
-    /// For each raw action the one that it amounts to; needed for the alphabet `visible`.
+    /// For each raw action, the action of the same effect that represents it; required for the alphabet `visible`.
     pub visible: Option<Vec<u8>>,
-    /// Numbers of the learned estimate.
+    /// Settings of the learned estimate.
     pub learned: Option<LearnedSettings>,
-    /// Numbers of the exact estimate.
+    /// Settings of the exact estimate.
     pub exact: Option<ExactSettings>,
 }
 
 impl AffinityConfig {
-    /// The estimator that the settings ask for, with its weights drawn from `rng`.
+    /// Creates the chosen estimator, with its weights drawn from `rng`; `None` for [`EstimatorKind::None`].
     ///
     /// # Errors
-    /// A number or table that is missing or out of range.
+    /// A setting or table that is missing or out of range.
     pub fn estimator(
         &self,
         num_actions: usize,
@@ -104,7 +104,7 @@ impl AffinityConfig {
         };
         let name = format!("{:?}", self.estimator);
         let bad = |e: AffinityError| ConfigError::of("learner.affinity", &name, e);
-        // What the chosen estimator does not use is checked all the same.
+        // Tables that the chosen estimator does not use are checked too.
         let learned = self.learned.map_or(Ok(()), |it| it.check_valid());
         let exact = self.exact.map_or(Ok(()), |it| it.check_valid());
         learned.and(exact).map_err(bad)?;
@@ -139,10 +139,10 @@ impl AffinityConfig {
 }
 
 impl Config {
-    /// Checks every field's range but those of `update`, which checks itself.
+    /// Checks the ranges of all fields except `update`, which has its own [`UpdateSettings::validate`].
     ///
     /// # Errors
-    /// The first field that cannot work, and why.
+    /// The first invalid field, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let within = |key: &str, value: u64, most: u64| {
             let (key, is_fine) = (format!("learner.{key}"), (1..=most).contains(&value));
@@ -181,11 +181,11 @@ impl Config {
     }
 }
 
-/// Why a run's settings are none that a learner can work with.
+/// Why a learner cannot work with a run's settings.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum LearnerConfigError {
-    /// Not TOML, a table that is missing or does not fit, or a value of `[run]` or `[learner]` that cannot work.
+    /// The text is not TOML, a table is missing or does not fit, or a value of `[run]` or `[learner]` is invalid.
     #[error(transparent)]
     Tables(#[from] ConfigError),
     #[error(transparent)]
@@ -198,24 +198,24 @@ pub enum LearnerConfigError {
     Sizes,
 }
 
-/// Everything a learner needs to know of a run.
+/// The settings of a run that its learner needs.
 #[derive(Clone, Debug)]
 pub struct LearnerConfig {
-    /// What all processes agree on.
+    /// The settings that all processes share: the `[run]` table.
     pub spec: RunSpec,
     /// The network's sizes: the `[model]` table.
     pub model: ModelConfig,
     /// The size at which the network sees a frame: the `[input]` table.
     pub input: InputSize,
-    /// The learner's own numbers: the `[learner]` table.
+    /// The learner's own settings: the `[learner]` table.
     pub learner: Config,
     /// How messages travel: the `[transport]` table.
     pub transport: TransportConfig,
-    /// By which rule rows are drawn: `sampling` of the `[replay]` table.
+    /// The rule by which rows are drawn: `sampling` of the `[replay]` table.
     pub sampling: Sampling,
 }
 
-/// What a learner reads of the `[replay]` table.
+/// The fields of the `[replay]` table that a learner reads.
 #[derive(Deserialize)]
 struct ReplayTable {
     #[serde(default)]
@@ -226,7 +226,7 @@ impl LearnerConfig {
     /// Reads the tables from a run's resolved settings.
     ///
     /// # Errors
-    /// A table that is missing or does not fit, or values that cannot work.
+    /// A table that is missing or does not fit, or invalid values.
     pub fn from_toml(text: &str) -> Result<Self, LearnerConfigError> {
         let settings = Settings::parse(text)?;
         let this = Self {
@@ -252,7 +252,7 @@ impl LearnerConfig {
             width,
             ..this.model.clone()
         };
-        // What is cut of the input is nothing that a layer reads.
+        // The model's input may lack the border pixels that no layer reads, so that both inputs give the same local shape.
         let follows = this.model.input_channels == states
             && this.model.num_actions == this.spec.num_actions as usize
             && this.model.local_shape() == whole.local_shape()

@@ -1,5 +1,5 @@
-//! What one update computes, part by part, counted from the network's layers and what the auxiliary loss passes through them.
-//! It measures nothing; how fast a machine does it is for `driml bench learner`.
+//! Counts the operations of one update, by part, from the network's layers and the auxiliary loss's passes through them.
+//! It measures nothing; `driml bench learner` measures speed.
 
 use driml_model::{LayerCost, ModelConfig};
 
@@ -8,19 +8,19 @@ use crate::{auxiliary::loss::Passes, config::Config};
 /// How an update uses its networks, and for how many rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UpdateShape {
-    /// Rows, B.
+    /// Rows of the batch, B.
     pub rows: u64,
-    /// Whether the C51 head gives s_t's distributions for every action; the loss reads that of the action taken alone.
+    /// Whether the C51 head computes the distributions of all actions in s_t. The loss reads only that of the taken action.
     pub every_action: bool,
     /// Whether the online network chooses the action in s_{t+n}.
     pub double_dqn: bool,
-    /// What the auxiliary loss needs.
+    /// The auxiliary loss's passes through the networks.
     pub passes: Passes,
 }
 
 impl UpdateShape {
-    /// That of a learner with these settings, where the replay server serves `positives` later states a row. Meaningful for
-    /// settings that can work.
+    /// The shape for a learner with these settings, if the replay server serves `positives` later states per row. An auxiliary loss with
+    /// invalid settings counts as no passes.
     pub fn of(learner: &Config, positives: usize) -> Self {
         let passes = learner.update.auxiliary().map_or_else(
             |_| Passes::default(),
@@ -35,14 +35,14 @@ impl UpdateShape {
     }
 }
 
-/// Multiplications and additions of one update, each counted as one: matrix products alone, of all rows.
+/// Operations of one update, for all rows: the multiplications and additions of matrix products alone, each counted as one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UpdateCost {
     /// s_t through the torso, forward and backward.
     pub online: u64,
     /// s_t through the C51 head, forward and backward.
     pub head: u64,
-    /// s_{t+n} through the target network, forward; rows that do not bootstrap are left out of it, and counted here.
+    /// s_{t+n} through the target network, forward. Rows that do not bootstrap count here, although an update skips them.
     pub target: u64,
     /// s_{t+n} through the online network, forward, to choose an action.
     pub double_dqn: u64,
@@ -50,14 +50,14 @@ pub struct UpdateCost {
     pub states: u64,
     /// States through the key encoder, forward.
     pub keys: u64,
-    /// The auxiliary heads, forward and backward; a loss's own layers once a row.
+    /// The auxiliary heads, forward and backward; a loss's extra layers count once per row.
     pub heads: u64,
     /// Dot products of all pairs of rows, and their gradients.
     pub scores: u64,
 }
 
 impl UpdateCost {
-    /// What an update of `shape` costs with a network of `model`.
+    /// The cost of an update of `shape` with the network `model`.
     pub fn of(model: &ModelConfig, shape: &UpdateShape) -> Self {
         let layers = model.layer_costs();
         let sum = |parts: &[&str], cost: fn(&LayerCost) -> u64| -> u64 {
@@ -79,7 +79,7 @@ impl UpdateCost {
         };
         let (height, width, _) = model.local_shape();
         let matrices = passes.local_scores * (height * width) as u64 + passes.global_scores;
-        // Forward, and the gradients of both sides; a key has none.
+        // The forward product and the gradients of both operands; keys have no gradient.
         let products = if passes.keys > 0 { 2 } else { 3 };
         let value = forward(&["torso", "head"]);
         let own = model.loss_layers.iter().map(|it| learning(&[&it.layer()]));
@@ -98,7 +98,7 @@ impl UpdateCost {
         }
     }
 
-    /// The sum of all layers.
+    /// The sum of all parts.
     pub const fn total(&self) -> u64 {
         let Self {
             online,
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
     use crate::auxiliary::settings::Lambda;
 
-    /// 6 x 6 x 1, a map of 2 x 2 x 3, f4 of 5; embedding_dim 4, 2 actions of 3 atoms.
+    /// Input 6 x 6 x 1, local features 2 x 2 x 3, 5 values in f4, embedding_dim 4, 2 actions of 3 atoms.
     fn model(dim: DimHeads) -> ModelConfig {
         let model: ModelConfig = toml::from_str(
             "height = 6\nwidth = 6\ninput_channels = 1\nnum_actions = 2\natoms = 3\nv_min = -1.0\nv_max = 1.0\n\
@@ -143,7 +143,7 @@ mod tests {
             passes: Passes::default(),
         };
         let plain = UpdateCost {
-            // The image needs no gradient.
+            // The input needs no gradient.
             online: 10 * (2 * conv + 3 * fc),
             // One of the two actions.
             head: 10 * 3 * head / 2,
@@ -160,7 +160,7 @@ mod tests {
             passes,
             ..c51
         };
-        // Forward; psi is given features and the action's embedding, once for all four locations.
+        // Forward alone. Psi receives features and the action's embedding, which is computed once for all four locations.
         let action = (2 * 2 * 2, 2 * (2 * 2 + 2 * 2));
         let psi3 = 2 * (2 * (4 * 3 * 4 + 2 * 4) + 4 * 4 * 4);
         let phi3 = 2 * (2 * (4 * 3 * 4) + 4 * 4 * 4);

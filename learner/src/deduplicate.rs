@@ -1,33 +1,33 @@
-//! States of a pass that are equal to another of it: found by a checksum that a comparison confirms, and passed through a network once.
-//! It computes nothing of the states.
+//! Finds equal states of a forward pass, by a checksum that a comparison confirms, so that a network computes each of them once.
+//! It computes no features.
 //!
-//! Where a scene stands still, half of a batch's states are there twice. Each result of a row has the same bits whatever the rows
-//! beside it, so what is computed once is what would be computed each time. A state's gradient is then the sum of its copies',
-//! first to last, where the products would have summed them among others: gradients differ in their last bits, and are the same
-//! for any number of threads.
+//! Where a scene stands still, half of a batch's states occur twice. The result of a row has the same bits whatever the other rows
+//! are, so that sharing it changes no result of the forward pass. The gradient of a shared state is the sum over its copies, first to
+//! last; otherwise, the matrix products sum the copies among other rows. Gradients therefore differ in their last bits, but they are
+//! the same for any number of threads.
 
 use std::{borrow::Cow, collections::HashMap};
 
 use rayon::prelude::*;
 
-/// A pass is made shorter where at least one of this many states repeats another: below, what is saved is less than what it costs
-/// to pick states out and to hand their features round.
+/// Equal states are shared if at least one state in this many repeats another. With fewer repeats, selecting states and copying
+/// their features costs more than the shorter pass saves.
 const PAYS_ONE_IN: usize = 32;
 const TASK_STATES: usize = 16;
 
-/// The bytes of a state; none of a blank one, which stands where there is no state.
+/// The bytes of a state; `None` is a blank state, the placeholder for a missing one.
 pub(crate) type State<'a> = Option<&'a [u8]>;
 
-/// The states of a pass as a network takes them: all, or the distinct ones alone where that pays.
+/// The input of a forward pass: all states, or only the distinct ones if that is faster.
 pub(crate) struct PassInput<'a> {
     pub(crate) bytes: Cow<'a, [u8]>,
-    /// Of each state its place among those that pass; none where all do.
+    /// For each state, its index in `bytes`; `None` if `bytes` holds all states.
     pub(crate) places: Option<Vec<u32>>,
 }
 
 impl<'a> PassInput<'a> {
-    /// That of `states` of this length; `plane`, if it is as long as all of them, holds them one after the other. `once` says whether equal
-    /// ones may pass once.
+    /// Makes the input from `states` of `state_bytes` bytes each. If `plane` has their total length, it holds the same states one after
+    /// the other. `once` says whether equal states may be shared.
     pub(crate) fn of(
         states: &[State<'_>],
         plane: &'a [u8],
@@ -53,17 +53,17 @@ impl<'a> PassInput<'a> {
     }
 }
 
-/// The distinct states of a pass, and which of them each of its states is.
+/// The distinct states of a pass, and for each state the distinct one that it equals.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Distinct {
-    /// Of each distinct state its first place in the pass, ascending.
+    /// For each distinct state, the index of its first occurrence in the pass, ascending.
     firsts: Vec<usize>,
-    /// Of each state its place among the distinct ones.
+    /// For each state, its index among the distinct states.
     places: Vec<u32>,
 }
 
 impl Distinct {
-    /// That of `states`, if it pays to compute the distinct ones alone.
+    /// Finds the distinct ones of `states`; `None` if too few repeat to be worth it.
     fn of(states: &[State<'_>]) -> Option<Self> {
         let sums = states.par_iter().with_min_len(TASK_STATES);
         let sums = sums.map(|state| state.map_or(0, crc32fast::hash));
@@ -72,7 +72,7 @@ impl Distinct {
             firsts: Vec::with_capacity(states.len()),
             places: Vec::with_capacity(states.len()),
         };
-        // By checksum. Of two different states with the same checksum, the second never counts as a repeat, nor do its copies.
+        // By checksum. If two different states have the same checksum, the second and its copies all count as distinct.
         let mut known_places = HashMap::with_capacity(states.len());
         for (at, (state, sum)) in states.iter().zip(sums).enumerate() {
             let new = distinct.firsts.len() as u32;
@@ -83,13 +83,13 @@ impl Distinct {
             }
             distinct.places.push(if known { place } else { new });
         }
-        // States that are equal to one before them.
+        // The number of states that equal an earlier one.
         let repeats = states.len() - distinct.firsts.len();
         (repeats > 0 && repeats * PAYS_ONE_IN >= states.len()).then_some(distinct)
     }
 }
 
-/// The bytes of `states` of this length.
+/// Concatenates `states` of `state_bytes` bytes each; a blank state is all 0.
 pub(crate) fn one_after_another<'a>(
     states: impl ExactSizeIterator<Item = State<'a>>,
     state_bytes: usize,

@@ -1,7 +1,6 @@
-//! Why an update did not happen: the one error of everything that takes part in it.
+//! The error type of an update, shared by all modules that take part in it.
 
-/// Why an update, or the making of a learner, did not happen. But for [`UpdateError::Diverged`] parameters are then as they
-/// were before.
+/// Why an update, or the creation of a learner, failed. Parameters are unchanged, except after [`UpdateError::Diverged`].
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum UpdateError {
@@ -9,15 +8,15 @@ pub enum UpdateError {
     Batch(String),
     #[error("{0}; `driml presets` has settings that work")]
     Settings(String),
-    /// Settings of the auxiliary loss that are at odds with each other.
+    /// Settings of the auxiliary loss contradict each other.
     #[error("{0}")]
     AuxiliaryLoss(String),
-    /// State that does not fit the network, as from another run's checkpoint.
+    /// The state does not fit the network, for example because it is from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
     State(String),
     #[error("{0} is not finite; the update is not taken")]
     NonFinite(String),
-    /// The step itself left the finite numbers: this learner can neither continue nor be published or saved.
+    /// The optimiser step made a parameter or moment infinite or NaN. This learner can neither continue nor publish nor save.
     #[error(
         "update {update} took {name} beyond the finite numbers; the learner cannot continue: resume from the newest checkpoint with \
          a learner.update.adam.lr below {lr:e}"

@@ -1,5 +1,5 @@
-//! From a checked batch to the gradients of its losses: what the networks make of it, what C51 is to predict, and both losses.
-//! It takes no step: `agent` does.
+//! Computes the losses and gradients of a checked batch: the passes through the networks, the C51 target, and both losses.
+//! It takes no optimiser step: `agent` does.
 
 use candle_core::Tensor;
 use driml_model::{Compute, Encoder, HeadNoise, ModelConfig, Network, Parameters, greedy};
@@ -20,12 +20,12 @@ use crate::{
     tensors::{finite, flat, states},
 };
 
-/// What one update did: the numbers of a row of metrics.
+/// The results of one update, as in a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UpdateReport {
-    /// Mean KL divergence of the prediction from the projected target, in nats; of weighted rows the mean of weight times divergence.
+    /// Mean over rows of `KL(projected target || prediction)`, in nats; each row is multiplied by its importance weight, if it has one.
     pub c51_kl: f32,
-    /// Of weighted rows, each one's divergence [B] before its weight, in nats; else empty, and not computed.
+    /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
     pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
     pub losses: Vec<(&'static str, f32)>,
@@ -37,21 +37,20 @@ pub struct UpdateReport {
     pub q_mean: f32,
 }
 
-/// The losses of a batch and all that led to them, before any step is taken.
+/// The losses of a batch, what they were computed from, and the gradients, before any optimiser step.
 #[derive(Debug)]
 pub struct Evaluation {
-    /// Mean KL divergence, in nats; of weighted rows the mean of weight times divergence.
+    /// Mean KL divergence over rows, in nats; each row is multiplied by its importance weight, if it has one.
     pub c51_kl: f32,
-    /// Of weighted rows, each one's divergence [B] before its weight, in nats; else empty, and not computed.
+    /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
     pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
     pub losses: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
     pub total: f32,
-    /// Online logits [B, N] of the actions taken in s_t, without a graph.
+    /// Online logits [B, N] of the actions taken in s_t, detached from the graph.
     pub taken_logits: Tensor,
-    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap, as nothing is
-    /// computed of that state.
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] if the row does not bootstrap, as its s_{t+n} is not evaluated.
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
@@ -59,7 +58,7 @@ pub struct Evaluation {
     pub gradients: Gradients,
 }
 
-/// The networks that a batch passes through, and how.
+/// The networks that a batch passes through, and their settings.
 #[derive(Debug)]
 pub(crate) struct Networks {
     pub(crate) model: ModelConfig,
@@ -68,7 +67,7 @@ pub(crate) struct Networks {
     /// Whether equal states of a batch are computed once.
     pub(crate) deduplicate: bool,
     pub(crate) auxiliary: Box<dyn AuxiliaryLoss>,
-    /// Those of the online network.
+    /// The online network's parameters.
     pub(crate) parameters: Parameters,
     pub(crate) online: Network,
     pub(crate) target: Network,
@@ -76,22 +75,22 @@ pub(crate) struct Networks {
     pub(crate) key: Option<Encoder>,
 }
 
-/// What C51 is to predict.
+/// The target of the C51 loss.
 struct BellmanTarget {
-    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap.
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] if the row does not bootstrap.
     next_greedy_action: Vec<u8>,
-    /// Distributions on the support, one Bellman step earlier [B, N].
+    /// Target distributions [B, N], moved one Bellman step and projected onto the atoms.
     projection: Vec<f32>,
 }
 
 impl Networks {
-    /// Losses and gradients of `batch`, which is checked, with this noise of noisy layers.
+    /// Computes losses and gradients of `batch`, which has been checked, with the given noise of the noisy layers.
     pub(crate) fn evaluate(
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
     ) -> Result<Evaluation, UpdateError> {
-        // Neither needs the other: what one does on a single thread falls into the other's products.
+        // The two are independent: while one works on a single thread, the other's matrix products use the remaining threads.
         let (target, features) = rayon::join(
             || self.bellman_target(batch, noise),
             || {
@@ -128,7 +127,7 @@ impl Networks {
         for WeightedLoss { loss, weight, .. } in &auxiliary {
             total = (total + loss.affine(*weight, 0.0)?)?;
         }
-        // Before any number is read: reading waits for a GPU, which should have all its work by then.
+        // Before any number is read: reading waits for a GPU, which should have all of its work queued by then.
         let gradients = Gradients::of(&self.parameters, &total)?;
         let c51_kl = finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
@@ -155,9 +154,9 @@ impl Networks {
         })
     }
 
-    /// Distributions one Bellman step earlier, of the actions that are greedy in s_{t+n}, without a graph.
+    /// Computes the target distributions, of the actions that are greedy in s_{t+n}, without a graph.
     ///
-    /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
+    /// Rows that do not bootstrap skip the pass: whatever s_{t+n} is, all of their probability goes to their return.
     fn bellman_target(
         &self,
         batch: &Batch<'_>,
@@ -202,7 +201,7 @@ impl Networks {
         })
     }
 
-    /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
+    /// Computes, for the n rows that bootstrap, the greedy actions in s_{t+n} [n] and the target network's logits of these actions [n, N].
     fn next_greedy(
         &self,
         batch: &Batch<'_>,
@@ -242,7 +241,7 @@ impl Networks {
     }
 }
 
-/// Logits [B, A, N] of `frames`, cut off from any graph.
+/// Computes the logits [B, A, N] of `frames`, detached from the graph.
 pub(crate) fn distribution(
     network: &Network,
     frames: &Tensor,

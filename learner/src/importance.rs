@@ -1,15 +1,15 @@
-//! What is made good where rows were not drawn equally likely: importance weights, and rows drawn anew as if they had been.
-//! The chance of each row comes with its batch.
+//! Corrections for rows that were not drawn equally likely: importance weights, and resampling to equal probabilities.
+//! The probability of each row comes with its batch.
 
 use rand::{Rng, distr::Distribution, distr::weighted::WeightedIndex};
 
-/// Largest error of an importance weight, as a share of it: half of an f32's last place.
+/// Largest relative error of an importance weight: half a unit in the last place of an f32.
 pub const WEIGHT_ERROR: f64 = 6.1e-8;
 
-/// `w_i = (N P(i))^-beta / max_j (N P(j))^-beta`, the maximum over the batch: weights only ever make a step smaller. N cancels, so that
-/// this is `(min_j P(j) / P(i))^beta`.
+/// Computes `w_i = (N P(i))^-beta / max_j (N P(j))^-beta` with the maximum over the batch, so that weights only reduce a step. N cancels:
+/// the result is `(min_j P(j) / P(i))^beta`.
 ///
-/// `probabilities` [B], from 1.2e-38 to 1; `beta` in [0, 1]. Result [B], in (0, 1], 1 for the least likely row, each right to
+/// `probabilities` [B], from 1.2e-38 to 1; `beta` in [0, 1]. Result [B], in (0, 1], 1 for the least likely row, each accurate to
 /// [`WEIGHT_ERROR`]; beta = 0 gives 1 for all. Source: Schaul et al. 2016, Prioritized Experience Replay, section 3.4.
 pub fn importance_weights(probabilities: &[f32], beta: f64) -> Vec<f32> {
     let least = probabilities.iter().copied().fold(f32::INFINITY, f32::min);
@@ -17,8 +17,8 @@ pub fn importance_weights(probabilities: &[f32], beta: f64) -> Vec<f32> {
     probabilities.iter().map(weight).collect()
 }
 
-/// As many rows as there are, each drawn anew with a chance in proportion to 1 / P: they follow the law of rows that are drawn equally
-/// likely, but for an error of the order of 1 / B.
+/// Draws B rows with replacement, each with a probability proportional to 1 / P. They are distributed like rows drawn equally likely,
+/// up to an error of the order of 1 / B.
 ///
 /// `probabilities` [B], from 1.2e-38 to 1, B at least 1. Result [B], in 0..B. Source: Rubin 1987, sampling importance resampling.
 pub fn drawn_evenly(probabilities: &[f32], rng: &mut impl Rng) -> Vec<usize> {
@@ -36,7 +36,7 @@ mod tests {
 
     #[test]
     fn rows_drawn_by_priority_and_then_evenly_are_equally_likely() {
-        // Eight kinds of transitions, one of a kind as likely to be in the replay as the other; priorities from 1 to 64.
+        // Eight kinds of transitions, equally frequent in the replay, with priorities from 1 to 64.
         let priorities: Vec<f64> = (0..8).map(|kind| f64::from(1 + kind * 9)).collect();
         let sum: f64 = priorities.iter().sum();
         let by_priority = WeightedIndex::new(&priorities).unwrap();
@@ -47,7 +47,7 @@ mod tests {
             let kinds: Vec<usize> = (0..256).map(|_| by_priority.sample(&mut rng)).collect();
             let chance = |&kind: &usize| (priorities[kind] / sum) as f32;
             let chances: Vec<f32> = kinds.iter().map(chance).collect();
-            // One of each batch, as those of one batch depend on each other.
+            // One row of each batch, as rows of the same batch depend on each other.
             drawn[kinds[0]] += 1.0;
             even[kinds[drawn_evenly(&chances, &mut rng)[0]]] += 1.0;
         }
@@ -56,7 +56,7 @@ mod tests {
             let terms = counts.map(|it| (it - expected).powi(2) / expected);
             terms.iter().sum::<f64>()
         };
-        // 7 degrees of freedom: above 24.3 in one of a thousand.
+        // 7 degrees of freedom: the statistic exceeds 24.3 with probability 0.001.
         assert!(chi_square(drawn) > 1_000.0);
         assert!(chi_square(even) < 24.3, "{even:?}");
     }

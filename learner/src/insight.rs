@@ -1,5 +1,5 @@
-//! What a learned network makes of states: the return it expects, and which patches of a later state it would know again.
-//! It learns nothing and chooses no action.
+//! Inspects a trained network: which return it expects in a state, and which locations of a later state it recognises.
+//! It trains nothing and chooses no action.
 
 use candle_core::Tensor;
 use driml_model::{Compute, Features, ModelConfig, Network, Parameters};
@@ -13,7 +13,7 @@ use crate::{
     tensors::{flat, states},
 };
 
-/// A learned network, to be asked.
+/// A trained network to inspect.
 #[derive(Debug)]
 pub struct Insight {
     model: ModelConfig,
@@ -23,7 +23,7 @@ pub struct Insight {
     local_clip: Option<f64>,
 }
 
-/// What the network makes of a batch of states.
+/// The network's outputs for a batch of states.
 #[derive(Debug)]
 pub struct Seen {
     /// Expected returns [B, A].
@@ -34,12 +34,12 @@ pub struct Seen {
 }
 
 impl Insight {
-    /// The network of `agent`, whose parameters it shares, computed as `compute` says; that is to be on the agent's device.
+    /// Inspects the online network of `agent` and shares its parameters. `compute` must be on the agent's device.
     pub fn of(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
         Self::new(agent.model(), agent.settings(), agent.online(), compute)
     }
 
-    /// The network with these parameters, learned with these settings; without DIM's heads it compares no features.
+    /// Inspects a network with these parameters, trained with these settings. Without DIM's local heads it compares no features.
     pub fn new(
         model: &ModelConfig,
         settings: &UpdateSettings,
@@ -58,13 +58,13 @@ impl Insight {
         })
     }
 
-    /// Rows and columns of the local features that are compared; none if this agent compares none.
+    /// Rows and columns of the local features that are compared; `None` if the agent does not compare local features.
     pub fn local_shape(&self) -> Option<(usize, usize)> {
         let (rows, columns, _) = self.model.local_shape();
         self.local_clip.map(|_| (rows, columns))
     }
 
-    /// What the network makes of states [B, H, W, C], of its input's size.
+    /// Computes the network's outputs for states [B, H, W, C] of the network's input size.
     pub fn look(&self, bytes: &[u8]) -> Result<Seen, UpdateError> {
         let features = self
             .network
@@ -84,15 +84,15 @@ impl Insight {
         })
     }
 
-    /// Probabilities [B, L] with which local DIM, given the features of a location in state b of `now` and the action that was taken
-    /// there, picks that location of the state that followed out of those of all B in `later`: what InfoNCE raises. 1 / B is chance;
-    /// none where the agent's auxiliary loss is another.
+    /// Probabilities [B, L], which InfoNCE raises, that local DIM identifies the state that followed; 1 / B is chance. DIM is given the
+    /// features of location l in state b of `now` and the action taken there, and picks among location l of all B states in `later`.
+    /// `None` if the agent does not compare local features.
     ///
-    /// `later` holds s_{t+k} of the s_t in `now`, in the same order. Source: Mazoure et al. 2020, section 4; its negatives are a
+    /// `later` holds s_{t+k} of the s_t in `now`, in the same order. Source: Mazoure et al. 2020, section 4, where the negatives are a
     /// batch's other states.
     ///
     /// # Errors
-    /// Batches of different lengths, or an action that there is not.
+    /// Batches of different lengths, or an unknown action.
     pub fn local_matches(
         &self,
         now: &Seen,

@@ -1,5 +1,5 @@
-//! A learner's work without its network connections: batch in, report out, weights and affinity on demand.
-//! The processes and the lockstep mode run this same code; it neither asks for batches nor sends anything.
+//! The learner without network connections: takes a batch, returns a report, and exports weights and affinity on demand.
+//! Both the learner process and lockstep mode run this code. It neither requests batches nor sends messages.
 
 use std::path::{Path, PathBuf};
 
@@ -20,10 +20,10 @@ use crate::{
     progress::Progress,
 };
 
-/// What the seed of noisy layers' noise is drawn for.
+/// The name under which the noisy layers' seed is derived from the run's seed.
 const NOISE: &str = "noisy layers";
 
-/// Why a learner could not be made, learn or be saved.
+/// Why a learner could not be created, learn or be saved.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum LearnerError {
@@ -44,7 +44,7 @@ pub enum LearnerError {
     OtherAffinity(PathBuf),
 }
 
-/// A learner's state, and what it learns by.
+/// A learner: its settings, its state, and the preparation of its batches.
 pub struct Learner {
     config: LearnerConfig,
     spec_hash: u64,
@@ -52,7 +52,7 @@ pub struct Learner {
     preparation: Preparation,
 }
 
-/// What an agent has beside its state.
+/// Applies the settings that an agent's state does not contain.
 fn configured(agent: Agent, config: &LearnerConfig) -> Agent {
     agent
         .with_deduplication(config.learner.deduplicate_states)
@@ -60,7 +60,7 @@ fn configured(agent: Agent, config: &LearnerConfig) -> Agent {
 }
 
 impl Learner {
-    /// A learner at its start, all generators derived from the run's seed.
+    /// Creates a learner before its first update. All its random generators are derived from the run's seed.
     pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, LearnerError> {
         let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
@@ -83,10 +83,10 @@ impl Learner {
         })
     }
 
-    /// A learner restored from the newest checkpoint in `folder`; a new one if there is none.
+    /// Restores a learner from the newest checkpoint in `folder`, or creates a new learner if there are no checkpoints.
     ///
     /// # Errors
-    /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
+    /// Invalid settings, or a checkpoint that is damaged or belongs to another run or to other settings.
     pub fn resume(
         config: LearnerConfig,
         compute: &Compute,
@@ -117,47 +117,47 @@ impl Learner {
         Ok(this)
     }
 
-    /// The networks, and how they learn.
+    /// The agent: networks, optimiser and count of updates.
     pub const fn agent(&self) -> &Agent {
         &self.state.agent
     }
 
-    /// Hash of the run spec.
+    /// The hash of the run spec.
     pub const fn spec_hash(&self) -> u64 {
         self.spec_hash
     }
 
-    /// Updates taken since the run began, those before a restart included.
+    /// The number of updates since the run began, including those before a restart.
     pub const fn updates(&self) -> u64 {
         self.state.agent.updates()
     }
 
-    /// What the run has done beside its updates.
+    /// The run's other counts: transitions stored and rows learned, by shard.
     pub const fn progress(&self) -> &Progress {
         &self.state.progress
     }
 
-    /// The same, to add to: [`Learner::update`] does not know where a batch comes from.
+    /// [`Learner::progress`] for the caller to update: [`Learner::update`] does not know which shards a batch comes from.
     pub const fn progress_mut(&mut self) -> &mut Progress {
         &mut self.state.progress
     }
 
-    /// Learns from one batch: the network and the affinity.
+    /// Updates the network and the affinity estimate from one batch.
     ///
     /// # Errors
-    /// A batch that does not fit, or arithmetic that left the finite numbers; nothing has changed then, except after
-    /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
+    /// A batch that does not fit, or a result that is not finite. Nothing has changed then, except after
+    /// [`UpdateError::Diverged`](crate::UpdateError::Diverged): the learner can then neither publish weights nor save a checkpoint.
     pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
         let beta = self.config.sampling.beta(self.updates());
         let columns = Columns::of(batch, beta);
-        // Kept only if the update succeeds.
+        // A copy, which replaces the generator only if the update succeeds.
         let mut rng = self.state.rng.clone();
         let batch = self.preparation.prepare(&columns, &mut rng);
-        // Before the affinity sees its actions.
+        // The affinity estimate must not see the actions of an invalid batch.
         self.state.agent.check(&batch)?;
         let mut affinity = self.state.affinity.clone();
         if let Some(affinity) = &mut affinity {
-            // Of rows drawn by priority it would be the affinity of surprising transitions.
+            // Without the resampling, rows drawn by priority would give the affinity of surprising transitions.
             let pairs = match &columns.probabilities {
                 None => batch.action_pairs(0..batch.rows),
                 Some(it) => batch.action_pairs(drawn_evenly(it, &mut rng)),
@@ -169,7 +169,7 @@ impl Learner {
         Ok(report)
     }
 
-    /// Writes into `status` what the last update gave.
+    /// Writes the results of the last update into `status`.
     pub fn note(&self, report: &UpdateReport, status: &mut LearnerStatus) {
         status.updates = self.updates();
         status.c51_kl = report.c51_kl;
@@ -180,13 +180,13 @@ impl Learner {
         status.q_mean = report.q_mean;
     }
 
-    /// The next weights get a version above `version`: actors take what is newer than theirs, which may be those of a learner
-    /// that died after its last checkpoint.
+    /// Makes the next weights' version larger than `version`. Actors accept only weights newer than theirs, which may be those of a
+    /// learner that crashed after its last checkpoint.
     pub fn publish_above(&mut self, version: u64) {
         self.state.weights_version = self.state.weights_version.max(version);
     }
 
-    /// The affinity matrix after the last update, if this agent has one, as `learner` sends it.
+    /// The affinity matrix after the last update, as a message from `learner`; `None` if the run estimates no affinity.
     pub fn affinity_update(&self, learner: u64) -> Option<AffinityUpdate> {
         self.state.affinity.as_ref().map(|affinity| AffinityUpdate {
             learner,
@@ -196,19 +196,19 @@ impl Learner {
         })
     }
 
-    /// Whether the actors are due newer weights after this many updates.
+    /// Whether it is time to publish weights, after the current number of updates.
     pub const fn publication_is_due(&self) -> bool {
         let period = self.config.learner.publish_period_updates;
         self.updates().is_multiple_of(period)
     }
 
-    /// Whether a checkpoint is due after this many updates.
+    /// Whether it is time to save a checkpoint, after the current number of updates.
     pub const fn checkpoint_is_due(&self) -> bool {
         let period = self.config.learner.checkpoint_period_updates;
         self.updates() > 0 && self.updates().is_multiple_of(period)
     }
 
-    /// The present weights as a new version.
+    /// Exports the current weights under a new version number.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
         let dtype = self.config.learner.publish_dtype;
         let safetensors = self.agent().weights_as(dtype)?;
@@ -223,12 +223,12 @@ impl Learner {
     /// Writes a checkpoint into `folder`.
     ///
     /// # Errors
-    /// The file system refused; older checkpoints are untouched.
+    /// A state that is not finite, or a failing file system; older checkpoints are untouched.
     pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
         self.save_with(folder, None)
     }
 
-    /// Writes a checkpoint into `folder` and, in it, what its caller keeps with it: [`checkpoint::companion`] reads that.
+    /// Writes a checkpoint into `folder`, together with the bytes of the caller's `companion`, which [`checkpoint::companion`] reads.
     pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
         let LearnerConfig {
             spec, model, input, ..

@@ -1,6 +1,6 @@
-//! The learner: from batches of replayed transitions to better weights, for C51 and one auxiliary loss beside it.
+//! The learner: trains the network on batches of replayed transitions, with the C51 loss and at most one auxiliary loss.
 //!
-//! Start at [`Agent`]: the networks, their optimiser, and one update. It needs no other process:
+//! Start at [`Agent`], which holds the networks and the optimiser and performs one update. An agent needs no other process:
 //!
 //! ```
 //! use driml_learner::{Agent, Batch, Compute, UpdateSettings};
@@ -37,14 +37,13 @@
 //! # }
 //! ```
 //!
-//! [`Learner`] is an agent in a run: it takes the replay server's batches, enlarges and augments states, estimates the action
-//! affinity ([`affinity`]), counts versions of the weights and keeps [`checkpoint`]s; lockstep mode runs it unchanged.
-//! A batch's way to new weights, in the order of reading: `learner`, `prepare`, `agent`, `evaluation`, `auxiliary::loss`, [`optimiser`].
-//! [`run`] is the process around a learner; what it says to other processes stands in [`remote`], and nothing else here knows
-//! zenoh.
+//! [`Learner`] is an agent within a run. It takes the replay server's batches, enlarges and augments their states, estimates the
+//! action affinity ([`affinity`]), numbers the versions of the weights and saves [`checkpoint`]s. Lockstep mode runs the same code.
+//! A batch passes through the modules in this order: `learner`, `prepare`, `agent`, `evaluation`, `auxiliary::loss`, [`optimiser`].
+//! [`run`] is the learner process. All communication with other processes is in [`remote`]; no other module here uses zenoh.
 //!
-//! To change what is learned: a loss beside C51 is a file in [`auxiliary`] and a line in its menu; the pure losses are in
-//! [`losses`], Adam and the target network in [`optimiser`]; [`parity`] compares one update with PyTorch's in float64.
+//! To add an auxiliary loss, add a file to [`auxiliary`] and a line to its menu. The loss functions are in [`losses`], Adam and the
+//! target network in [`optimiser`]. [`parity`] compares one update with PyTorch's in float64.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

@@ -1,5 +1,5 @@
-//! From a batch as it travels to one that an update reads: states enlarged and augmented, rows weighted.
-//! It learns nothing.
+//! Turns a received batch into one that an update reads: enlarges and augments states, and computes importance weights.
+//! It trains nothing.
 
 use std::borrow::Cow;
 
@@ -13,22 +13,22 @@ use crate::{
     deduplicate::one_after_another, importance::importance_weights,
 };
 
-/// The columns of a batch that do not lie in it as an update reads them.
+/// The columns of a received batch that need a conversion before an update can read them.
 pub(crate) struct Columns<'a> {
     batch: &'a WireBatch,
-    /// s_t, s_{t+k}, s_{t+n}, whose stacks of frames are put together here, once an update.
+    /// s_t, s_{t+k} and s_{t+n}. Their stacks of frames are assembled here, once per update.
     states: [Cow<'a, [u8]>; 3],
     returns: Vec<f32>,
     discounts: Vec<f32>,
-    /// The chance with which each row was drawn, where rows were not equally likely.
+    /// The probability with which each row was drawn; `None` if rows were equally likely.
     pub(crate) probabilities: Option<Vec<f32>>,
     weights: Option<Vec<f32>>,
-    /// Every row has another view of itself.
+    /// `positive_valid` if the positive is another view of s_t: 1 for every row.
     all_valid: Vec<u8>,
 }
 
 impl<'a> Columns<'a> {
-    /// `beta` is the exponent of importance weights.
+    /// Converts the columns of `batch`; `beta` is the exponent of importance weights.
     pub(crate) fn of(batch: &'a WireBatch, beta: f64) -> Self {
         let probabilities = batch.probabilities();
         let weights = probabilities.as_ref();
@@ -44,15 +44,15 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// How states are prepared, with memory that is used again for each batch.
+/// Prepares the states of batches, in buffers that are reused for each batch.
 pub(crate) struct Preparation {
     positives: Positives,
     state_bytes: usize,
     enlarge: Option<Enlarge>,
-    /// States at the network's input size, if that is another.
+    /// States at the network's input size, if they have to be enlarged.
     enlarged: [Vec<u8>; 3],
     augment: Option<Augment>,
-    /// What the auxiliary loss sees, if that is not the plain states.
+    /// Augmented states for the auxiliary loss.
     seen: [Vec<u8>; 2],
 }
 
@@ -73,7 +73,7 @@ impl Preparation {
         })
     }
 
-    /// The batch of `columns` as an update reads it; augmentation draws from `rng`.
+    /// Returns the batch of `columns` in the form that an update reads; augmentation draws from `rng`.
     pub(crate) fn prepare<'a>(
         &'a mut self,
         columns: &'a Columns<'_>,
@@ -111,7 +111,7 @@ impl Preparation {
             }
             let [seen_t, seen_k] = &mut self.seen;
             augment.apply(states_t, seen_t, rng);
-            // Draws for every positive, also for those that rows do not have: a run's views do not depend on which came.
+            // Draws for missing positives too, so that a run's augmentations do not depend on which positives are missing.
             if batch.states_k.len() < batch.positive_valid.len() * self.state_bytes {
                 let each = batch.positive_states(self.state_bytes).into_iter();
                 augment.apply(&one_after_another(each, self.state_bytes), seen_k, rng);
@@ -125,7 +125,7 @@ impl Preparation {
     }
 }
 
-/// Enlarges all `states` into `larger`, spread over the threads.
+/// Enlarges all `states` into `larger`, in parallel.
 fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
     let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
     larger.resize(states.len() / from * to, 0);

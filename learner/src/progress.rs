@@ -1,30 +1,30 @@
-//! What a run has done so far, as its learner counts it. The checkpoint keeps it: no other process knows what was learned.
-//! It derives nothing: every number was counted.
+//! The counts of a run so far. The learner keeps them in its checkpoints, as no other process knows which rows it learned.
+//! No number is derived: each was counted.
 
 use driml_protocol::ShardCounts;
 use serde::{Deserialize, Serialize};
 
-/// Largest count: no run comes near it, and what is added to counts cannot overflow.
+/// Largest valid count. No run comes near it, and additions to valid counts cannot overflow.
 pub(crate) const COUNT_MAX: u64 = 1 << 53;
 
-/// What a run has done so far, beside its updates.
+/// The counts of a run so far, except its updates.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
-    /// Which run it is: a random number that its first learner drew; 0 before.
+    /// Identifier of the run: a random number that its first learner drew; 0 before.
     pub run: u64,
-    /// Of each shard of the replay: transitions stored, by its last report, and rows learned.
+    /// For each shard of the replay, the transitions stored, by its last report, and the rows learned.
     pub shards: Vec<ShardCounts>,
 }
 
 /// Rows of a batch that came from one shard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServedPart {
-    /// Which shard.
+    /// Index of the shard.
     pub shard: usize,
-    /// How many rows.
+    /// Number of rows.
     pub rows: u32,
-    /// Transitions that the shard had stored by then.
+    /// Transitions that the shard had stored when it sent the rows.
     pub inserted: u64,
 }
 
@@ -39,7 +39,7 @@ impl Progress {
         self.shards.iter().map(|it| it.rows_sampled).sum()
     }
 
-    /// The same for a replay of so many shards: counts of another number of them are spread evenly.
+    /// Adapts the counts to a replay of `shards` shards. If the number of shards has changed, the totals are spread evenly.
     pub fn spread_over(&mut self, shards: usize) {
         if self.shards.len() == shards {
             return;
@@ -62,7 +62,7 @@ impl Progress {
         }
     }
 
-    /// A shard has stored so many transitions by now.
+    /// Records that `shard` has stored `inserted` transitions. A lower number than before is ignored.
     pub fn note_inserted(&mut self, shard: usize, inserted: u64) {
         if self.shards.len() <= shard {
             self.shards.resize(shard + 1, ShardCounts::default());
@@ -71,14 +71,14 @@ impl Progress {
         *known = inserted.max(*known);
     }
 
-    /// What all shards but `this` have counted together.
+    /// The sum of the counts of all shards except `this`.
     pub fn other_shards(&self, this: usize) -> ShardCounts {
         let others = self.shards.iter().enumerate();
         let others = others.filter(|(at, _)| *at != this);
         others.fold(ShardCounts::default(), |sum, (_, counts)| sum + *counts)
     }
 
-    /// Whether no count is one that no run reaches.
+    /// Whether a run can reach these counts.
     pub(crate) fn is_sane(&self) -> bool {
         let counts = self.shards.iter();
         let mut counts = counts.flat_map(|it| [it.inserted, it.rows_sampled]);

@@ -1,14 +1,14 @@
-//! How a setting that has a range is checked, and the ranges that more than one table has.
-//! They are narrower than f64: what is computed is f32.
+//! Checks settings against their ranges, and defines the ranges that several tables share.
+//! The ranges are narrower than f64's because the computation is in f32.
 
 use std::ops::RangeInclusive;
 
 use crate::error::UpdateError;
 
-/// Shares of the online network that a slow copy in f32 follows.
+/// Range of tau, the share of the online network in a move of a slow copy, whose parameters are f32.
 pub(crate) const TAU: RangeInclusive<f64> = 1e-5..=1.0;
 
-/// Checks that a setting is in its range; NaN is not.
+/// Checks that a setting is in its range. NaN is outside every range.
 pub(crate) fn check_range(
     name: &str,
     value: f64,
@@ -17,7 +17,7 @@ pub(crate) fn check_range(
     outside(name, value, &range).map_or(Ok(()), |why| Err(UpdateError::Settings(why)))
 }
 
-/// What is wrong with a setting, if it is not in its range.
+/// The error message for a setting that is outside its range.
 pub(crate) fn outside(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
     let (least, most) = (range.start(), range.end());
     let is_inside = range.contains(&value);

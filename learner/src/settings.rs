@@ -1,5 +1,5 @@
-//! Everything that one update depends on beside the network's sizes: the table `[learner.update]`.
-//! It fills in no number: presets do, with their sources.
+//! The table `[learner.update]`: all settings of an update except the network's sizes.
+//! No number has a default here: presets give all of them, with their sources.
 
 use std::ops::RangeInclusive;
 
@@ -17,45 +17,45 @@ use crate::{
     ranges::{TAU, check_range},
 };
 
-/// Bounds of the soft clip at which f32, in which other devices than the CPU clip, holds both a score and its share of the bound.
+/// Range of the soft clip's bound: other devices than the CPU clip in f32, which must hold a score and its ratio to the bound.
 const TANH_CLIP: RangeInclusive<f64> = 1e-30..=1e30;
-/// Below it what clipping adds to a norm against a division by 0 is no longer small; above it the square of a gradient that is
-/// within it comes near to the largest f32.
+/// Below this range, the 1e-6 that clipping adds to the norm is too large. Above it, the square of a clipped gradient comes near
+/// to the largest f32.
 const MAX_GRAD_NORM: RangeInclusive<f64> = 1e-6..=1e15;
 
-/// Everything that one update depends on beside the network's sizes. No field has a default.
+/// All settings of an update except the network's sizes. Only `average_tau` and the auxiliary loss's own table may be absent.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct UpdateSettings {
-    /// Choose the action in s_{t+n} by the online network instead of the target network.
+    /// Whether the online network, instead of the target network, chooses the action in s_{t+n}.
     pub double_dqn: bool,
     /// The auxiliary loss.
     pub auxiliary_loss: AuxiliaryKind,
-    /// Whether Psi is given a_t, in a world where there is something to decide.
+    /// Whether Psi receives a_t. Without effect in an environment with a single action.
     pub condition_on_action: bool,
-    /// Weights of the auxiliary losses, by pair of levels; all 0 for an agent without any.
+    /// Weights of the auxiliary losses, by pair of levels; all 0 for an agent without an auxiliary loss.
     pub lambda: Lambda,
     /// Bound c of the auxiliary scores' soft clip `c * tanh(x / c)`, from 1e-30 to 1e30; the largest clips nothing.
     pub tanh_clip: f64,
-    /// Global 2-norm to which gradients are clipped, from 1e-6 to 1e15; the largest clips nothing that Adam can square.
+    /// Global 2-norm to which gradients are clipped, from 1e-6 to 1e15; the largest in effect turns clipping off.
     pub max_grad_norm: f64,
-    /// The optimiser's numbers.
+    /// Adam's settings.
     pub adam: AdamSettings,
     /// Updates from one move of the target network to the next, at least 1.
     pub target_period_updates: u64,
-    /// Share of the online network in a move of the target network, from 1e-5 to 1. Parameters are f32, and a target stands
-    /// still within a relative 6e-8 / tau of the online network: 6e-4 at 1e-4, and 6e-3 at the least.
+    /// Share of the online network in a move of the target network, from 1e-5 to 1. Parameters are f32, so that the target stops moving
+    /// within a relative distance of 6e-8 / tau from the online network: 6e-4 at 1e-4, and 6e-3 at 1e-5.
     pub target_tau: f64,
-    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; without it there is none. In the first
-    /// 1 / average_tau updates the share of update t is 1 / t, which makes a plain mean. The averaged network is saved in checkpoints
-    /// and is what `evaluate` plays; training does not use it.
+    /// Share of the online network in an update's move of the averaged network, from 1e-5 to 1; absent: no averaged network. In the first
+    /// 1 / average_tau updates, the share of update t is 1 / t, which gives a plain mean. Checkpoints contain the averaged network, and
+    /// `evaluate` plays it; training does not use it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub average_tau: Option<f64>,
-    /// The auxiliary loss's own numbers, a table of its name such as `[learner.update.curl]`; none for an auxiliary loss that has none.
+    /// The auxiliary loss's own settings, in a table of its name such as `[learner.update.curl]`; empty if the loss has none.
     #[serde(flatten, deserialize_with = "own_tables")]
     pub own: toml::Table,
 }
 
-/// What is left of the settings: nothing but tables of auxiliary losses.
+/// Reads the remaining keys, each of which must be the name of an auxiliary loss.
 fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Error> {
     let own = toml::Table::deserialize(from)?;
     let mut names = own.keys();
@@ -83,7 +83,7 @@ impl UpdateSettings {
         self.adam.validate()
     }
 
-    /// What the auxiliary loss is made from.
+    /// The settings from which the auxiliary loss is created.
     pub const fn auxiliary_settings(&self) -> AuxiliarySettings<'_> {
         AuxiliarySettings {
             auxiliary_loss: self.auxiliary_loss.name(),
@@ -94,16 +94,16 @@ impl UpdateSettings {
         }
     }
 
-    /// The auxiliary loss.
+    /// Creates the auxiliary loss.
     ///
     /// # Errors
-    /// Settings of it that cannot work.
+    /// Invalid settings of the loss.
     pub fn auxiliary(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
         self.auxiliary_loss.loss(&self.auxiliary_settings())
     }
 
-    /// The heads that the online network needs in a world of `num_actions` actions; none where the settings cannot work, which
-    /// [`UpdateSettings::validate`] says.
+    /// The heads that the online network needs in an environment of `num_actions` actions; none if the settings are invalid, which
+    /// [`UpdateSettings::validate`] reports.
     pub fn dim_heads(&self, num_actions: usize) -> DimHeads {
         let action = self.condition_on_action && num_actions > 1;
         let loss = self.auxiliary();

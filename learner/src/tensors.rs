@@ -1,4 +1,4 @@
-//! Between bytes, slices and candle's tensors: states as the network takes them, and the values behind a tensor on the CPU.
+//! Conversions between bytes, slices and candle's tensors: states as the network's input, and the values of a tensor on the CPU.
 
 use std::{borrow::Cow, cell::RefCell};
 
@@ -7,7 +7,7 @@ use driml_model::{ModelConfig, floats};
 
 use crate::error::UpdateError;
 
-/// The bytes of states as a tensor [B, H, W, C] u8 on `device`: bytes travel there, they become numbers there.
+/// The bytes of states as a tensor [B, H, W, C] u8 on `device`, where the network converts them to floats.
 pub(crate) fn states<'a>(
     model: &ModelConfig,
     bytes: impl Into<Cow<'a, [u8]>>,
@@ -22,23 +22,23 @@ pub(crate) fn states<'a>(
     }
 }
 
-/// All values of a tensor of f32, in their order.
+/// All values of an f32 tensor, in row-major order.
 pub(crate) fn flat(tensor: &Tensor) -> candle_core::Result<Vec<f32>> {
     tensor.flatten_all()?.to_vec1()
 }
 
-/// All values of a tensor as f64, in their order.
+/// All values of a tensor as f64, in row-major order.
 pub(crate) fn flat_f64(tensor: &Tensor) -> candle_core::Result<Vec<f64>> {
     tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()
 }
 
-/// Changes `var` in place, given the values of `other`, as many; both are on the CPU.
+/// Calls `change` with the values of `var`, to change in place, and those of `other`. Both are on the CPU and equally long.
 pub(crate) fn change(
     var: &Var,
     other: &Tensor,
     change: impl FnMut(&mut [f32], &[f32]),
 ) -> candle_core::Result<()> {
-    // candle hands operations out by shared reference only.
+    // candle passes the operation by shared reference only.
     var.inplace_op2(other, &Change(RefCell::new(change)))
 }
 
@@ -69,7 +69,7 @@ impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for Change<F> {
     }
 }
 
-/// A loss as a number; an error that names it unless it is finite.
+/// Reads a scalar loss; an error that names it if it is not finite.
 pub(crate) fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
     let value = loss.to_scalar::<f32>()?;
     match value.is_finite() {

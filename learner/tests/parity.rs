@@ -1,4 +1,4 @@
-//! The project's update against updates computed elsewhere in float64, and the check against broken files.
+//! Compares the project's update with updates computed elsewhere in float64, and tests the check with broken files.
 //! It makes no cases.
 
 #![allow(clippy::unwrap_used)]
@@ -34,13 +34,13 @@ fn every_open_case_is_within_tolerance() {
     check_all(&Compute::CPU);
 }
 
-/// What a GPU is given to compute, on the CPU: the same operations in the same order.
+/// These are the operations of a GPU in the same order, computed on the CPU.
 #[test]
 fn so_it_is_with_candle_s_own_operations() {
     check_all(&REFERENCE);
 }
 
-/// With the tolerances of bf16, which are its own; in f32's it fails, so that they are not a formality.
+/// bf16 has its own tolerances. It would fail those of f32, so the difference matters.
 #[test]
 fn so_it_is_in_bf16() {
     let report = check_all(&Compute::cpu(Precision::Bf16)).swap_remove(0);
@@ -71,7 +71,7 @@ fn a_broken_file_is_a_clear_error() {
             "{length} bytes"
         );
     }
-    // Of one length each, so that the file stays whole.
+    // Each pair has the same length, so that the file stays complete.
     for (from, to, said) in [
         (r#""config""#, r#""confix""#, "config"),
         (r#"\"atoms\": 51"#, r#"\"atoms\": -1"#, "config"),

@@ -1,5 +1,5 @@
 //! One process's connection to a run: queries, replies, publications and subscriptions, each message at its own key.
-//! It decides neither what is asked nor how often: timeouts and retries are the caller's.
+//! The caller decides what to request, and sets time-outs and retries.
 
 use std::{marker::PhantomData, time::Duration};
 
@@ -23,7 +23,7 @@ use crate::{
     },
 };
 
-/// A session, the run's keys and its hash: all that a message needs to arrive and be understood.
+/// A connection to a run: a session, the run's keys and the hash of its spec.
 /// Clones share the session.
 #[derive(Clone, Debug)]
 pub struct RunClient {
@@ -32,22 +32,22 @@ pub struct RunClient {
     spec_hash: u64,
 }
 
-/// A message of type `M` as it travels; it may be sent several times.
+/// An encoded message of type `M`, which may be sent several times.
 #[derive(Clone, Debug)]
 pub struct Sealed<M> {
     bytes: ZBytes,
-    /// The actor that it speaks for.
+    /// The actor that the message names as its sender, if any.
     actor: Option<u32>,
     message: PhantomData<fn() -> M>,
 }
 
 impl<M: Message> Sealed<M> {
-    /// A message without a payload, for the run with this hash.
+    /// Encodes a message without a payload for the run with this hash.
     pub fn new(message: &M, spec_hash: u64) -> Result<Self, CodecError> {
         Self::with_payload(message, ZBytes::new(), spec_hash)
     }
 
-    /// A message with a payload, which is not copied.
+    /// Encodes a message with a payload, which is not copied.
     pub fn with_payload(message: &M, payload: ZBytes, spec_hash: u64) -> Result<Self, CodecError> {
         let head = codec::seal(spec_hash, message, &payload.to_bytes())?;
         let mut writer = ZBytes::writer();
@@ -60,14 +60,14 @@ impl<M: Message> Sealed<M> {
         })
     }
 
-    /// The bytes of prefix, header and payload.
+    /// Returns the bytes of prefix, header and payload.
     pub fn into_bytes(self) -> ZBytes {
         self.bytes
     }
 }
 
 impl RunClient {
-    /// A client of the run whose keys these are and whose spec has this hash.
+    /// Creates a client of the run with these keys and this hash of its spec.
     pub const fn new(session: Session, keys: Keys, spec_hash: u64) -> Self {
         Self {
             session,
@@ -76,7 +76,7 @@ impl RunClient {
         }
     }
 
-    /// The session, for what is no message: closing it, liveliness of others.
+    /// The session, for everything but sending messages, such as closing it or watching the liveliness of others.
     pub const fn session(&self) -> &Session {
         &self.session
     }
@@ -91,10 +91,10 @@ impl RunClient {
         self.spec_hash
     }
 
-    /// Asks a request without payload and waits for its reply.
+    /// Sends a request without a payload and waits for its reply.
     ///
     /// # Errors
-    /// No process answers, no reply in time, or an unreadable one. All but the last may be tried again.
+    /// No process answers, the reply is late, or it cannot be read. In all cases but the last, the caller may retry.
     pub fn ask<R: Request>(
         &self,
         request: &R,
@@ -103,18 +103,18 @@ impl RunClient {
         self.send(self.seal(request)?, timeout)?.wait()
     }
 
-    /// Fetches a message that takes no request, such as a status.
+    /// Fetches a message by an empty query, such as a status.
     pub fn fetch<M: Keyed>(&self, timeout: Duration) -> Result<M, SessionError> {
         self.query::<M, M>(self.keys.of::<M>(), ZBytes::new(), timeout)?
             .wait()
     }
 
-    /// A request that is ready to be sent, as often as need be.
+    /// Encodes a request, which may then be sent several times.
     pub fn seal<R: Request>(&self, request: &R) -> Result<Sealed<R>, SessionError> {
         self.seal_with(request, ZBytes::new())
     }
 
-    /// A request with a payload, which is not copied.
+    /// Encodes a request with a payload, which is not copied.
     pub fn seal_with<R: Request>(
         &self,
         request: &R,
@@ -124,10 +124,10 @@ impl RunClient {
         sealed.map_err(|why| SessionError::Failed(format!("{}: {why}", self.keys.of::<R>())))
     }
 
-    /// Sends a request; requests of one priority arrive in the order in which they were sent.
+    /// Sends a request. Requests of one priority arrive in the order in which they were sent.
     ///
     /// # Errors
-    /// zenoh refused. It may be tried again.
+    /// zenoh rejects the request. The caller may retry.
     pub fn send<R: Request>(
         &self,
         request: Sealed<R>,
@@ -154,7 +154,7 @@ impl RunClient {
         })
     }
 
-    /// Declares where `M` is announced.
+    /// Declares a publisher of messages of type `M`.
     pub fn announce<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
         let publisher = self
             .session
@@ -169,8 +169,8 @@ impl RunClient {
         })
     }
 
-    /// Calls `on_message` at each publication of `M`, until the result is dropped. It is called on the thread that reads the socket,
-    /// so it must not wait.
+    /// Calls `on_message` at each publication of `M`, until the returned subscriber is dropped. The call runs on the thread that reads the
+    /// socket, so it must not block.
     pub fn subscribe<M: Keyed>(
         &self,
         on_message: impl Fn(Result<M, CodecError>) + Send + Sync + 'static,
@@ -185,14 +185,14 @@ impl RunClient {
             .wait()
     }
 
-    /// Lets others see that `who` is connected, until the result is dropped.
+    /// Shows other processes that `who` is connected, until the returned token is dropped.
     pub fn declare_alive(&self, who: Alive) -> zenoh::Result<LivelinessToken> {
         let token = self.session.liveliness();
         token.declare_token(self.keys.alive_key(who)).wait()
     }
 }
 
-/// Where messages of type `M` are announced. One that is dropped on the way is not sent again.
+/// Publishes messages of type `M`. A message that is lost on the way is not sent again.
 #[derive(Debug)]
 pub struct Announcer<M> {
     publisher: Publisher<'static>,
@@ -201,14 +201,14 @@ pub struct Announcer<M> {
 }
 
 impl<M: Message> Announcer<M> {
-    /// Announces a message to all who listen now.
+    /// Publishes a message to all current subscribers.
     pub fn put(&self, message: &M) -> zenoh::Result<()> {
         let sealed = Sealed::new(message, self.spec_hash)?;
         self.publisher.put(sealed.bytes).wait()
     }
 }
 
-/// A reply that is to come.
+/// A reply that has yet to arrive.
 #[derive(Debug)]
 pub struct PendingReply<M> {
     bytes: PendingBytes,
@@ -217,18 +217,18 @@ pub struct PendingReply<M> {
 }
 
 impl<M: Message> PendingReply<M> {
-    /// Waits for the reply, which has no payload.
+    /// Waits for a reply without a payload.
     pub fn wait(mut self) -> Result<M, SessionError> {
         self.bytes.wait_for(|bytes| decode(bytes, self.spec_hash))
     }
 
-    /// Waits for the reply, at most for `wait_max`; `None` if it has not come by then.
+    /// Waits for the reply for at most `wait_max`; returns `None` if it has not arrived by then.
     pub fn wait_within(&mut self, wait_max: Duration) -> Result<Option<M>, SessionError> {
         let read = |bytes: &ZBytes| decode(bytes, self.spec_hash);
         self.bytes.wait_for_within(wait_max, read)
     }
 
-    /// Waits for the reply and copies its payload into own memory of `pool`.
+    /// Waits for the reply and copies its payload into private memory from `pool`.
     pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
         self.bytes.wait_for(|bytes| {
             codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))

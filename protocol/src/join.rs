@@ -1,5 +1,5 @@
-//! Joining a run: fetching its settings, and taking part in it as an actor or as the learner.
-//! It does not serve or leave the run; each process does that itself.
+//! Joining a run: fetching its settings, and registering as an actor or as the learner.
+//! Serving a run and leaving it are up to each process.
 
 use std::time::Duration;
 
@@ -20,9 +20,9 @@ use crate::{
 
 /// How long a joining process waits for a replay server.
 const SERVER_MAX: Duration = Duration::from_secs(60);
-/// How long it waits for its predecessor to be gone: a session that was cut off counts as connected for its lease of 30 s.
+/// How long it waits until its predecessor is disconnected: a session that was cut off counts as connected for its lease of 30 s.
 const TAKEN_MAX: Duration = Duration::from_secs(45);
-/// How long it waits before it says so.
+/// How long it waits before it logs that it is waiting.
 const SILENT_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its reply.
 const TRY_MAX: Duration = Duration::from_secs(2);
@@ -36,16 +36,16 @@ pub enum JoinError {
     NoReplayServer { last: SessionError },
     #[error("the replay server's run info: {0}")]
     Codec(#[from] CodecError),
-    /// Another process has the same role and does not end, or the replay server refuses.
+    /// Another process has the same role and does not exit, or the replay server rejects this one.
     #[error("{0}")]
     Refused(String),
 }
 
-/// Asks the replay server for the run's settings, waiting for it if it is not there yet, and for as long as it reads its replay back
-/// from disk; `None` if told to stop before.
+/// Fetches the run's settings from the replay server. Waits up to 60 s for the server to start, and without a limit while the server reads
+/// its replay back from disk. Returns `None` if `shutdown` is set first.
 ///
 /// # Errors
-/// No replay server answered within 60 s, or its protocol version differs.
+/// No replay server answered within 60 s, or its reply cannot be read, for example because its protocol version differs.
 pub fn run_info(
     session: &Session,
     keys: &Keys,
@@ -63,7 +63,7 @@ pub fn run_info(
     }
 }
 
-/// Asks the replay server once for the run's settings.
+/// Asks the replay server once for the run's settings, and waits for at most `wait_max`.
 pub fn run_info_within(
     session: &Session,
     keys: &Keys,
@@ -83,7 +83,7 @@ struct Patience {
 }
 
 impl Patience {
-    /// Takes note that a try failed, and says now and then what is waited for; an error if another try is of no use.
+    /// Records a failed attempt, and logs now and then what this process waits for. Returns an error if a retry is useless.
     fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
         let e = match e {
             SessionError::Unreadable { why, .. } => return Err(why.into()),
@@ -102,7 +102,7 @@ impl Patience {
         }
         if since > SILENT_MAX && self.silence_said.due().is_some() {
             let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
-            // A router may listen there, to which the replay server has yet to connect.
+            // The listener may be a router to which the replay server has not connected yet.
             let why = match e {
                 SessionError::NoAnswerer { key } => format!(
                     "a process listens there, but does not answer at {key}: is it the replay server of this run, with the same --namespace?"
@@ -117,10 +117,10 @@ impl Patience {
     }
 }
 
-/// Takes part as an actor or as the run's learner; `None` if told to stop before.
+/// Registers this process as an actor or as the run's learner; returns `None` if `shutdown` is set first.
 ///
 /// # Errors
-/// Another process has this role and stays; the replay server refuses, or does not answer for a minute.
+/// Another process keeps this role, or the replay server rejects this one or does not answer for a minute.
 pub fn take_part(
     client: &RunClient,
     join: &impl Request<Reply = JoinReply>,

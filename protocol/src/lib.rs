@@ -1,9 +1,9 @@
-//! Everything that crosses a process boundary: the run spec, the messages, their bytes, and where they travel.
-//! It holds no algorithm and no state; `deploy/docs/src/reference/protocol.md` has the table of messages.
+//! The interface between the processes of a run: the run spec, the messages, their encoding, and the connections that carry them.
+//! This crate has no algorithm and no state of a run; `deploy/docs/src/reference/protocol.md` has the table of messages.
 //!
 //! Start at [`RunClient`], which queries, fetches, publishes and subscribes, and at [`QueryWorkers`], which reply. A [`Message`] is a
-//! header and perhaps a payload; [`codec`] turns both into bytes and back, and refuses what is damaged, foreign or of another
-//! kind. [`RunSpec`] is what all processes of a run agree on, and its hash is in every message.
+//! header and perhaps a payload; [`codec`] encodes and decodes both, and rejects damaged, foreign and unexpected messages. All processes of
+//! a run must agree on the [`RunSpec`], whose hash is in every message.
 //!
 //! ```
 //! use driml_protocol::{Leave, codec};

@@ -1,8 +1,8 @@
-//! Threads that answer queries, so that the threads on which zenoh receives never wait.
-//! Each process decides what it replies.
+//! Threads that answer queries, so that the threads on which zenoh receives never block.
+//! Each process supplies the function that replies.
 //!
-//! zenoh calls back on the thread that reads the socket. Were it to send megabytes from there, or to wait for anything, nothing
-//! would be read meanwhile, and if the other side is sending too, both would wait forever.
+//! zenoh calls back on the thread that reads the socket. A callback that sends megabytes or waits would stop the reading. If the other side
+//! were sending too, both sides would deadlock.
 
 use std::{
     marker::PhantomData,
@@ -34,13 +34,13 @@ use crate::{
     },
 };
 
-/// Queries that wait for a thread; one more is dropped, and its sender is told at once and retries.
+/// Most queries in the queue. A query beyond this is dropped; its sender is notified at once and retries.
 const WAITING_MAX: usize = 4096;
-/// Bytes of the queries that wait for a thread: a few hundred chunks of Procgen. Beyond it one query may wait, so that one of
-/// any size is answered in the end; one more is dropped, and its sender retries.
+/// Payload bytes in the queue after which queries are dropped, a few hundred chunks of Procgen. Only the bytes before a query count, so
+/// that a query of any size is answered in the end. The sender of a dropped query retries.
 const WAITING_BYTES_MAX: usize = 1 << 29;
 
-/// A request that has arrived and waits for its reply.
+/// A request that has arrived and has yet to be answered.
 #[derive(Debug)]
 pub struct Incoming<R> {
     query: Query,
@@ -55,13 +55,13 @@ impl<R: Request> Incoming<R> {
         read.map(|(request, _)| request)
     }
 
-    /// Reads a request and copies its payload into own memory of `pool`; one that came at another process's key is an error.
+    /// Reads a request and copies its payload into private memory from `pool`. A request at another process's key is an error.
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
         let (request, payload): (R, _) =
             codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
-        // One that speaks for an actor, or for the learner beside them, comes at its own key, which others may have no access to.
+        // Where each process has its own key, access control guards only the key, so the request must come at the key of its sender.
         let (key, actor) = (self.query.key_expr().as_str(), request.actor());
         if R::BY_ACTOR && Keys::actor(key) != actor {
             let key = key.to_owned();
@@ -70,7 +70,7 @@ impl<R: Request> Incoming<R> {
         Ok((request, payload))
     }
 
-    /// What the reply goes through.
+    /// Returns the responder that sends the reply.
     pub fn into_responder(self) -> Responder<R::Reply> {
         Responder {
             query: self.query,
@@ -80,7 +80,7 @@ impl<R: Request> Incoming<R> {
     }
 }
 
-/// The means to reply with an `M`; where it is dropped without a reply, the sender of the query is told at once.
+/// Sends one reply of type `M`. If it is dropped without a reply, the sender of the query is notified at once.
 #[derive(Debug)]
 pub struct Responder<M> {
     query: Query,
@@ -89,17 +89,17 @@ pub struct Responder<M> {
 }
 
 impl<M: Message> Responder<M> {
-    /// Sends the reply. That it cannot be sent is logged: its asker asks again.
+    /// Sends the reply. A failure is logged, and the requester retries.
     pub fn reply(self, reply: &M) {
         self.send(Sealed::new(reply, self.spec_hash));
     }
 
-    /// Sends the reply with a payload, as [`Responder::reply`] does without.
+    /// Sends the reply with a payload, like [`Responder::reply`].
     pub fn reply_with(self, reply: &M, payload: ZBytes) {
         self.send(Sealed::with_payload(reply, payload, self.spec_hash));
     }
 
-    /// Says instead of a reply that there is none yet, as the replay is being read back from disk.
+    /// Answers, in place of a reply, that the replay is still being read back from disk.
     pub fn put_off(self, recovering: &Recovering) {
         match Sealed::new(recovering, self.spec_hash) {
             Ok(sealed) => session::put_off(&self.query, sealed.into_bytes()),
@@ -115,14 +115,14 @@ impl<M: Message> Responder<M> {
     }
 }
 
-/// What a thread of these is given.
+/// An item in the queue of the threads.
 enum Work {
     Query(Query),
-    /// A query of so many bytes was too long, and who is told.
+    /// A rejected query: the bytes of its payload, and the callback that reports them.
     TooLong(usize, Arc<dyn Fn(usize) + Send + Sync>),
 }
 
-/// Threads and the queue to them, for the requests `R`. The threads end when this and everything that it declared are dropped.
+/// Threads that answer requests `R`, and their queue. The threads exit once this value and all queryables that it declared are dropped.
 #[derive(Debug)]
 pub struct QueryWorkers<R> {
     work: Sender<Work>,
@@ -132,7 +132,7 @@ pub struct QueryWorkers<R> {
 }
 
 impl<R: Request + 'static> QueryWorkers<R> {
-    /// Starts `threads` threads, each of which answers one request of the run `spec_hash` after the other with `answer`.
+    /// Starts `threads` threads, each of which answers one request of the run `spec_hash` after another by calling `answer`.
     pub fn start(
         name: &str,
         threads: usize,
@@ -172,8 +172,8 @@ impl<R: Request + 'static> QueryWorkers<R> {
         })
     }
 
-    /// Takes the requests in the client's run, until the result is dropped, of at most `bytes_max` bytes: longer ones are dropped before
-    /// anything is copied, and `refused` is told their bytes. No other process need be asked: the reply is complete.
+    /// Accepts requests of the client's run until the returned queryable is dropped. A request of more than `bytes_max` bytes is dropped
+    /// before anything is copied, and `refused` is called with its bytes. The reply is complete: zenoh need query no other process.
     pub fn declare(
         &self,
         client: &RunClient,
@@ -185,12 +185,12 @@ impl<R: Request + 'static> QueryWorkers<R> {
         let take = move |query: Query| {
             let bytes = payload_bytes(&query);
             if bytes > bytes_max {
-                // Where it finds no room, it is one of very many.
+                // If the queue is full, this report is lost; it is one of very many.
                 let _ = work.try_send(Work::TooLong(bytes, refused.clone()));
                 return;
             }
             let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
-            // A dropped query ends: its sender is told at once.
+            // Dropping a query notifies its sender at once.
             if before > WAITING_BYTES_MAX || work.try_send(Work::Query(query)).is_err() {
                 waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
                 tracing::debug!("more queries than can wait; the sender retries");
@@ -200,7 +200,7 @@ impl<R: Request + 'static> QueryWorkers<R> {
         queryable.complete(true).callback(take).wait()
     }
 
-    /// The threads, to be waited for.
+    /// Returns the threads so that the caller can join them.
     pub fn into_threads(self) -> Vec<JoinHandle<()>> {
         self.threads
     }

@@ -1,5 +1,5 @@
-//! Whether anything listens at an endpoint, and what: zenoh itself says no more than that it gave up.
-//! It connects and hangs up, so it knows nothing of certificates, namespaces and runs.
+//! Checks whether anything listens at an endpoint, and what: zenoh itself reports only that it gave up.
+//! The check connects and disconnects, so it ignores certificates, namespaces and runs.
 
 use std::{
     io::{ErrorKind, Read, Write},
@@ -11,7 +11,7 @@ use std::{
 
 /// How long one address may take to answer.
 const TRY_MAX: Duration = Duration::from_secs(2);
-/// Pauses between tries: the first, which doubles, and the longest.
+/// Pauses between attempts: the first pause, which doubles each time, and the longest.
 const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(1)];
 /// How long a foreign server may take to send its first bytes.
 const SAYS_MAX: Duration = Duration::from_secs(1);
@@ -21,7 +21,7 @@ const SAYS_MAX: Duration = Duration::from_secs(1);
 #[error("{said}")]
 pub struct Unreachable {
     said: String,
-    /// It makes sense to try again in a moment, as the replay server may be starting.
+    /// Whether a retry may succeed, as the replay server may still be starting.
     may_pass: bool,
 }
 
@@ -60,7 +60,7 @@ pub fn look(endpoint: &str) -> Result<(), Unreachable> {
             let failed = failed.unwrap_or_else(|| ErrorKind::AddrNotAvailable.into());
             Err(of_error(endpoint, failed))
         }
-        // zenoh says what is wrong with it.
+        // zenoh reports what is wrong with such an endpoint.
         None => Ok(()),
     }
 }
@@ -117,7 +117,7 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
     }
 }
 
-/// The first words of a foreign server that listens at `endpoint`, if it sends any.
+/// Returns the first line that a foreign server at `endpoint` sends in answer to an HTTP request, if it is printable text.
 pub(crate) fn what_listens(endpoint: &str) -> Option<String> {
     let ("tcp", address) = endpoint.split_once('/')? else {
         return None;

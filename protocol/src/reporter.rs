@@ -1,6 +1,5 @@
-//! The thread with which an actor or the learner tells the replay server what it does.
-//! Nothing waits for a report, and a lost one is not sent again: the next one follows. The learner's last one, that the run is
-//! finished, is sent until it arrives.
+//! The thread by which an actor or the learner reports to the replay server what it does. No process waits for a report, and a lost one is
+//! not sent again, because the next one follows. Only the learner's last report, that the run is finished, is retried until it arrives.
 
 use std::{
     thread::JoinHandle,
@@ -17,16 +16,16 @@ use crate::{
     session::SessionError,
 };
 
-/// How often a process reports although nothing has changed.
+/// How often a process reports if nothing has changed.
 const PERIOD: Duration = Duration::from_secs(2);
-/// How often it looks whether something has.
+/// How often a process checks whether its activity has changed.
 const TICK: Duration = Duration::from_millis(250);
 const TIMEOUT: Duration = Duration::from_secs(2);
-/// How long a replay server that does not answer is told that the run is finished: it may be starting again.
+/// How long the learner retries its last report at a replay server that does not answer: the server may be restarting.
 const FINISHED_MAX: Duration = Duration::from_secs(30);
 
-/// Tells each replay server of `clients` that `who`, the learner, has finished the run after so many updates: until it answers, as long
-/// as it reads its replay back, 30 s where it does not, or `shutdown`.
+/// Reports to each replay server of `clients` that the learner `who` has finished the run after `updates` updates. Retries until the server
+/// answers or `shutdown` is set, at least once: for 30 s, plus all the time in which the server reads its replay back.
 pub fn say_finished(clients: &[RunClient], who: Participant, updates: u64, shutdown: &Shutdown) {
     let finished = Report {
         finished: Some(updates),
@@ -53,14 +52,14 @@ fn send_until_heard(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdow
     }
 }
 
-/// What `who` says of itself, and the last warning in the log of this process.
+/// Returns a report that `who` does `doing`, with the last warning in the log of this process.
 fn report(who: Participant, doing: &str, since: Duration) -> Report {
     let warning = last_warning::get();
     let warning = warning.map(|(text, age)| Warning::new(&text, age.as_secs_f64()));
     Report::new(who, doing, since.as_secs_f64(), warning)
 }
 
-/// Reports what `who` does to the replay servers of `clients`, until `shutdown` or the end of their sessions.
+/// Starts a thread that reports what `who` does to the replay servers of `clients`, until `shutdown` is set or all sessions are closed.
 pub fn start(
     clients: Vec<RunClient>,
     who: Participant,

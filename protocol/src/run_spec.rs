@@ -1,5 +1,5 @@
-//! What every process of one run must agree on, and its hash, which is in every message.
-//! It holds no setting that only one process uses.
+//! The values on which all processes of one run must agree, and their hash, which is in every message.
+//! Settings that only one process uses are not among them.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -9,10 +9,10 @@ use crate::{
     wire::codec,
 };
 
-/// Version of the fields below, for their hash. It is not the protocol's: messages may change while checkpoints stay good.
+/// Version of the fields of [`RunSpec`], for their hash. The protocol version may change while checkpoints stay valid.
 const FIELDS: u16 = 1;
 
-/// Most positives a row can carry; a rule that asks for more is refused.
+/// Most positives that a row can carry; a rule that needs more is rejected.
 const POSITIVES_MAX: usize = 32;
 
 /// Most frames that make one state.
@@ -22,9 +22,9 @@ pub const FRAME_STACK_MAX: u32 = 16;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Horizon {
-    /// No positive is served: the agent looks at no later state. Serde lets a variant without a list of fields have any.
+    /// No positive is served: the agent uses no later state. The braces make serde reject unknown fields, which a unit variant accepts.
     None {},
-    /// k, or the steps left in the episode if fewer.
+    /// Always k, or the steps left in the episode if these are fewer.
     Fixed {
         /// Environment steps ahead, at least 1.
         k: u32,
@@ -47,7 +47,7 @@ pub enum Horizon {
 }
 
 impl Horizon {
-    /// Positives a row carries: frames s_{t+k} served beside s_t.
+    /// Number of positives in a row: states s_{t+k} served beside s_t.
     pub const fn positives(&self) -> usize {
         match self {
             Self::None {} => 0,
@@ -56,7 +56,7 @@ impl Horizon {
         }
     }
 
-    /// The largest k that can be served, environment steps; 0 where none is.
+    /// The largest k that can be served, environment steps; 0 if no positive is served.
     pub const fn k_max(&self) -> u32 {
         match *self {
             Self::None {} => 0,
@@ -70,35 +70,35 @@ impl Horizon {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimeoutRule {
-    /// As the end of the episode: nothing follows (the paper).
+    /// A time-out ends the return as a terminal step does (the paper).
     Terminal,
-    /// Bootstrap from the last frame before it, over the fewer steps that remain.
+    /// The return bootstraps from the last frame before the time-out, over the fewer steps up to it.
     Bootstrap,
 }
 
-/// What every process of one run must agree on.
+/// The values on which all processes of one run must agree.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunSpec {
-    /// The world, as `--env` takes it.
+    /// The world, as given to `--env`.
     pub world: String,
-    /// The agent, as `--agent` takes it.
+    /// The agent, as given to `--agent`.
     pub agent: String,
-    /// The run's seed; every generator of every process is derived from it.
+    /// The run's seed, from which the generators of all processes are derived.
     pub seed: u64,
-    /// Rows of a frame as it travels: those of the world's that the network reads, from the top.
+    /// Rows of a frame as actors send it: those rows of the world's frame that the network reads, from the top.
     pub frame_height: u32,
-    /// Columns of a frame as it travels, from the left.
+    /// Columns of a frame as actors send it, from the left.
     pub frame_width: u32,
-    /// Bytes a pixel of a frame as the world gives it.
+    /// Bytes per pixel of a frame, as the world gives it.
     pub frame_channels: u32,
-    /// Frames that make one state, oldest first along the channels.
+    /// Number of frames in one state, oldest first along the channels.
     pub frame_stack: u32,
-    /// Actions of the world; valid ones are `0..num_actions`.
+    /// Number of the world's actions; valid ones are `0..num_actions`.
     pub num_actions: u32,
-    /// Environment steps in the return.
+    /// Number of environment steps in the return.
     pub n_step: u32,
-    /// Discount a step, 0 to 1.
+    /// Discount per step, 0 to 1.
     pub gamma: f64,
     /// The rule for k.
     pub horizon: Horizon,
@@ -107,7 +107,7 @@ pub struct RunSpec {
 }
 
 impl RunSpec {
-    /// Frames of one byte, two actions, returns of one step and no positives: for tests, benches and checks.
+    /// The smallest valid spec, for tests, benches and checks: frames of one byte, two actions, one-step returns, no positives.
     pub fn smallest() -> Self {
         Self {
             world: "counter".into(),
@@ -125,7 +125,7 @@ impl RunSpec {
         }
     }
 
-    /// Bytes of one frame as it travels: neither stacked nor enlarged.
+    /// Bytes of one frame as actors send it: neither stacked nor enlarged.
     pub const fn frame_bytes(&self) -> usize {
         self.frame_height as usize * self.frame_width as usize * self.frame_channels as usize
     }
@@ -143,7 +143,7 @@ impl RunSpec {
         u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
     }
 
-    /// The seed of one generator of one process: SHA-256 of the run's seed, the process's name and `index`.
+    /// The seed of one generator of one process: SHA-256 of the run's seed, `index` and the process's name.
     pub fn seed_for(&self, process: &str, index: u64) -> [u8; 32] {
         let mut hasher = Sha256::new();
         hasher.update(self.seed.to_le_bytes());

@@ -1,26 +1,26 @@
-//! By which rule the replay draws the rows of a batch: the menu, and what the learner has to know of it.
-//! How rows are drawn is the replay server's, how they are weighted the learner's.
+//! The rules by which the replay draws the rows of a batch, with the parameters that the learner needs.
+//! The replay server implements the drawing, the learner the weighting.
 
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check};
 
-/// By which rule the replay draws the rows of a batch: `replay.sampling`.
+/// The rule by which the replay draws the rows of a batch: the setting `replay.sampling`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampling {
-    /// Each transition that can be an anchor is equally likely. Serde lets a variant without a list of fields have any.
+    /// Each transition that can be an anchor is equally likely. The braces make serde reject unknown fields, which a unit variant accepts.
     Uniform {},
     /// By priority, the proportional rule of Schaul et al. 2016: P(i) = p_i^alpha / sum_j p_j^alpha, where p_i is the C51 loss of
-    /// transition i when it was learned from last. A row's loss is weighted by (N P(i))^-beta, over the batch's largest.
+    /// transition i at the last update that used it. A row's loss is weighted by (N P(i))^-beta, divided by the batch's largest weight.
     Prioritised {
         /// How much priorities count, 0 to 1: at 0 all rows are equally likely.
         alpha: f64,
-        /// beta at the first update, 0 to 1: at 1 weights undo the whole bias of the draw, at 0 nothing of it.
+        /// beta at the first update, 0 to 1: at 1 the weights remove the whole bias of the draw, at 0 none of it.
         beta_start: f64,
-        /// beta from `beta_updates` on, no less than `beta_start`, at most 1.
+        /// beta after `beta_updates` updates, `beta_start` to 1.
         beta_end: f64,
-        /// Updates over which beta rises, in a straight line.
+        /// Number of updates over which beta rises linearly.
         beta_updates: u64,
     },
 }
@@ -32,12 +32,12 @@ impl Default for Sampling {
 }
 
 impl Sampling {
-    /// Whether rows are drawn by priority: then batches say how likely each was, and the learner answers with priorities.
+    /// Whether rows are drawn by priority. Batches then carry the probability of each row, and the learner sends priorities back.
     pub const fn is_prioritised(&self) -> bool {
         matches!(self, Self::Prioritised { .. })
     }
 
-    /// beta at the update that follows `updates`.
+    /// Returns beta for the update that follows `updates` updates.
     pub fn beta(&self, updates: u64) -> f64 {
         match *self {
             Self::Uniform {} => 0.0,
@@ -53,7 +53,7 @@ impl Sampling {
         }
     }
 
-    /// Checks every number's range.
+    /// Checks the range of every parameter.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let Self::Prioritised {
             alpha,

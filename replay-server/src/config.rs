@@ -1,5 +1,5 @@
-//! What can be set about the replay server, and the checks that keep a run from stalling.
-//! It does not hold the rules of the return or of k: those are the run spec's, shared by every process.
+//! The settings of the replay server, and the checks that keep a run from stalling.
+//! The rules of the return and of k are not here: they are in the run spec, which every process shares.
 
 use driml_protocol::{
     BatchHeader, RunSpec, Sampling, TRANSITION_BYTES,
@@ -11,18 +11,18 @@ use serde::{Deserialize, Serialize};
 pub(crate) const SHARDS_MAX: u32 = 256;
 
 pub(crate) const SEGMENT_BYTES_MIN: u64 = 1 << 20;
-/// Most priorities of a shard on disk, 8 bytes each: a state holds all of them, and leaves a sixteenth for the rest.
+/// Maximum priorities (8 bytes each) of a shard on disk. A snapshot holds all of them and reserves a sixteenth for the rest.
 const PRIORITIES_MAX: u64 = VALUE_BYTES_MAX as u64 / 16 * 15 / 8;
 
-/// How frames are kept in memory. Batches are the same, bit for bit, whatever it is.
+/// How frames are stored in memory. Batches are bit for bit the same with each variant.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Compression {
-    /// As they came: the least work.
+    /// Uncompressed: the least work.
     #[default]
     None,
-    /// Consecutive frames of one stream together, by LZ4: a fifth of the memory or less on many Procgen games, not on all, and
-    /// more work a chunk and a batch.
+    /// LZ4 over consecutive frames of one stream: a fifth of the memory or less on many but not all Procgen games, and more work per
+    /// chunk and batch.
     Lz4,
 }
 
@@ -35,44 +35,44 @@ pub struct Config {
     /// Replay servers among which the capacity and the actors are spread; the learner draws from each in proportion to what it
     /// holds.
     pub shards: u32,
-    /// By which rule rows are drawn. Settings of earlier versions do not have it: uniformly.
+    /// The rule that draws rows. Settings of earlier versions lack this field and mean uniform sampling.
     #[serde(default)]
     pub sampling: Sampling,
-    /// How frames are kept in memory; batches do not depend on it.
+    /// How frames are stored in memory; batches do not depend on it.
     #[serde(default)]
     pub compression: Compression,
-    /// Bytes that compressed frames may take, beside at most 128 a transition: if they compress badly, the oldest are overwritten
-    /// before `capacity_transitions` are held. Without it they may take as much as uncompressed ones.
+    /// Maximum bytes of compressed frames, besides at most 128 bytes per transition. If frames compress badly, the oldest are overwritten
+    /// before `capacity_transitions` are held. Default: no limit; compressed frames take no more than uncompressed ones.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub compressed_bytes_max: Option<u64>,
     /// Rows sampled per transition inserted after the warm-up. More trains longer on each transition.
     pub replay_ratio: f64,
     /// Transitions stored before the replay ratio starts to count and the first row is sampled.
     pub warmup_transitions: u64,
-    /// New transitions stored before the first row is sampled when a run is resumed without its replay: no more than it had stored and
-    /// than `capacity_transitions`, no fewer than the warm-up. Settings of earlier versions do not have it: as many as the warm-up.
+    /// New transitions to store before the first row is sampled, if a run is resumed without its replay. At most the transitions that the
+    /// run had stored and `capacity_transitions`, at least the warm-up. Settings of earlier versions lack this field and mean the warm-up.
     #[serde(default)]
     pub refill_transitions: u64,
     /// Transitions that inserts may run ahead of sampling, after the warm-up, before they have to wait.
     pub slack_transitions: u64,
-    /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
+    /// Transitions of the whole run, warm-up included. Once that many are stored, the server accepts no more. `None`: no limit.
     pub transitions_max: Option<u64>,
-    /// Where the replay is kept on disk (`--replay-dir`, `--durable`): most bytes that all shards may take there. Beyond it the oldest
-    /// transitions go, from memory too, before `capacity_transitions` are held. Without it they take as much as uncompressed ones
-    /// in memory, and up to a segment more.
+    /// Maximum bytes of all shards on disk, if the replay is kept there (`--replay-dir`, `--durable`). Beyond the limit the oldest
+    /// transitions are removed, from memory too, before `capacity_transitions` are held. Default: as many bytes as uncompressed transitions
+    /// take in memory, and up to a segment more.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub disk_bytes_max: Option<u64>,
-    /// Where the replay is kept on disk: milliseconds after which what was written is flushed, so that it survives a power cut too;
-    /// the death of the process it always survives. 0 flushes before each answer. Without it 1,000.
+    /// Period in milliseconds between flushes, if the replay is kept on disk. Flushed data survives a power cut; written data always
+    /// survives the death of the process. 0 flushes before each reply. Default: 1,000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fsync_ms: Option<u64>,
-    /// The point from which `replay_ratio` holds, if it, the batch size or the warm-up was changed when the run was resumed and the
-    /// warm-up is over by then; without it the end of the warm-up.
+    /// The point from which `replay_ratio` holds. Set if a resume after the warm-up changed the ratio, the batch size or the warm-up.
+    /// Default: the end of the warm-up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub since: Option<Since>,
 }
 
-/// A point in a run: what was counted when it was resumed with other settings. `driml train --resume` writes it.
+/// The counts of a run when it was resumed with other settings. `driml train --resume` writes them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Since {
@@ -84,13 +84,13 @@ pub struct Since {
     pub updates: u64,
 }
 
-/// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
+/// Returns the environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
 pub(crate) fn reach(spec: &RunSpec) -> u32 {
     spec.n_step.max(spec.horizon.k_max())
 }
 
 impl Config {
-    /// The point from which `replay_ratio` holds.
+    /// Returns the point from which `replay_ratio` holds.
     pub fn ratio_start(&self) -> Since {
         let since = self.since.unwrap_or_default();
         let transitions = since.transitions.max(self.warmup_transitions);
@@ -100,7 +100,7 @@ impl Config {
         }
     }
 
-    /// One shard in memory, drawn from uniformly, in which neither side ever waits: for tests, benches and checks.
+    /// Returns settings for tests, benches and checks: one shard in memory, uniform sampling, and limits at which neither side ever waits.
     pub fn unlimited(capacity_transitions: u64) -> Self {
         Self {
             capacity_transitions,
@@ -119,8 +119,7 @@ impl Config {
         }
     }
 
-    /// Checks that nothing is set that needs a replay on disk, for one that is in memory alone; `to_keep_it` are the flags that would
-    /// change that.
+    /// Checks that no disk setting is given for a replay in memory. `to_keep_it` names the flags that would keep the replay on disk.
     pub fn check_in_memory(&self, to_keep_it: &str) -> Result<(), ConfigError> {
         for (key, set) in [
             ("replay.disk_bytes_max", self.disk_bytes_max),
@@ -135,7 +134,7 @@ impl Config {
         Ok(())
     }
 
-    /// Checks that the state of a shard can be written, for a replay that is kept on disk.
+    /// Checks that the snapshot of each shard fits the codec's limit, for a replay that is kept on disk.
     pub(crate) fn check_on_disk(&self) -> Result<(), ConfigError> {
         let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
         let is_prioritised = self.sampling.is_prioritised();
@@ -224,9 +223,9 @@ impl Config {
     }
 }
 
-/// Least disk budget of a replay: room for the transitions before the first batch, and for the segments that come and go.
+/// Returns the minimum disk budget: twice the transitions before the first batch, and four segments of minimum size per shard.
 fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
-    // A segment is four times as long as the state that it begins with, which has 8 bytes of each row that has a priority.
+    // A segment is at least four times as long as its snapshot, which has 8 bytes for each row with a priority.
     let of_states = 4 * 8 * u64::from(config.sampling.is_prioritised());
     let row_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64 + of_states;
     let warmup = config.warmup_transitions.saturating_mul(row_bytes);
@@ -234,9 +233,9 @@ fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
     warmup.saturating_mul(2).saturating_add(segments)
 }
 
-/// Most rows of one batch of this run, so that it stays below the codec's limit; larger requests are refused.
+/// Returns the maximum rows of a batch of this run, which keeps it below the codec's limit. Larger requests are rejected.
 pub(crate) fn rows_max(spec: &RunSpec, sampling: &Sampling) -> u32 {
-    // With each state whole: a receiver may make them so.
+    // Counts each state with its full frame stack, as a receiver may expand the states to that.
     let header = BatchHeader {
         stacked: None,
         ..BatchHeader::of(spec, 1)

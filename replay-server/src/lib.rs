@@ -1,12 +1,12 @@
-//! The replay server: keeps transitions exactly once, holds the replay ratio, and serves batches with k drawn as they are made.
-//! It knows bytes and integers, never tensors, and it does not know what a frame shows.
+//! The replay server stores each transition exactly once, enforces the replay ratio, and serves batches. It draws each k with the batch.
+//! It handles bytes and integers, never tensors, and does not interpret the content of a frame.
 //!
-//! Start at [`run`], a whole replay server process, or at [`Replay`], the same without network, clock and threads: chunks go in,
-//! batches come out. [`RateLimiter`] says which side has to wait, [`horizon`] how far ahead a positive lies.
+//! Start at [`run`], which runs a whole replay server process, or at [`Replay`], its core without network, clock and threads: chunks go in,
+//! batches come out. [`RateLimiter`] decides which side has to wait. [`horizon`] decides how far ahead the positive of a row lies.
 //!
-//! Which transitions are drawn is a setting, `replay.sampling`: each that can be an anchor equally likely, or in proportion to a power of
-//! the C51 loss that it had when it was learned from last. Then a batch says how likely each row was, the learner weights the row's loss
-//! by that, and [`Replay::set_priorities`] takes what it found. Of several shards each gives rows in proportion to what it holds.
+//! The setting `replay.sampling` draws anchors uniformly, or in proportion to a power of the C51 loss at their last update. In the second
+//! case a batch holds the probability of each row, by which the learner weights the loss, and [`Replay::set_priorities`] takes the new
+//! losses. Each of several shards contributes rows in proportion to the transitions that it holds.
 //!
 //! ```
 //! use driml_protocol::{ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec};

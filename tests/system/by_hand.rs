@@ -30,12 +30,18 @@ fn finds_each_other_and_ends_in_order(system: &TestSystem) {
     let run = system.run_folder("run");
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
-    learner.stop_ok().expect_said("finished after 540 updates");
+    learner
+        .stop()
+        .expect_code(0)
+        .expect_said("finished after 540 updates");
     // The learner's run folder can be evaluated like that of a launched run.
     system.run_ok("evaluate --run run --episodes 5");
+    // The learner stayed alive after the end of the run, so its stop does not make the run unfinished.
+    client.wait_for_replay("the end of the run", |it| it.learner_finished);
     drop(client);
     server
-        .stop_ok()
+        .stop()
+        .expect_code(0)
         .expect_said("stops with 1280 transitions stored");
     assert_eq!(system.survivors(), []);
 }
@@ -97,7 +103,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         client.wait_for_replay("both actors", |replay| replay.actors == 2);
         let ends = |process: Process, says: &str| {
             process.signal(signal);
-            process.wait_ok().expect_said(says)
+            process.wait().expect_code(130).expect_said(says)
         };
         for (id, actor) in (0..).zip(actors) {
             ends(actor, &format!("actor {id} leaves: "));

@@ -147,6 +147,10 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         .expect_said("--env \"exec:exec python3 ");
     let actor = |flags: &str| system.start_process(&system.connected(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");
+    // An actor whose world takes long to start stops at once.
+    let mut starting = actor("--id 2 --env 'exec:echo starts >&2; exec sleep 100'");
+    starting.wait_for_stderr("starts");
+    starting.stop().expect_code(130);
     // The same world by another command, as another machine may have it. This world will hang.
     let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
     let client = system.connect();

@@ -40,7 +40,7 @@ fn missing_processes_are_named_with_what_to_do() {
     server.wait_for_stderr("no actor has joined yet, waiting since");
 
     let actors = [system.start_actor(0), system.start_actor(5)];
-    let words = ["actor-0 ", "actor-5 ", "learns since", "nothing is missing"];
+    let words = ["actor-0 ", "actor-5 ", "learns (", "nothing is missing"];
     let said = wait_for_status(&system, &words);
     assert!(!said.contains("GONE"), "{said}");
 

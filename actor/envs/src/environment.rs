@@ -1,4 +1,4 @@
-//! What a world is: many environments, stepped together, written straight into the caller's buffers.
+//! The interface of a world: many environments, stepped together, that write straight into the caller's buffers.
 //! It does not stack, enlarge or convert frames, and it keeps no statistics; those live where they are used.
 
 use crate::error::EnvError;
@@ -10,12 +10,12 @@ pub struct FrameShape {
     pub height: usize,
     /// Columns.
     pub width: usize,
-    /// Bytes a pixel.
+    /// Bytes per pixel.
     pub channels: usize,
 }
 
 impl FrameShape {
-    /// As a shape [H, W, C] is written.
+    /// Creates the shape [H, W, C].
     pub const fn new(height: usize, width: usize, channels: usize) -> Self {
         Self {
             height,
@@ -61,7 +61,7 @@ pub trait Environment: Send {
     /// Number of environments, N.
     fn num_envs(&self) -> usize;
 
-    /// Writes the current frames [N, H, W, C]; the ones in which the next actions are taken.
+    /// Writes the current frames [N, H, W, C], in which the next actions are taken.
     fn observe(&mut self, frames: &mut [u8]);
 
     /// Takes `actions` [N] and writes what they earned, `rewards` [N], and what they ended, `ends` [N].
@@ -75,16 +75,16 @@ pub trait Environment: Send {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError>;
 
-    /// All environments' complete state, generators included: a world made with the same arguments that [`load`](Self::load)s it continues
-    /// exactly as this one does.
+    /// Returns the complete state of all environments, including their generators. A world made with the same arguments
+    /// continues exactly as this one does after it [`load`](Self::load)s the state.
     ///
     /// # Errors
-    /// [`EnvError::NotSaved`] where a world cannot do this, which is the default; a fault of the engine.
+    /// [`EnvError::NotSaved`] if the world cannot do this, which is the default; or a fault of the engine.
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
         Err(EnvError::not_saved())
     }
 
-    /// Takes the state that [`save`](Self::save) gave. That the bytes are undamaged, and of the same settings, is the caller's to check.
+    /// Restores a state from [`save`](Self::save). The caller must check that the bytes are undamaged and of the same settings.
     ///
     /// # Errors
     /// Bytes of another world or of another number of environments; the world must then not be used any more.

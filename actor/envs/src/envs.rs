@@ -1,5 +1,4 @@
-//! What every world of many environments shares: a generator for each environment, the check of a caller's step buffers, and how environments that are
-//! stepped one by one are a world.
+//! The code that worlds share: a generator per environment, checks of the caller's buffers, and worlds stepped one environment at a time.
 //! It holds no game rules.
 
 use rand::SeedableRng;
@@ -11,27 +10,27 @@ use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::WorldSettings;
 
-/// One environment of a world in which each is stepped by itself.
+/// One environment of a world whose environments are stepped one by one.
 pub trait Env: Send + Sized {
-    /// What all environments of a world have in common.
+    /// The settings that all environments of a world share.
     type Config: WorldSettings + Clone + Send;
 
-    /// All of an environment that does not follow from the settings.
+    /// The state of an environment that does not follow from the settings.
     type Saved: Serialize + DeserializeOwned;
 
-    /// Environment number `env` of a world with this seed, in its first frame; the settings are valid.
+    /// Creates environment number `env` of a world with this seed, at its first frame. The settings must be valid.
     fn new(config: &Self::Config, seed: u64, env: usize) -> Result<Self, EnvError>;
 
     /// Writes the current frame [H, W, C].
     fn draw(&self, config: &Self::Config, frame: &mut [u8]);
 
-    /// Takes an action, which the world has, and starts anew what it ended.
+    /// Takes a valid action and returns its reward and end. Resets the environment if its episode ended.
     fn act(&mut self, config: &Self::Config, action: u8) -> (f32, StepEnd);
 
-    /// What is saved of it.
+    /// Returns the state to save.
     fn saved(&self) -> Self::Saved;
 
-    /// Takes what was saved of another one.
+    /// Restores the state that another environment saved.
     fn restore(&mut self, config: &Self::Config, saved: Self::Saved) -> Result<(), EnvError>;
 }
 
@@ -42,10 +41,10 @@ pub struct Envs<E: Env> {
 }
 
 impl<E: Env> Envs<E> {
-    /// `num_envs` environments; environment i depends on (`seed`, i) and its actions only.
+    /// Creates `num_envs` environments; environment i depends on (`seed`, i) and its actions only.
     ///
     /// # Errors
-    /// Settings that cannot work, or no environment.
+    /// Invalid settings, or `num_envs` = 0.
     pub fn new(config: &E::Config, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;
@@ -105,7 +104,7 @@ impl<E: Env> Environment for Envs<E> {
     }
 }
 
-/// The argument of `Environment::observe` is as long as the frames of all environments.
+/// Checks that the argument of `Environment::observe` is as long as the frames of all environments.
 pub(crate) fn check_frames(frames: &[u8], num_envs: usize, shape: FrameShape) {
     assert_eq!(
         frames.len(),
@@ -114,7 +113,7 @@ pub(crate) fn check_frames(frames: &[u8], num_envs: usize, shape: FrameShape) {
     );
 }
 
-/// What an environment's generator is used for; each use has its own stream, so adding one leaves the others as they were.
+/// The use of an environment's generator. Each use has its own stream, so that a new use does not change the others.
 #[derive(Clone, Copy)]
 pub(crate) enum RngUse {
     /// The game's own chance moves.
@@ -123,7 +122,7 @@ pub(crate) enum RngUse {
     Overlay,
 }
 
-/// The generator of environment `env` in a world seeded with `seed`: ChaCha8 keyed by the seed, one stream an environment and use.
+/// Returns the generator of environment `env` in a world seeded with `seed`: ChaCha8 keyed by the seed, one stream per environment and use.
 pub(crate) fn env_rng(seed: u64, env: usize, used_for: RngUse) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(2 * env as u64 + used_for as u64);

@@ -1,11 +1,11 @@
-//! The newest few frames of each environment, as one image with more channels.
+//! Stacks the newest few frames of each environment into one image with more channels.
 //! It keeps no history beyond the stack, and it does not enlarge or convert pixels.
 
 use crate::environment::FrameShape;
 use crate::error::{EnvError, require};
 use crate::saved;
 
-/// Most frames in a stack; more are rejected.
+/// The most frames in a stack; more are rejected.
 const STACK_MAX: usize = 64;
 
 /// For each of N environments the newest `stack` frames, [N, H, W, C * stack].
@@ -35,7 +35,7 @@ impl FrameStack {
         })
     }
 
-    /// Takes the current `frames` [N, H, W, C]; `first` [N] says which are the first of an episode or level.
+    /// Adds the current `frames` [N, H, W, C]; `first` [N] says which are the first of an episode or level.
     ///
     /// # Panics
     /// If a slice has the wrong length: both come from the caller's own buffers.
@@ -79,7 +79,7 @@ impl FrameStack {
         &self.stacked
     }
 
-    /// Takes the stacked observations [N, H, W, C * stack] that another stack of these sizes had.
+    /// Restores the stacked observations [N, H, W, C * stack] of another stack of the same sizes.
     pub fn load(&mut self, stacked: &[u8]) -> Result<(), EnvError> {
         saved::check(stacked.len() == self.stacked.len(), "a stack of frames")?;
         self.stacked.copy_from_slice(stacked);

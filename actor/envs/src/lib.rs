@@ -1,4 +1,4 @@
-//! The worlds: no network, no tensors, deterministic from a seed.
+//! The worlds in which agents act: deterministic from a seed, without a network connection or tensors.
 //! Stepping policies, recording and statistics live in `driml-actor`.
 //!
 //! Every world is N environments behind one trait, [`Environment`]: `observe` writes the current frames,
@@ -13,14 +13,13 @@
 //! | `exec:COMMAND` | as it declares | as it declares | your own world, in its own process |
 //! | `libenv:PATH:GAME` | 64 x 64 x 3 | 15 | one of Procgen's games by another build of its library |
 //!
-//! [`WorldConfig`] holds the settings of any of them (`kind` says which) and builds it, and [`WorldName`] reads the names
-//! above from a command line. [`FrameStack`] stacks frames without crossing the end of an episode.
-//!
-//! [`RestrictedWorld`] is one with fewer actions and smaller frames.
+//! [`WorldConfig`] holds the settings of any of these worlds (`kind` says which) and builds the world. [`WorldName`]
+//! reads the names above from a command line. [`FrameStack`] stacks frames without crossing the end of an episode.
+//! [`RestrictedWorld`] gives a world fewer actions and smaller frames.
 //!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
 //! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`],
-//! and the world itself, which implements [`Environment`] (or `Env`, for one of its environments, if they are stepped one by one);
+//! and the world itself, which implements [`Environment`] (or, if its environments are stepped one by one, `Env` for one of them);
 //! then give it a line in `registry.rs`.
 //!
 //! ```

@@ -1,4 +1,4 @@
-//! How tests play a world, and what they ask of an error.
+//! Helpers for tests: playing a world, and checking the text of an error.
 
 use std::fmt::Display;
 
@@ -7,14 +7,14 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::environment::{Environment, StepEnd};
 
-/// The current frames [N, H, W, C].
+/// Returns the current frames [N, H, W, C].
 pub(crate) fn frames(world: &mut dyn Environment) -> Vec<u8> {
     let mut frames = vec![0; world.num_envs() * world.frame_shape().bytes()];
     world.observe(&mut frames);
     frames
 }
 
-/// The rewards [N] and ends [N] of a step.
+/// Steps the world and returns the rewards [N] and ends [N].
 pub(crate) fn step(world: &mut dyn Environment, actions: &[u8]) -> (Vec<f32>, Vec<StepEnd>) {
     let num_envs = world.num_envs();
     let (mut rewards, mut ends) = (vec![0.0; num_envs], vec![StepEnd::Running; num_envs]);
@@ -22,7 +22,7 @@ pub(crate) fn step(world: &mut dyn Environment, actions: &[u8]) -> (Vec<f32>, Ve
     (rewards, ends)
 }
 
-/// Takes so many steps of actions drawn from `rng`: of each the frames in which it was taken, its rewards and its ends.
+/// Takes `steps` steps with actions drawn from `rng`. Returns for each step the frames before it, its rewards and its ends.
 pub(crate) fn play(
     world: &mut dyn Environment,
     steps: usize,
@@ -40,7 +40,7 @@ pub(crate) fn play(
     seen
 }
 
-/// The text of an error, which has all of these sentences.
+/// Checks that the result is an error whose text contains all `sentences`, and returns the text.
 #[track_caller]
 pub(crate) fn fails<T, E: Display>(result: Result<T, E>, sentences: &[&str]) -> String {
     let text = result.err().expect("an error").to_string();

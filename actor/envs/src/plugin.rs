@@ -1,5 +1,5 @@
-//! Worlds that a program adds to those of this crate, before anything else is done; they are known by name from then on.
-//! They come from the same program that starts every process, so that all processes know them.
+//! Worlds that a program adds to those of this crate. It registers them before anything else; from then on their names are known.
+//! The same program starts every process of a run, so that all processes know these worlds.
 
 use std::fmt;
 use std::sync::{Arc, OnceLock};
@@ -10,7 +10,7 @@ use toml::Table;
 
 use crate::settings::WorldSettings;
 
-/// Settings of any world, shared by those who read them.
+/// The settings of any world, behind a shared pointer.
 type Settings = Arc<dyn WorldSettings + Send + Sync>;
 
 /// A kind of world that a program adds.
@@ -24,11 +24,11 @@ pub struct CustomKind {
 static CUSTOM: OnceLock<Vec<CustomKind>> = OnceLock::new();
 
 impl CustomKind {
-    /// The world of this name: `--env NAME` trains in it, and `kind = "NAME"` in settings is read as an `S`.
+    /// Creates a kind of world: `--env NAME` trains in it, and the settings of `kind = "NAME"` are read as an `S`.
     ///
     /// `preset` is the world's layer of settings, TOML as in `deploy/settings/presets/world/`: at least `run.frame_stack`,
-    /// `input.height`, `input.width` and the table `[world]` with the fields of `S`. A name that this crate's worlds have stays
-    /// theirs, and of two of one name the first one counts.
+    /// `input.height`, `input.width` and the table `[world]` with the fields of `S`. A name of one of this crate's
+    /// worlds keeps its meaning. If two kinds have the same name, the first counts.
     pub fn of<S>(name: &'static str, preset: &'static str) -> Self
     where
         S: WorldSettings + DeserializeOwned + Send + Sync + 'static,
@@ -41,7 +41,7 @@ impl CustomKind {
     }
 }
 
-/// Makes these worlds known.
+/// Registers these worlds.
 ///
 /// # Panics
 /// If it was called before.
@@ -54,31 +54,31 @@ fn custom() -> &'static [CustomKind] {
     CUSTOM.get().map_or(&[], Vec::as_slice)
 }
 
-/// The names of all worlds that were registered.
+/// The names of all registered worlds.
 pub(crate) fn kinds() -> impl Iterator<Item = &'static str> {
     custom().iter().map(|kind| kind.name)
 }
 
-/// The layer of settings of a registered world.
+/// Returns the layer of settings (TOML) of a registered world.
 pub fn preset(name: &str) -> Option<&'static str> {
     let kind = custom().iter().find(|kind| kind.name == name);
     kind.map(|kind| kind.preset)
 }
 
-/// The settings of a world that a program added: as they were read, and what its code made of them.
+/// The settings of a registered world: the table as read, and the world's settings made from it.
 #[derive(Clone, Serialize)]
 #[serde(transparent)]
 pub struct CustomWorld {
     #[serde(skip)]
     kind: &'static str,
-    /// With `kind`, so that they are written as they were read.
+    /// The table, with `kind`, so that the settings are written as they were read.
     table: Table,
     #[serde(skip)]
     settings: Settings,
 }
 
 impl CustomWorld {
-    /// Reads the settings of a registered world: its `fields`, and the `table` of them and its `kind`. `None` if that is not registered.
+    /// Reads the settings of a registered world. `table` holds `kind` and the `fields`. Returns `None` if `kind` is not registered.
     pub(crate) fn read(
         kind: &str,
         fields: Table,

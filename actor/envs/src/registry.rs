@@ -1,6 +1,6 @@
-//! The worlds there are, and their names on a command line. A new world is a line in `worlds!` and a file in `worlds/`; one that a
-//! program adds without a change here is `plugin`'s.
-//! It holds no numbers: each world's settings are described beside that world.
+//! The registry of worlds, and their names on a command line. A new world is a line in `worlds!` and a file in `worlds/`.
+//! `plugin` adds the worlds that a program registers without a change here.
+//! The registry holds no numbers: each world's settings are described beside that world.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -22,23 +22,23 @@ use crate::worlds::ising::IsingConfig;
 use crate::worlds::pacman::PacmanConfig;
 use crate::worlds::procgen::ProcgenConfig;
 
-/// Makes [`WorldConfig`] and the list of kinds from one line a world.
+/// Makes [`WorldConfig`] and the list of kinds from one line per world.
 macro_rules! worlds {
     ($($(#[$doc:meta])* $kind:literal $World:ident($Settings:ty);)+) => {
-        /// The settings of one world; `kind` in the file says of which.
+        /// The settings of one world; `kind` in the file says which world.
         #[derive(Clone, Debug, PartialEq, Serialize)]
         #[serde(tag = "kind")]
         pub enum WorldConfig {
             $($(#[$doc])* #[serde(rename = $kind)] $World($Settings),)+
-            /// One that the program added.
+            /// A world that the program registered.
             #[serde(untagged)]
             Own(CustomWorld),
         }
 
-        /// What a file calls each world of this crate.
+        /// The `kind` of each world of this crate in a settings file.
         const NAMES: &[&str] = &[$($kind),+];
 
-        /// Every world of this crate: its name, and which variants of it are worlds of their own.
+        /// Every world of this crate: its kind, and a function that returns its variants.
         const KINDS: &[(&str, fn() -> Variants)] = &[$(($kind, <$Settings>::variants)),+];
 
         impl WorldConfig {
@@ -49,7 +49,7 @@ macro_rules! worlds {
                 }
             }
 
-            /// Reads the settings of this crate's world `kind`; `None` if it has none of that name.
+            /// Reads the settings of this crate's world `kind`; `None` if the crate has no such world.
             fn ours(kind: &str, fields: &Table) -> Option<Result<Self, toml::de::Error>> {
                 match kind {
                     $($kind => Some(fields.clone().try_into().map(Self::$World)),)+
@@ -73,10 +73,10 @@ worlds! {
     "exec" Exec(ExecConfig);
 }
 
-/// What `libenv:PATH:GAME` begins with: one of Procgen's games, by another build of its library.
+/// The prefix of `libenv:PATH:GAME`: one of Procgen's games, run by another build of its library.
 const LIBENV: &str = "libenv";
 
-/// The kind whose games other libraries may have.
+/// The kind of world whose games `libenv:PATH:GAME` names.
 const LIBENV_KIND: &str = "procgen";
 
 impl<'de> Deserialize<'de> for WorldConfig {
@@ -107,12 +107,12 @@ impl WorldConfig {
         }
     }
 
-    /// Number of the world's actions; valid ones are below it.
+    /// The number of the world's actions; valid actions are `0..num_actions`.
     pub fn num_actions(&self) -> usize {
         self.action_names().len()
     }
 
-    /// The actions of `set`, in their order: each is a place in [`action_names`](WorldSettings::action_names).
+    /// Returns the actions of `set`, ascending; each is an index into [`action_names`](WorldSettings::action_names).
     pub fn actions(&self, set: ActionSet) -> Vec<u8> {
         let mut actions = match set {
             ActionSet::All => (0..self.num_actions()).map(|action| action as u8).collect(),
@@ -123,10 +123,10 @@ impl WorldConfig {
         actions
     }
 
-    /// The same world with other levels.
+    /// Returns the same world with other levels.
     ///
     /// # Errors
-    /// A world without levels, or without unseen ones; says what to ask for.
+    /// The world has no levels, or no unseen ones; the message says what to use instead.
     pub fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
         match self {
             Self::Procgen(config) => config.with_levels(levels).map(Self::Procgen),
@@ -138,7 +138,7 @@ impl WorldConfig {
         }
     }
 
-    /// The first setting that makes `other`, a world of this name, another task than this one: any but a time limit.
+    /// Returns the first setting that differs in `other`, a world of the same name. Time-outs do not count: they do not change the task.
     pub fn first_difference(&self, other: &Self) -> Option<String> {
         let table = |it| Table::try_from(it).expect("settings are read from TOML");
         let (before, after) = (table(self), table(other));
@@ -148,8 +148,8 @@ impl WorldConfig {
         keys.find(differs).cloned()
     }
 
-    /// The same world by the code that `name` has, where its own code is a person's: a command, or a library. A machine may have them
-    /// elsewhere than the one on which the run was made.
+    /// Returns the same world with the command or the library of `name`, if the world has code outside this program.
+    /// This machine may have that code in another place than the machine on which the run was made.
     pub fn with_code_of(&self, name: WorldName) -> Result<Self, EnvError> {
         let mut changed = self.clone();
         match &mut changed {
@@ -167,7 +167,7 @@ impl WorldConfig {
     }
 }
 
-/// What a run must know of the world, and how it is built, are those of its settings.
+/// Gives access to the world's [`WorldSettings`]: what a run must know of the world, and how to build it.
 impl Deref for WorldConfig {
     type Target = dyn WorldSettings;
 
@@ -176,16 +176,16 @@ impl Deref for WorldConfig {
     }
 }
 
-/// A world's name on a command line: its kind, and its variant after a colon if it has any. It says nothing of settings.
+/// A world's name on a command line: its kind and, after a colon, its variant if it has one. Other settings are not part of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct WorldName {
     kind: &'static str,
     variant: Option<&'static str>,
-    /// The library that is loaded instead of the world's own.
+    /// The path of the library that is loaded instead of the world's own.
     library: Option<&'static str>,
 }
 
-/// A text of a person's own, kept until the process ends: a run has one or two, and names stay small and easy to hand around.
+/// Leaks a text that the user chose, so that [`WorldName`] is small and `Copy`. A run has one or two such texts; equal ones are shared.
 fn kept(text: &str) -> &'static str {
     static KEPT: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
     let mut all = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
@@ -198,8 +198,7 @@ fn kept(text: &str) -> &'static str {
 }
 
 impl WorldName {
-    /// Every name there is: each of Procgen's games, then the others, then those that the program added. Names that are a person's
-    /// own, such as a command, are not among them.
+    /// All names without a text that the user chooses: each of Procgen's games, then the other worlds, then the registered ones.
     pub fn all() -> impl Iterator<Item = WorldName> {
         let ours = KINDS.iter().flat_map(|(kind, variants)| {
             let Variants { names, is_open, .. } = variants();
@@ -218,7 +217,7 @@ impl WorldName {
         }
     }
 
-    /// A name with something of a person's own in it, such as a command.
+    /// Reads a name with a text that the user chooses, such as a command or the path of a library.
     fn open(text: &str) -> Option<Self> {
         let (first, rest) = text.split_once(':')?;
         if first == LIBENV {
@@ -235,12 +234,12 @@ impl WorldName {
         (!rest.trim().is_empty()).then(|| Self::of(kind, Some(kept(rest))))
     }
 
-    /// The command that makes the world, if it runs in its own process.
+    /// The command that starts the world, if the world runs in its own process.
     pub fn command(self) -> Option<&'static str> {
         self.variant.filter(|_| self.variants().is_open)
     }
 
-    /// What distinguishes worlds of its kind.
+    /// The variants of the world's kind.
     fn variants(self) -> Variants {
         let known = KINDS.iter().find(|(kind, _)| *kind == self.kind);
         known.map(|(_, variants)| variants()).unwrap_or_default()
@@ -251,7 +250,7 @@ impl WorldName {
         self.command().or(self.library)
     }
 
-    /// The same world by the engine that belongs to it: what holds of it holds of other builds too.
+    /// Returns the same world with its own engine: what is known of it also holds for other builds.
     pub const fn with_own_library(self) -> Self {
         Self {
             library: None,
@@ -259,17 +258,17 @@ impl WorldName {
         }
     }
 
-    /// The library that is loaded instead of the world's own, by its path.
+    /// The path of the library that is loaded instead of the world's own, if any.
     pub const fn library(self) -> Option<&'static str> {
         self.library
     }
 
-    /// What a file's `kind` calls the world.
+    /// The world's `kind` in a settings file.
     pub const fn kind(self) -> &'static str {
         self.kind
     }
 
-    /// The settings and their values that say which of several worlds of one kind it is.
+    /// The settings, with their values, that select this world among those of its kind.
     pub fn settings(self) -> impl Iterator<Item = (&'static str, &'static str)> {
         let variant = self.variant.map(|name| (self.variants().key, name));
         let library = self.library.map(|path| ("library", path));
@@ -300,7 +299,7 @@ impl FromStr for WorldName {
     }
 }
 
-/// A text that names no world. Lists those that there are, and suggests the nearest if one is near.
+/// The error for a text that names no world. The message lists all worlds and suggests the nearest if one is near.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WorldNameError {
     text: String,
@@ -347,7 +346,7 @@ impl fmt::Display for WorldNameError {
 
 impl std::error::Error for WorldNameError {}
 
-/// Whether a name is made as Gymnasium's are: `ALE/Pong-v5`, `CartPole-v1`.
+/// Whether a name has the form of Gymnasium's names: `ALE/Pong-v5`, `CartPole-v1`.
 fn is_gymnasium_name(text: &str) -> bool {
     let version = text.rsplit_once("-v").map(|(_, version)| version);
     let has_version =
@@ -355,9 +354,9 @@ fn is_gymnasium_name(text: &str) -> bool {
     !text.contains(':') && (has_version || text.contains('/'))
 }
 
-/// The world whose name is at most 3 edits, and a third of the letters, from `text`; a variant may be named without its kind.
+/// Returns the world whose name is nearest to `text`: at most 3 edits, and a third of its letters, away. `text` may lack the kind.
 fn nearest(text: &str) -> Option<WorldName> {
-    // A name is short: no use in comparing letter by letter with a text that is not.
+    // Names are short: a long text cannot be near one.
     if text.chars().count() > 40 {
         return None;
     }
@@ -370,7 +369,7 @@ fn nearest(text: &str) -> Option<WorldName> {
         })
     };
     let name = WorldName::all().min_by_key(|&name| distance(name))?;
-    // All of a short name may be other letters: pong is not ising.
+    // Three edits may replace most of a short name: pong is not ising.
     let most = (text.chars().count() / 3).min(3);
     (distance(name) <= most).then_some(name)
 }

@@ -1,6 +1,5 @@
-//! A part of a world: some of its actions, and frames that are cut at the right and at the bottom: where nothing reads those borders,
-//! nothing keeps or sends them.
-//! Which actions do the same is for each world to say, and who reads what of a frame for the caller.
+//! A world restricted to some of its actions, and to frames without the right and bottom borders that no layer reads.
+//! Those borders are neither kept nor sent. Each world says which actions do the same; the caller says which part of a frame is read.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,32 +7,32 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::check_frames;
 use crate::error::{EnvError, require};
 
-/// Which of a world's actions an agent chooses among.
+/// The set of a world's actions among which an agent chooses.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ActionSet {
-    /// All that the world takes.
+    /// All of the world's actions.
     #[default]
     All,
-    /// One of those that do the same in this world. Chance and the network choose among fewer then, so neither what is explored nor
-    /// what is learned is the same.
+    /// One action of each group that does the same in this world. Exploration and the network then choose among fewer
+    /// actions, so both the exploration and the learning differ.
     Visible,
 }
 
-/// Another world, with some of its actions, numbered without gaps, and the upper left part of its frames.
+/// A world with some of another world's actions, numbered without gaps, and the upper left part of its frames.
 pub struct RestrictedWorld {
     world: Box<dyn Environment>,
     actions: Vec<u8>,
-    /// The world's actions of the step in progress [N].
+    /// The actions of the step in progress [N], as `world` numbers them.
     step: Vec<u8>,
     whole: FrameShape,
     shape: FrameShape,
-    /// Whole frames of all environments: memory to use again.
+    /// Whole frames of all environments: a reused buffer.
     frames: Vec<u8>,
 }
 
 impl RestrictedWorld {
-    /// `world` with a subset `actions` of its actions and frames of (height, width); unchanged where these are all that it has.
+    /// Restricts `world` to `actions` and to frames of (height, width). Returns `world` unchanged if these are all it has.
     ///
     /// # Errors
     /// No action, or one that the world does not have; frames larger than the world's, or without a pixel.

@@ -1,5 +1,5 @@
-//! The bytes in which a world keeps its state, and what is checked when they come back.
-//! What is in them is each world's own; where they are kept, and that they are undamaged there, is their keeper's.
+//! Encodes the state of a world as bytes, and checks the bytes when they are read back.
+//! Each world decides what its state holds. The caller stores the bytes and makes sure that they are undamaged.
 
 use serde::{Serialize, de::DeserializeOwned};
 
@@ -8,7 +8,7 @@ use crate::error::EnvError;
 /// Longest state of a world, bytes.
 const STATE_BYTES_MAX: usize = 1 << 28;
 
-/// The bytes of a world's state, which cannot be saved where they are more than are read back.
+/// Encodes a world's state. Returns [`EnvError::NotSaved`] if the bytes are more than [`decode`] reads.
 pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
     let bytes = bincode::serde::encode_to_vec(state, bincode::config::standard())
         .map_err(|e| EnvError::State(e.to_string()))?;
@@ -20,7 +20,7 @@ pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
     }
 }
 
-/// The state that [`encode`] wrote.
+/// Decodes a state that [`encode`] wrote.
 pub(crate) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
     let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
     let (state, used) = bincode::serde::decode_from_slice(bytes, config)
@@ -31,7 +31,7 @@ pub(crate) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
     }
 }
 
-/// An error unless a state is of as many environments as this world has.
+/// Returns an error unless a state has as many environments as this world.
 pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvError> {
     if found == num_envs {
         return Ok(());
@@ -41,7 +41,7 @@ pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvEr
     )))
 }
 
-/// An error unless `holds`: a state that this world cannot be in.
+/// Returns an error unless `holds`; `what` names the part of the state that does not fit the settings.
 pub(crate) fn check(holds: bool, what: &str) -> Result<(), EnvError> {
     let wrong = || EnvError::State(format!("{what} is none of these settings"));
     holds.then_some(()).ok_or_else(wrong)
@@ -60,8 +60,8 @@ pub(crate) mod tests {
     /// Environments of each world here.
     const ENVS: usize = 3;
 
-    /// Checks that another world made by `make` continues as the first did, also when that one has been stepped meanwhile. Gives the
-    /// number of ends since it was saved.
+    /// Checks that a second world from `make`, stepped before, continues as the first after it loads the first's state.
+    /// Returns the number of ends since the state was saved.
     pub(crate) fn continues(
         name: &str,
         steps: usize,
@@ -77,7 +77,7 @@ pub(crate) mod tests {
         let ended = ends.filter(|&&end| end != StepEnd::Running).count();
         assert_ne!(world.save().unwrap(), state, "{name}");
         let mut other = make();
-        // The state holds all: what the other one did before does not matter.
+        // The state is complete: earlier steps of the second world do not matter.
         play(&mut *other, 5, &mut rng);
         other.load(&state).unwrap();
         assert_eq!(other.save().unwrap(), state, "{name}");

@@ -1,5 +1,5 @@
-//! The cache folder: where it is, as the environment says, and whether other users can change what lies in it.
-//! It makes nothing; `install` does. `deploy/cuda/build.sh` follows the same rule for the folder.
+//! The cache folder: finds it by the environment variables, and checks that other users cannot change what lies in it.
+//! It creates nothing; `install` does. `deploy/cuda/build.sh` follows the same rule for the folder.
 
 use std::ffi::OsString;
 use std::fs;
@@ -20,7 +20,7 @@ pub(crate) struct Cache {
 }
 
 impl Cache {
-    /// As this process's environment says.
+    /// Reads the environment variables of this process.
     pub(crate) fn from_env() -> Result<Cache, ProcgenError> {
         Cache::from_variables(|name| std::env::var_os(name))
     }
@@ -41,8 +41,7 @@ impl Cache {
     }
 }
 
-/// Checks that only this user and root can change the file or folder, as the engine is code that runs as this user. One that is not
-/// there passes.
+/// Checks that only this user and root can change the file or folder, as the engine runs as this user. A missing path passes.
 pub(crate) fn check_private(path: &Path) -> Result<(), ProcgenError> {
     let Ok(data) = fs::metadata(path) else {
         return Ok(());

@@ -4,14 +4,14 @@ use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// What every error about the engine ends with: a world that works without it.
+/// The end of every error about the engine: names a world that works without the engine.
 pub(crate) const WITHOUT_ENGINE: &str = "(`--env mspacman` is the world that needs no engine)";
 
-/// Why the engine is not there, could not be put there, made or driven.
+/// Why the engine could not be found, installed, loaded or used.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum ProcgenError {
-    /// The engine is not installed, or something of it is gone; and how to get it, with and without a network.
+    /// The engine is not installed, or is incomplete. The message says how to get it, with and without a network.
     #[error(
         "procgen's engine in {}: {reason}; run with network access and without DRIML_OFFLINE, or fetch the wheel where there is a network \
          with `{}` and put it into {} {WITHOUT_ENGINE}",
@@ -42,10 +42,10 @@ pub enum ProcgenError {
     /// The library is missing, or the loader rejects it.
     #[error("loading procgen's engine from {0} {WITHOUT_ENGINE}")]
     Library(String),
-    /// The engine would end the process with these settings; what to do instead.
+    /// The engine would end the process with these settings. The message says what to do instead.
     #[error("procgen settings: {0}")]
     Options(String),
-    /// An action, or their number, is not one the engine takes.
+    /// An action is out of range, or the number of actions is wrong.
     #[error("stepping procgen: {0}")]
     Action(String),
     /// A state belongs to another game, or an environment's number is out of range.
@@ -61,7 +61,7 @@ impl ProcgenError {
         ProcgenError::Library(format!("{}: {reason}", path.display()))
     }
 
-    /// Adds to an error of the file system what was being done, and with which file.
+    /// Adds to an error of the file system the operation and the path.
     pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ProcgenError {
         let path = path.to_owned();
         move |source| ProcgenError::Io {

@@ -1,5 +1,5 @@
 //! The engine's C interface (libenv version 1), type for type.
-//! Nothing here is safe to use by itself; `vec_game` is where the rules of the calls are kept.
+//! Nothing here is safe to use by itself; `vec_game` keeps the rules of the calls.
 //!
 //! Source: `gym3/libenv.h` of gym3 0.3.3 and `procgen/src/vecgame.cpp` of procgen 0.10.7.
 
@@ -26,7 +26,7 @@ pub(crate) struct LibenvTensortype {
     pub(crate) dtype: u32,
     pub(crate) shape: [i32; DIMENSIONS_MAX],
     pub(crate) ndim: i32,
-    /// The bounds of its values, unions of which `dtype` says the type; nothing here reads them.
+    /// The bounds of the values: unions of the type that `dtype` names; nothing here reads them.
     pub(crate) low: u32,
     pub(crate) high: u32,
 }
@@ -47,7 +47,7 @@ pub(crate) struct LibenvOptions {
     pub(crate) count: i32,
 }
 
-/// Where the engine reads and writes. Pointer arrays are indexed by `tensor * num_envs + env`.
+/// The buffers that the engine reads and writes. Pointer arrays are indexed by `tensor * num_envs + env`.
 #[repr(C)]
 pub(crate) struct LibenvBuffers {
     pub(crate) ob: *mut *mut c_void,
@@ -111,7 +111,7 @@ impl LibenvTensortype {
         }
     }
 
-    /// What distinguishes it from others, as [`describe`] has it.
+    /// Returns the tensor's name, dtype and shape in the form of [`describe`].
     pub(crate) fn describe(&self) -> String {
         let bytes: Vec<u8> = self.name.iter().map(|&byte| byte as u8).collect();
         let name = bytes.split(|&byte| byte == 0).next().unwrap_or_default();
@@ -124,7 +124,7 @@ impl LibenvTensortype {
     }
 }
 
-/// Name, dtype and shape of a tensor in one line.
+/// Returns the name, dtype and shape of a tensor in one line.
 pub(crate) fn describe(name: &str, dtype: u32, shape: &[i32]) -> String {
     format!("{name} (dtype {dtype}) {shape:?}")
 }

@@ -5,7 +5,7 @@ use std::fmt;
 
 use DistributionMode::{Easy, Extreme, Hard, Memory};
 
-/// Makes [`Game`] of a line a game: its name, its steps of an episode at most, and its modes beside easy and hard.
+/// Makes [`Game`] from one line per game: its name, the most steps of an episode, and its modes besides easy and hard.
 macro_rules! games {
     ($($Game:ident $name:literal $limit:literal [$($mode:ident)*];)+) => {
         /// One of Procgen's games.
@@ -20,7 +20,7 @@ macro_rules! games {
             /// Every game, by name.
             pub const ALL: [Game; 16] = [$(Game::$Game),+];
 
-            /// Their names, in the same order.
+            /// The names of all games, in the same order.
             pub const NAMES: [&str; Game::ALL.len()] = [$($name),+];
 
             /// Steps after which the engine ends an episode; the step with this number is the last.
@@ -33,7 +33,7 @@ macro_rules! games {
                 }
             }
 
-            /// Whether the game has this difficulty; the engine ends the process where it has not.
+            /// Whether the game has this difficulty; the engine ends the process if not.
             pub const fn has(self, mode: DistributionMode) -> bool {
                 match self {
                     $(Game::$Game => matches!(mode, Easy | Hard $(| $mode)*),)+
@@ -75,7 +75,7 @@ impl fmt::Display for Game {
     }
 }
 
-/// How hard the levels are, and of which kind; numbered as the engine does.
+/// The difficulty and the kind of the levels, numbered as in the engine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DistributionMode {
@@ -83,9 +83,9 @@ pub enum DistributionMode {
     Easy = 0,
     /// The engine's standard levels; every game has it.
     Hard = 1,
-    /// Harder ones: chaser, dodgeball, leaper and starpilot only.
+    /// Harder levels: chaser, dodgeball, leaper and starpilot only.
     Extreme = 2,
-    /// Larger ones of which little is seen at once: caveflyer, dodgeball, heist, jumper, maze and miner only.
+    /// Larger levels of which little is seen at once: caveflyer, dodgeball, heist, jumper, maze and miner only.
     Memory = 10,
 }
 

@@ -1,8 +1,8 @@
-//! Puts the engine into the cache folder and finds it there.
-//! It does not load it, and fetches nothing with `DRIML_OFFLINE=1`.
+//! Installs the engine in the cache folder and finds it there.
+//! It does not load the engine, and fetches nothing with `DRIML_OFFLINE=1`.
 //!
-//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE}`. The folder is made beside its place, checked and renamed into it, one
-//! process at a time: so it is there whole or not at all, and all processes that race succeed.
+//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE}`. One process at a time makes the folder
+//! beside its place, checks it and renames it: so the folder is complete or missing, and all processes that race succeed.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use crate::wheel::{self, LIBRARY_SHA256, WHEEL_NAME, WHEEL_SHA256};
 /// The Python whose pip fetches and unpacks the engine.
 const PYTHON: &str = "python3";
 
-/// How long to wait for another process that installs; then this one does it too.
+/// How long to wait for another process that installs; then this process installs too.
 const WAIT_MAX: Duration = Duration::from_secs(120);
 
 /// The unpacked engine.
@@ -27,15 +27,15 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// The engine in the cache folder.
+    /// Finds the engine in the cache folder.
     ///
     /// # Errors
-    /// Not installed, something is gone, others can change it, or a machine that cannot run it.
+    /// The engine is not installed or is incomplete, other users can change it, or this machine cannot run it.
     pub fn locate() -> Result<Engine, ProcgenError> {
         Engine::locate_in(&Cache::from_env()?)
     }
 
-    /// The engine in the cache folder; fetched with pip if it is not there.
+    /// Returns the engine in the cache folder, and fetches it with pip if it is not there.
     ///
     /// A wheel that already lies in the cache folder under its published name is used instead of fetching.
     /// `progress` gets a line for each step; none if the engine is installed.
@@ -48,7 +48,7 @@ impl Engine {
         Engine::install_in(&cache, LIBRARY_SHA256, progress, unpack)
     }
 
-    /// From where [`Engine::install`] would take the engine, for a person. Nothing is fetched or looked at more closely.
+    /// Describes, for people, where [`Engine::install`] would take the engine from. Fetches nothing and checks no wheel.
     ///
     /// # Errors
     /// No pip, or `DRIML_OFFLINE=1` and no wheel in the cache folder.
@@ -62,15 +62,15 @@ impl Engine {
         ))
     }
 
-    /// Another build of the engine than the published one, by the path of its library. Its pictures are in the folder `assets`
-    /// beside the library or beside the library's folder, as in Procgen's own source tree. It is code that runs as this user, and is
-    /// loaded without a check of its hash.
+    /// Returns another build of the engine than the published one, by the path of its library. The pictures are in the
+    /// folder `assets` beside the library or beside the library's folder, as in Procgen's own source tree. The library
+    /// is code that runs as this user, and is loaded without a check of its hash.
     ///
     /// # Errors
-    /// A library or pictures that are not there, or a machine that cannot run it.
+    /// The library or the pictures are missing, or this machine cannot run the engine.
     pub fn other(library: &Path) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
-        // The loader takes a name without a folder for one of the system's.
+        // The loader would look for a name without a folder among the system's libraries.
         let library =
             fs::canonicalize(library).map_err(|error| ProcgenError::library(library, error))?;
         let mut folders = library.ancestors().skip(1).take(2);
@@ -83,7 +83,7 @@ impl Engine {
         Ok(Engine { library, assets })
     }
 
-    /// Loads the engine's library, which makes no game yet.
+    /// Checks that the engine's library loads; makes no game.
     pub fn check_loads(&self) -> Result<(), ProcgenError> {
         library::load(&self.library).map(drop)
     }
@@ -156,12 +156,12 @@ impl Engine {
         // A crash of the machine must not leave a folder in place whose files are empty.
         let _ = File::open(&fresh).map(nix::unistd::syncfs);
         if root.exists() {
-            // What is moved into the temporary folder goes with it.
+            // The temporary folder is deleted with all that is moved into it.
             fs::rename(&root, folder.path().join("damaged"))
                 .map_err(ProcgenError::io("moving away the damaged", &root))?;
         }
         let renamed = fs::rename(&fresh, &root).map_err(ProcgenError::io("renaming", &root));
-        // Where files cannot be locked, another process may have put the same there.
+        // If files cannot be locked, another process may have installed the same meanwhile.
         Engine::locate_in(cache).map_err(|error| renamed.err().unwrap_or(error))
     }
 }
@@ -179,7 +179,7 @@ impl Cache {
         }
     }
 
-    /// The wheel that the user has put into the cache folder; an error where there is none and none may be fetched.
+    /// Returns the wheel that the user has put into the cache folder. Returns an error if it is missing and fetching is forbidden.
     fn provided(&self, reason: &str) -> Result<Option<PathBuf>, ProcgenError> {
         let provided = self.folder.join(WHEEL_NAME);
         if provided.is_file() {
@@ -194,10 +194,10 @@ impl Cache {
     }
 }
 
-/// Lets one process at a time do something, by locking a file; the turn ends when what this gives is dropped.
+/// Waits for the lock file, which one process holds at a time. Dropping the returned file releases it.
 ///
-/// `None` when the file cannot be locked or the limit has passed: then two may do the same at once, which wastes
-/// time, and at worst one of them reports an error.
+/// Returns `None` if the file cannot be locked or the limit has passed: then two processes may install at once, which
+/// wastes time, and at worst one of them reports an error.
 fn wait_for_turn(cache: &Cache, limit: Duration) -> Option<File> {
     let file = File::create(cache.folder.join("install.lock")).ok()?;
     let started = Instant::now();
@@ -219,7 +219,7 @@ mod tests {
     use super::*;
     use crate::error::WITHOUT_ENGINE;
 
-    /// That of the library that stands for the engine's.
+    /// The hash of the library that stands in for the engine's.
     const LIBRARY_HASH: &str = "8c08842bdcdbaa0dde9e6598c215af56513417ebd79c758c2cc8cd6a63f3f296";
 
     fn cache_in(folder: &Path) -> Cache {
@@ -229,7 +229,7 @@ mod tests {
         Cache { folder, offline }
     }
 
-    /// Installs with what stands for pip.
+    /// Installs with a stand-in for pip.
     fn install(cache: &Cache, library: &str) -> Result<Engine, ProcgenError> {
         let unpack = |to: &Path, _: Option<&Path>| {
             wheel::make_folder(&to.join("assets/b"))?;
@@ -241,7 +241,7 @@ mod tests {
         Engine::install_in(cache, library, &mut |_| {}, unpack)
     }
 
-    /// Names of what lies in the cache folder, sorted.
+    /// The names of all that lies in the cache folder, except the wheel, sorted.
     fn left(cache: &Cache) -> Vec<String> {
         let entries = fs::read_dir(&cache.folder).unwrap();
         let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
@@ -338,7 +338,7 @@ mod tests {
         assert!(turn.is_some());
         assert!(wait_for_turn(&cache, Duration::from_millis(120)).is_none());
         drop(turn);
-        // A child that another test has just forked holds it until it runs its program.
+        // A child that another test has just forked holds the lock until it runs its program.
         assert!(wait_for_turn(&cache, Duration::from_secs(60)).is_some());
     }
 }

@@ -5,8 +5,8 @@
 //! It is a C++ library that ends the whole process on a bad option, so everything is checked here first.
 //!
 //! Start with [`Engine::install`], which puts the engine into the cache folder once, and [`VecGame`], which steps N environments of a
-//! [`Game`] as [`Options`] describe them. A step is one call of [`VecGame::act`]; what came of it is in buffers of the game's own,
-//! one element or frame an environment. `driml-envs` makes a world of it.
+//! [`Game`] as [`Options`] describe them. A step is one call of [`VecGame::act`]; its results are in the game's
+//! buffers, one element or frame per environment. `driml-envs` makes a world of the game.
 //!
 //! ```no_run
 //! use procgen_sys::{DistributionMode, Engine, FRAME_BYTES, Game, Options, VecGame};

@@ -1,5 +1,5 @@
 //! Loads `libenv.so` once per path and finds its functions.
-//! It never unloads it: the engine keeps threads and static data that would be left hanging.
+//! It never unloads the library: the engine keeps threads and static data that would be left hanging.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ pub(crate) struct Api {
 
 const GLIB: &str = "libglib2.0-0` or, since Debian 13 and Ubuntu 24.04, `libglib2.0-0t64";
 
-/// The packages that hold the libraries which the engine needs: file, Debian, Fedora.
+/// The libraries that the engine needs: file, Debian package, Fedora package.
 const PACKAGES: [(&str, &str, &str); 6] = [
     ("libglib-2.0.so.0", GLIB, "glib2"),
     ("libgthread-2.0.so.0", GLIB, "glib2"),
@@ -49,7 +49,7 @@ pub(crate) fn load(path: &Path) -> Result<&'static Api, ProcgenError> {
     Ok(api)
 }
 
-/// Says whether the engine can run on this machine: Linux on x86-64 with AVX.
+/// Returns an error unless the engine can run on this machine: Linux on x86-64 with AVX.
 pub(crate) fn check_machine() -> Result<(), ProcgenError> {
     if !cfg!(all(target_os = "linux", target_arch = "x86_64")) {
         return Err(ProcgenError::Machine(format!(
@@ -68,8 +68,8 @@ pub(crate) fn check_machine() -> Result<(), ProcgenError> {
 }
 
 fn open(path: &Path) -> Result<Api, ProcgenError> {
-    // SAFETY: running the library's initialisers is what loading means; either its hash was compared with the pinned one when it was
-    // installed, where only this user can change it, or a person has named another build.
+    // SAFETY: loading runs the library's initialisers, which are trusted. Either the library's hash was compared with
+    // the pinned one at its installation, and only this user can change it since, or the user has named another build.
     let library = unsafe { Library::open(Some(path), RTLD_NOW | RTLD_LOCAL) };
     let library = library.map_err(|error| explain(path, &error.to_string()))?;
     // SAFETY: the types are those of gym3's `libenv.h`, and the version is checked before any other function is called.
@@ -106,7 +106,7 @@ unsafe fn functions(library: &Library) -> Result<(Version, Api), libloading::Err
     }
 }
 
-/// Turns what `dlopen` said into what to do about it.
+/// Turns an error of `dlopen` into an error that says what to do.
 fn explain(path: &Path, said: &str) -> ProcgenError {
     let is_missing = |library: &str| said.contains(library) && said.contains("cannot open shared");
     let missing = PACKAGES.iter().find(|(library, ..)| is_missing(library));

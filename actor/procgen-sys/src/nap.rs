@@ -1,32 +1,32 @@
-//! How long the calling thread leaves the engine's threads alone before it waits for them.
-//! It knows nothing of the engine: it is told how long steps took.
+//! How long the calling thread sleeps before it waits for the engine's threads.
+//! It knows nothing of the engine: the caller reports how long steps took.
 //!
-//! The engine's `observe` waits for the first environment, then for the second, and is woken whenever *any* of them is done: with 32 environments
-//! the calling thread wakes about 20 times a step, and each time an engine's thread has to make room for it. A thread that
-//! sleeps through the first half of a step is not there to be woken.
+//! The engine's `observe` waits for the first environment, then for the second, but wakes whenever *any* environment is done. With 32
+//! environments the calling thread wakes about 20 times a step, each time at the cost of an engine thread's processor time. A thread
+//! that sleeps through the first half of a step avoids the wake-ups in that half.
 
 use std::time::Duration;
 
-/// Shorter ones are left out: a sleep may end some 60 us late.
+/// The shortest nap; shorter ones are skipped, as a sleep may end some 60 us late.
 const NAP_MIN: Duration = Duration::from_micros(100);
 
-/// Half of what a fast step takes, by the latest ones.
+/// A sleep of half the duration of a fast step, estimated from the latest steps.
 #[derive(Debug, Default)]
 pub(crate) struct Nap {
-    /// What a fast step takes; `None` before the first.
+    /// The estimated duration of a fast step; `None` before the first step.
     step: Option<Duration>,
 }
 
 impl Nap {
-    /// Sleeps for as long as a step that has just begun surely takes.
+    /// Sleeps for the nap, if there is one; a step that has just begun takes longer than it.
     pub(crate) fn take(&self) {
         if let Some(duration) = self.duration() {
             std::thread::sleep(duration);
         }
     }
 
-    /// Learns how long a step took, the nap included. One that makes levels takes longer than others, so a step counts as at most an
-    /// eighth longer than those before.
+    /// Updates the estimate by the duration of a step, including the nap. A step that makes levels takes longer, so one
+    /// step raises the estimate by at most an eighth.
     pub(crate) fn learn(&mut self, took: Duration) {
         let step = self.step.map_or(took, |step| took.min(step + step / 8));
         self.step = Some(step);

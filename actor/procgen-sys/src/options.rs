@@ -1,5 +1,5 @@
 //! The engine's settings, checked in Rust and laid out as the engine reads them.
-//! It does not offer what the engine cannot save and restore (generated assets) nor what only people see (the large picture).
+//! It omits what the engine cannot save and restore (generated assets) and what only people see (the large picture).
 
 use std::ffi::c_void;
 
@@ -10,13 +10,13 @@ use crate::game::{DistributionMode, Game};
 /// Number of actions; valid ones are `0..15`.
 pub const NUM_ACTIONS: usize = 15;
 
-/// Environments that one handle may hold; more is refused.
+/// The most environments of one handle; more are rejected.
 pub const NUM_ENVS_MAX: usize = 4096;
 
-/// Threads that one handle may start; more is refused.
+/// The most threads that one handle starts; more are rejected.
 pub const NUM_THREADS_MAX: usize = 256;
 
-/// What `VecGame::new` needs to know.
+/// The settings for `VecGame::new`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Options {
     /// The game.
@@ -27,9 +27,9 @@ pub struct Options {
     pub num_levels: i32,
     /// The first level of the set; 0 or more.
     pub start_level: i32,
-    /// Seeds the choice of levels; the only source of randomness that is not the level's own.
+    /// Seeds the choice of levels. All other randomness depends on the level alone.
     pub rand_seed: i32,
-    /// Threads that the handle starts for itself; 0 steps in the calling thread.
+    /// Threads that the handle starts to step environments; 0 steps in the calling thread.
     pub num_threads: usize,
     /// How hard the levels are; not every game has every mode.
     pub distribution_mode: DistributionMode,
@@ -46,7 +46,7 @@ pub struct Options {
 }
 
 impl Options {
-    /// Says why the engine could not take these settings.
+    /// Returns an error that says why, if the engine cannot take these settings.
     pub fn validate(&self) -> Result<(), ProcgenError> {
         let (num_envs, num_threads) = (self.num_envs, self.num_threads);
         let (num_levels, start_level) = (self.num_levels, self.start_level);
@@ -81,8 +81,8 @@ impl Options {
     }
 }
 
-/// Hands checked settings to `make` in the engine's layout, which is there until that returns. `resource_root` is the folder of the
-/// pictures, with a slash at its end.
+/// Passes checked settings to `make` in the engine's layout, which is valid until `make` returns. `resource_root` is
+/// the folder of the pictures, with a slash at its end.
 pub(crate) fn lay_out<T>(
     options: &Options,
     resource_root: &str,
@@ -170,9 +170,9 @@ mod tests {
     #[test]
     fn values_lie_where_the_items_point() {
         let values = lay_out(&OPTIONS, "/somewhere/", |raw| {
-            // SAFETY: so many items are there, and until this returns.
+            // SAFETY: `raw.items` has `raw.count` items, which are valid until this closure returns.
             let items = unsafe { std::slice::from_raw_parts(raw.items, raw.count as usize) };
-            // SAFETY: none of these has a value of fewer bytes.
+            // SAFETY: no caller reads more bytes than the item's value has.
             let bytes = |item: usize, len| unsafe {
                 std::slice::from_raw_parts(items[item].data.cast::<u8>(), len).to_vec()
             };

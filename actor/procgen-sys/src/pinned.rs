@@ -1,10 +1,10 @@
 //! Memory at a fixed address that a C library writes to.
-//! It does not synchronise anything: its owner says when the library may write.
+//! It does not synchronise anything: its owner decides when the library may write.
 
 use std::cell::Cell;
 use std::ptr;
 
-/// Values that never move while this is alive, even when it is moved itself.
+/// Values whose addresses stay the same, even when this struct is moved.
 ///
 /// A `Vec` keeps its elements where they are, and what is in a `Cell` may be written through other pointers.
 pub(crate) struct Pinned<T>(Vec<Cell<T>>);
@@ -15,7 +15,7 @@ impl<T: Copy> Pinned<T> {
         Pinned(vec![Cell::new(value); len])
     }
 
-    /// Address of element `index` and of those after it, for the library to keep.
+    /// The address of element `index`, followed by the later elements, for the library to keep.
     pub(crate) fn address(&self, index: usize) -> *mut T {
         self.0[index..].as_ptr().cast_mut().cast()
     }

@@ -1,5 +1,5 @@
-//! Environments of one game, stepped together: the safe face of the engine.
-//! It passes the engine's flags on as they are and does not say what they mean for episodes.
+//! Environments of one game, stepped together: the safe interface of the engine.
+//! It passes on the engine's flags unchanged and does not interpret them as episodes.
 
 use std::ffi::c_void;
 use std::time::Instant;
@@ -24,12 +24,12 @@ pub const FRAME_BYTES: usize = FRAME_SIDE * FRAME_SIDE * 3;
 /// The action that takes the game's no-op and then ends the episode, whatever happened.
 pub const RESET: i32 = -1;
 
-/// Bytes set aside for a state at first; grown when states come near it. The engine ends the process if one does not
-/// fit; states seen are below 100 kB.
+/// The first size of a state's buffer, in bytes; doubled when a state takes more than half. The engine ends the process
+/// if a state does not fit; states seen are below 100 kB.
 const STATE_BYTES: usize = 1 << 20;
 
-/// An environment's complete state, as the engine wrote it. The engine trusts what it reads back: a forged one may end the process,
-/// so take states from your own files alone.
+/// An environment's complete state, as the engine wrote it. The engine trusts what it reads back: a forged one may end
+/// the process, so load states from your own files alone.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct State {
     game: Game,
@@ -43,16 +43,16 @@ impl State {
     }
 }
 
-/// N environments of one game. One thread at a time may use it; different ones may be used by different threads.
+/// N environments of one game. One thread at a time may use a `VecGame`; different threads may use different ones.
 pub struct VecGame {
     api: &'static Api,
     handle: Handle,
     game: Game,
     num_envs: usize,
     state_bytes: usize,
-    /// How long to leave the engine's own threads alone; `None` where the calling thread steps.
+    /// The sleep before waiting for the engine's threads; `None` if the calling thread steps.
     nap: Option<Nap>,
-    // The engine keeps the addresses of all of these until `close`, which `Drop` calls before they go.
+    // The engine keeps the addresses of all of these until `close`, which `Drop` calls before they are freed.
     frames: Pinned<u8>,
     rewards: Pinned<f32>,
     first: Pinned<u8>,
@@ -126,7 +126,7 @@ impl VecGame {
         self.read(&self.frames)
     }
 
-    /// What the last actions earned [N]; 0 before the first.
+    /// The rewards of the last actions [N]; 0 before the first.
     pub fn rewards(&self) -> &[f32] {
         self.read(&self.rewards)
     }
@@ -151,7 +151,7 @@ impl VecGame {
         unsafe { buffer.as_slice() }
     }
 
-    /// Takes one action in every environment, each in `0..15` or `RESET`, and waits for what comes of it.
+    /// Takes one action in every environment, each in `0..15` or `RESET`, and waits for the results.
     ///
     /// # Errors
     /// Not N actions, or one out of range; nothing was stepped.
@@ -185,7 +185,7 @@ impl VecGame {
         Ok(())
     }
 
-    /// The complete state of environment `env`: its level, its generators, everything.
+    /// Returns the complete state of environment `env`, including its level and generators.
     pub fn state(&mut self, env: usize) -> Result<State, ProcgenError> {
         let index = self.index(env)?;
         let mut bytes = vec![0_u8; self.state_bytes];
@@ -238,7 +238,7 @@ impl VecGame {
         Ok(i32::try_from(env).expect("below num_envs, which is small"))
     }
 
-    /// The buffers above are right only for exactly these tensors.
+    /// Checks that the engine has exactly the tensors for which the buffers above are made.
     fn check_types(&self) -> Result<(), ProcgenError> {
         let side = FRAME_SIDE as i32;
         let frame = ffi::describe("rgb", DTYPE_UINT8, &[side, side, 3]);
@@ -270,7 +270,7 @@ impl VecGame {
         Ok(())
     }
 
-    /// Tells the engine where to read and write, which also does the first reset. Once only.
+    /// Tells the engine where to read and write, which also does the first reset. Call this once only.
     fn set_buffers(&self) {
         let each = |address: &dyn Fn(usize) -> *mut c_void| {
             (0..self.num_envs).map(address).collect::<Vec<_>>()

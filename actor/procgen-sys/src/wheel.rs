@@ -1,5 +1,5 @@
-//! The pinned wheel of procgen: which one it is, and what the engine needs of it, unpacked by pip.
-//! It decides nothing about where things end up; `install` does.
+//! The pinned wheel of procgen: which wheel it is, and which of its files the engine needs. pip unpacks it.
+//! It decides nothing about where the files go; `install` does.
 
 use std::fs::{self, DirBuilder, File};
 use std::io;
@@ -23,20 +23,20 @@ pub(crate) const WHEEL_SHA256: &str =
 pub(crate) const LIBRARY_SHA256: &str =
     "f44786431a902e9ae1a32cd44f4aa650f4bdad893240a322e49e6098d6a7a2ea";
 
-/// What the engine needs of the wheel, and its name where it is installed.
+/// The files of the wheel that the engine needs, and their names where they are installed.
 const NEEDED: [(&str, &str); 3] = [
     ("procgen/data/prebuilt/libenv.so", "libenv.so"),
     ("procgen/data/assets", "assets"),
     ("procgen-0.10.7.dist-info/LICENSE", "LICENSE"),
 ];
 
-/// Which wheel pip is to take, whatever Python it runs on.
+/// pip's flags that select this wheel, whatever Python pip runs on.
 const PIP_SELECTION: &str = "--no-deps --only-binary=:all: --python-version 3.10 --abi cp310 --platform manylinux2014_x86_64";
 
-/// pip gives up by itself: 30 s without a byte, three tries.
+/// pip's flags that make it give up after three tries of 30 s without a byte.
 const PIP_LIMITS: &str = "--timeout 30 --retries 2 --no-input --disable-pip-version-check";
 
-/// Lines of pip's output that a message repeats.
+/// The most lines of pip's output that a message quotes.
 const OUTPUT_LINES_MAX: usize = 6;
 
 /// The command that fetches the wheel into the current folder, for people.
@@ -44,8 +44,8 @@ pub(crate) fn command_for_people() -> String {
     format!("python3 -m pip download procgen==0.10.7 {PIP_SELECTION}")
 }
 
-/// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. pip does it, and
-/// checks the wheel's hash: of the one in the folder `provided`, else of the index's.
+/// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. pip
+/// takes the wheel from the folder `provided`, else from the package index, and checks its hash.
 pub(crate) fn unpack(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
     let [all, pins] = ["wheel", "txt"].map(|extension| to.with_extension(extension));
     let text = format!("procgen==0.10.7 --hash=sha256:{WHEEL_SHA256}\n");
@@ -78,12 +78,12 @@ pub(crate) fn unpack(python: &str, to: &Path, provided: Option<&Path>) -> Result
     )))
 }
 
-/// What pip says to these arguments; an error where there is none.
+/// Runs pip with these arguments and returns its output. Returns an error if Python or pip is missing.
 pub(crate) fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
-    // Other users can change nothing of what it writes, whatever the umask says.
+    // Other users must not be able to change the files that pip writes, whatever the caller's umask.
     let mut command = Command::new("sh");
     command.args(["-c", "umask 022; exec \"$@\"", "sh", python, "-m", "pip"]);
-    // A configuration with `user = true` does not go with `--target`.
+    // A configuration of pip with `user = true` conflicts with `--target`.
     command.args(arguments).env("PIP_USER", "0");
     let missing = |what: &str| {
         let text = format!(
@@ -93,7 +93,7 @@ pub(crate) fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenErr
     };
     match command.stdin(Stdio::null()).output() {
         Err(error) => Err(ProcgenError::io("running", Path::new("sh"))(error)),
-        // The status of a shell that finds no Python, or of a launcher with none behind it.
+        // The exit status of a shell that finds no Python, or of a launcher that finds none.
         Ok(output) if output.status.code() == Some(127) => missing(python),
         Ok(output) if String::from_utf8_lossy(&output.stderr).contains("No module named pip") => {
             missing("pip")
@@ -116,7 +116,7 @@ pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), ProcgenError
     )))
 }
 
-/// Makes a folder, and those above it, in which other users can change nothing.
+/// Makes a folder, and its parents, in which other users cannot change anything.
 pub(crate) fn make_folder(path: &Path) -> Result<(), ProcgenError> {
     let made = DirBuilder::new().recursive(true).mode(0o755).create(path);
     made.map_err(ProcgenError::io("making", path))
@@ -128,7 +128,7 @@ mod tests {
 
     use super::*;
 
-    /// Unpacks into the folder's `fresh` with a Python that is this script, which runs in the folder.
+    /// Unpacks into `fresh` in `folder`, with `script`, run in `folder`, in place of Python.
     fn unpack_by(script: &str, folder: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
         let python = folder.join("python3");
         let script = format!("#!/bin/sh\ncd \"${{0%/*}}\"\n{script}\n");

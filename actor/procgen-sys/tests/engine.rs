@@ -1,4 +1,4 @@
-//! What the real engine does, call by call: these are the facts that `driml-envs` builds its worlds on.
+//! Checks what the real engine does, call by call: the facts on which `driml-envs` builds its worlds.
 //! The engine is fetched into the cache folder once; with `DRIML_OFFLINE=1` every test here is skipped.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
@@ -11,7 +11,7 @@ fn engine() -> Option<&'static Engine> {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
     if std::env::var_os("DRIML_OFFLINE").is_some_and(|it| !it.is_empty() && it != "0") {
         let test = std::thread::current();
-        // Past the test runner, which keeps the output of a test that passes.
+        // Bypasses the test runner, which hides the output of a test that passes.
         let line = format!(
             "skipped: {} (DRIML_OFFLINE=1)\n",
             test.name().unwrap_or("?")
@@ -175,12 +175,12 @@ fn time_limit_and_time(state: &State) -> (i32, i32) {
     for _ in 0..2 {
         at = after_text(at + 4);
     }
-    // Past reward, done, complete; and action.
+    // Skips reward, done and complete; and action.
     at += 4 * 4;
     (int(at), int(at + 9 * 4))
 }
 
-/// The limits that `Game::time_limit_steps` promises are the engine's, in every mode of every game.
+/// `Game::time_limit_steps` returns the engine's limits, in every mode of every game.
 #[test]
 fn time_limits_are_the_engines() {
     let Some(engine) = engine() else { return };

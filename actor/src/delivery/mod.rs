@@ -1,5 +1,5 @@
-//! Brings chunks to the replay server, each exactly once and in order, and says when the actor leaves.
-//! It does not drop: a chunk leaves the line when the replay server says that it is stored or no longer wanted.
+//! Delivers chunks to the replay server, each exactly once and in order, and then tells it that the actor leaves.
+//! Unless delivery fails, a chunk stays queued until the replay server replies that it is stored or no longer wanted.
 
 mod state;
 mod worker;
@@ -17,10 +17,10 @@ use worker::DeliveryWorker;
 
 pub use state::{DeliveryError, DeliveryLimits};
 
-/// How long an actor whose chunks wait may wait for newer weights.
+/// How long an actor may wait for newer weights while the rate limiter holds its chunks.
 const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
 
-/// A thread that delivers, and the queue to it.
+/// The delivery thread, and the queue of chunks to it.
 pub struct Delivery {
     queue: mpsc::Sender<Chunk>,
     limit: usize,
@@ -29,8 +29,8 @@ pub struct Delivery {
 }
 
 impl Delivery {
-    /// Starts the thread. `inserted_total` is the run's count so far; `pool` is where the chunks' memory comes from. The actor
-    /// has joined the run with the incarnation of its chunks.
+    /// Starts the thread. `inserted_total` is the number of transitions that the run has stored so far; the chunks'
+    /// memory comes from `pool`. The actor must have joined the run with the incarnation of its chunks.
     pub fn start(
         client: RunClient,
         inserted_total: u64,
@@ -40,7 +40,7 @@ impl Delivery {
     ) -> std::io::Result<Self> {
         let state = Arc::new(DeliveryState::default());
         state.progress().inserted_total = inserted_total;
-        // Until a chunk was let in at once: many actors that start together must not run ahead of the learner together.
+        // Held until a first chunk is stored at once: actors that start together must not run ahead of the learner together.
         state.progress().is_held = true;
         let (queue, chunks) = mpsc::channel();
         let worker = DeliveryWorker::new(client, limits, pool, shutdown, state.clone());
@@ -55,13 +55,12 @@ impl Delivery {
         })
     }
 
-    /// How far it is, as of the last answer.
+    /// Returns the progress as of the last reply.
     pub(crate) fn progress(&self) -> Progress {
         *self.state.progress()
     }
 
-    /// How long the actor has time to wait for newer weights before it begins its next chunk: where the rate limiter makes its
-    /// chunks wait, it loses nothing by acting with the newest.
+    /// How long the actor may wait for newer weights before its next chunk: while the rate limiter holds its chunks, waiting is free.
     pub fn fresh_weights_max(&self) -> Duration {
         match self.progress().is_held {
             true => FRESH_WEIGHTS_MAX,
@@ -69,7 +68,7 @@ impl Delivery {
         }
     }
 
-    /// What the next chunk would wait for now; none if it would not.
+    /// Describes what the next chunk would wait for now; `None` if it would not wait.
     pub fn describe_wait(&self) -> Option<&'static str> {
         let progress = self.progress();
         match progress.is_held {
@@ -79,8 +78,8 @@ impl Delivery {
         }
     }
 
-    /// Queues a chunk, waiting while too many are not acknowledged: one, where the rate limiter makes chunks wait. `false`: the
-    /// thread has ended; [`Self::finish`] says why.
+    /// Queues a chunk, waiting while `chunks_in_flight_max` chunks are not settled, or one if the rate limiter holds
+    /// chunks. Returns `false` if the thread has ended; [`Self::finish`] then returns why.
     pub fn send(&self, chunk: Chunk) -> bool {
         let mut progress = self.state.progress();
         loop {
@@ -88,7 +87,7 @@ impl Delivery {
             if progress.waiting < limit || self.thread.is_finished() {
                 break;
             }
-            // The time-out is for a thread that ended without a word.
+            // The time-out is for a thread that ended without a notification.
             let waited = self
                 .state
                 .settled
@@ -99,7 +98,7 @@ impl Delivery {
         self.queue.send(chunk).is_ok()
     }
 
-    /// Waits for the last chunk and sends `Leave`; gives the number of transitions that were not wanted any more.
+    /// Waits until the last chunk is settled and `Leave` is sent. Returns the number of transitions that the run no longer wanted.
     pub fn finish(self) -> Result<u64, DeliveryError> {
         drop(self.queue);
         let panicked = |_| DeliveryError::Failed("the delivery thread panicked".into());

@@ -1,4 +1,4 @@
-//! What the sending side and the delivering thread tell each other, and the limits that both keep.
+//! The state that the acting thread and the delivery thread share, and the limits that both keep.
 //! The chunks themselves go through a queue.
 
 use std::{
@@ -13,16 +13,16 @@ use crate::config::Config;
 /// Limits of one delivery.
 #[derive(Clone, Copy, Debug)]
 pub struct DeliveryLimits {
-    /// Chunks waiting to be acknowledged; at this many `send` waits.
+    /// The most chunks that are not settled; at this many `send` waits.
     pub chunks_in_flight_max: usize,
-    /// How long the replay server may be silent about a chunk that it was sent; a chunk that has to wait is answered meanwhile.
+    /// Time-out of the reply to a chunk. The replay server also replies in this time while the rate limiter holds the chunk.
     pub ack_timeout: Duration,
-    /// All tries for one chunk without any answer.
+    /// How long delivery may go without any reply, over all tries, before it fails.
     pub unreachable_max: Duration,
 }
 
 impl DeliveryLimits {
-    /// The limits that an actor's settings ask for.
+    /// Takes the limits from an actor's settings.
     pub const fn of(config: &Config) -> Self {
         Self {
             chunks_in_flight_max: config.chunks_in_flight_max as usize,
@@ -32,26 +32,26 @@ impl DeliveryLimits {
     }
 }
 
-/// What the sending side and the thread tell each other beside the chunks.
+/// The state that the acting thread and the delivery thread share, besides the queue.
 #[derive(Debug, Default)]
 pub(super) struct DeliveryState {
     progress: Mutex<Progress>,
-    /// Signalled when a chunk is settled.
+    /// Notified when a chunk is settled: stored, no longer wanted, or given up after a failure.
     pub(super) settled: Condvar,
 }
 
-/// How far the delivery is, as of the last answer.
+/// The progress of the delivery, as of the last reply.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Progress {
     /// Transitions that the run has stored.
     pub(crate) inserted_total: u64,
     /// Actors that are connected to the run; 0 before the first answer.
     pub(crate) actors: u32,
-    /// The run has all the transitions it wants.
+    /// Whether the run has all the transitions that it wants, or delivery has failed.
     pub(crate) finished: bool,
-    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
+    /// Whether the rate limiter holds chunks: the actor then queues one at a time, as others would only grow old.
     pub(super) is_held: bool,
-    /// Chunks that were sent and are not yet settled.
+    /// Chunks that were queued and are not yet settled.
     pub(super) waiting: usize,
 }
 
@@ -70,7 +70,7 @@ pub enum DeliveryError {
         within: Duration,
         source: SessionError,
     },
-    /// Anything else: a chunk was refused, or not stored in the time that an actor has which was told to stop.
+    /// Anything else: the replay server rejected a chunk, or did not store it in time after a shutdown.
     #[error("{0}")]
     Failed(String),
 }

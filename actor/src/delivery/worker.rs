@@ -1,6 +1,6 @@
-//! The delivering thread: sends chunks, understands the answers, sends again what did not arrive.
-//! It never waits without an answer: a server that delays a chunk says so every few seconds, and an unresponsive one is
-//! given up.
+//! The delivery thread: sends chunks, handles the replies, and sends a chunk again if it did not arrive.
+//! It never waits long without a reply: a replay server that holds a chunk replies every few seconds, and delivery
+//! fails if the server stays unresponsive.
 
 use std::{
     collections::VecDeque,
@@ -16,40 +16,40 @@ use zenoh::bytes::ZBytes;
 
 use super::state::{DeliveryError, DeliveryLimits, DeliveryState};
 
-/// After `Shutdown`, how long the chunks at hand may take to be stored.
+/// How long the queued chunks may take to be stored after `Shutdown`.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
-/// After `Shutdown`, how long the replay server may be silent about one of them before it is sent again: several tries must fit.
+/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`].
 const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// How often a thread that waits for an answer looks whether the actor is to stop.
+/// How often the thread checks for `Shutdown` while it waits for a reply.
 const TICK: Duration = Duration::from_millis(50);
-/// How long `Leave` is tried, without the time in which the replay server reads its replay back.
+/// How long `Leave` is retried, not counting the time in which the replay server reads its replay back from disk.
 const LEAVE_MAX: Duration = Duration::from_secs(5);
-/// How long one try waits for its answer: several must fit, as a message may be lost.
+/// Time-out of one `Leave`. Several must fit into [`LEAVE_MAX`], as a message may be lost.
 const LEAVE_TRY_MAX: Duration = Duration::from_secs(1);
 
 struct Outgoing {
     header: ChunkHeader,
     payload: ZBytes,
     in_shared_memory: bool,
-    /// Set while a question about it is on its way.
+    /// The reply to the chunk, or to a poll about it, if one is pending.
     asked: Option<PendingReply<InsertReply>>,
-    /// The replay server has it and will store it: a poll is enough.
+    /// The replay server has the chunk and will store it, so that a poll is enough.
     is_kept: bool,
 }
 
-/// What became of the first chunk in line.
+/// The result for the first chunk in the queue.
 enum Outcome {
     Stored,
     /// The run has enough transitions.
     Unwanted,
-    /// It is asked about again.
+    /// The chunk, or a poll about it, must be sent again.
     Again,
 }
 
-/// The delivering thread's state. Several chunks are on their way at once; they are settled in order, and where one has to go
-/// again those after it, which the replay server then refused as out of order, go again too.
+/// The delivery thread's state. Several chunks are in flight at once and are settled in order. If one must be sent
+/// again, so must those after it, which the replay server has rejected as out of order.
 pub(super) struct DeliveryWorker {
     client: RunClient,
     limits: DeliveryLimits,
@@ -57,10 +57,10 @@ pub(super) struct DeliveryWorker {
     shutdown: Shutdown,
     state: Arc<DeliveryState>,
     outgoing: VecDeque<Outgoing>,
-    /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
+    /// The most chunks in flight: 1 after a chunk had to wait or be sent again, and 1 more for each chunk that is stored at once.
     window: usize,
     silence: Silence,
-    /// When the chunk that waits at the rate limiter began to wait.
+    /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
     draining_since: Option<Instant>,
     retries_said: LogLimiter,
@@ -91,7 +91,7 @@ impl DeliveryWorker {
         }
     }
 
-    /// Delivers until the queue ends; gives the number of transitions that were not wanted.
+    /// Delivers chunks until the queue closes. Returns the number of transitions that the run did not want.
     pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> Result<u64, DeliveryError> {
         let mut last = None;
         let mut produced = 0;
@@ -100,7 +100,7 @@ impl DeliveryWorker {
         while let Some(header) = self.first_in_line(chunks) {
             fail_point::reach("delivery");
             let transitions = header.transitions() as u64;
-            // After a failure the rest is only counted, so that `Leave` tells the truth.
+            // After a failure the other chunks are only counted, so that `Leave` has the number of all that the actor produced.
             let outcome_of_first = match outcome {
                 Ok(()) => self.settle_first(),
                 Err(_) => Ok(Outcome::Stored),
@@ -130,7 +130,7 @@ impl DeliveryWorker {
         outcome.map(|()| unwanted)
     }
 
-    /// Lines up what was queued and gives the first, waiting for one if there is none; `None` when no more will come.
+    /// Takes chunks from the queue and returns the first one's header. Waits if there is none; `None` if the queue has closed.
     fn first_in_line(&mut self, chunks: &mpsc::Receiver<Chunk>) -> Option<ChunkHeader> {
         while self.outgoing.len() < self.limits.chunks_in_flight_max {
             let next = match self.outgoing.is_empty() {
@@ -139,7 +139,7 @@ impl DeliveryWorker {
             };
             let Some(chunk) = next else { break };
             if self.outgoing.is_empty() {
-                // While there was nothing to say, the replay server could not answer.
+                // The time without chunks does not count as silence of the replay server.
                 self.silence.answered();
             }
             let header = chunk.header;
@@ -153,13 +153,13 @@ impl DeliveryWorker {
             });
         }
         if self.shutdown.is_set() {
-            // Copying is cheap now, and a lost message would cost the time that is left.
+            // Copying is cheap now. A chunk lost in shared memory would cost the time that is left.
             self.copy_out_of_shared_memory();
         }
         self.outgoing.front().map(|first| first.header)
     }
 
-    /// Sends what the window allows and waits for what becomes of the first.
+    /// Sends the chunks that the window allows and settles the first by its reply.
     fn settle_first(&mut self) -> Result<Outcome, DeliveryError> {
         let sequence = self.outgoing[0].header.sequence;
         if self.shutdown.is_set() {
@@ -172,7 +172,7 @@ impl DeliveryWorker {
         }
         let reply = self.send_window().and_then(|()| self.wait_for_first());
         let Some(reply) = reply.transpose() else {
-            // To be let in at once, as the actor leaves.
+            // Sent again with `leaving` set, the chunk passes the rate limiter at once.
             return Ok(self.again());
         };
         if reply.is_ok() {
@@ -213,7 +213,7 @@ impl DeliveryWorker {
                 self.note_held(kept);
                 Ok(self.again())
             }
-            // Judged while one before it waited; all of those are stored now.
+            // The reply is from when an earlier chunk waited; all earlier chunks are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
             Ok(InsertReply::Refused { why }) => Err(DeliveryError::Failed(format!(
                 "the replay server refused a chunk: {why}"
@@ -223,7 +223,7 @@ impl DeliveryWorker {
                 if let Some(more) = self.retries_said.due() {
                     tracing::warn!("chunk {sequence} waits: {recovering}{more}");
                 }
-                // A question of a few bytes, in the place of chunks again and again: the answer to it says that they are wanted.
+                // A poll of a few bytes instead of the same chunks again and again: its reply says when chunks are wanted.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
                 self.outgoing[0].is_kept = true;
                 self.pause();
@@ -237,9 +237,9 @@ impl DeliveryWorker {
                 if let Some(more) = self.retries_said.due() {
                     tracing::warn!("chunk {sequence} will be sent again: {e}{more}");
                 }
-                // What was not answered may not have arrived, whatever was said of it before.
+                // A chunk without a reply may not have arrived, whatever an earlier reply said.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
-                // It may be unable to read shared memory: what is at hand, and the next chunks, go through the socket.
+                // The replay server may be unable to read shared memory: these chunks and the next ones go through the socket.
                 if self.outgoing[0].in_shared_memory {
                     self.pool.avoid_shared_memory();
                 }
@@ -250,7 +250,7 @@ impl DeliveryWorker {
         }
     }
 
-    /// The answer about the first chunk; none if the actor is to leave meanwhile, which the replay server does not know yet.
+    /// Waits for the reply to the first chunk. Returns `None` on a shutdown of which the replay server does not know yet.
     fn wait_for_first(&mut self) -> Result<Option<InsertReply>, SessionError> {
         let first = &mut self.outgoing[0];
         let Some(mut asked) = first.asked.take() else {
@@ -265,7 +265,7 @@ impl DeliveryWorker {
         }
     }
 
-    /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
+    /// Notes that the rate limiter holds the first chunk. Pauses before the retry unless the replay server keeps the chunk.
     fn note_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
         self.state.progress().is_held = true;
@@ -283,7 +283,7 @@ impl DeliveryWorker {
         }
     }
 
-    /// Before the next try; an actor that is to leave does not ask faster for it.
+    /// Pauses before the next try. Sleeps during a shutdown, when `wait_timeout` would return at once.
     fn pause(&self) {
         match self.shutdown.is_set() {
             true => std::thread::sleep(RETRY_PAUSE),

@@ -160,7 +160,7 @@ impl Server {
         });
         // A request that is on its way wants its answer before the session is closed.
         shutdown.set();
-        while !matches!(source.next(ANSWER_MAX)?, Next::Finished) {}
+        while matches!(source.next(ANSWER_MAX)?, Next::Batch(_)) {}
         rate
     }
 

@@ -1,5 +1,5 @@
-//! The cache of an experiment: its folder with finished pieces of work, from which it resumes, its data and its figures.
-//! It knows no experiment; what a piece is and what follows from all of them is theirs. Whole runs are kept by `sweep::runs`.
+//! The cache of an experiment: its folder with finished pieces of work, from which it resumes, and with its data and figures.
+//! Each experiment decides what a piece is and what follows from all pieces. `sweep::runs` keeps whole runs.
 
 use std::{
     fs,
@@ -31,25 +31,25 @@ use crate::{
     progress::Progress,
 };
 
-/// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
+/// The subfolder with the finished pieces, one file each, and the settings that made them. Git ignores it.
 const PIECES: &str = "pieces";
 const SETTINGS: &str = "settings.json";
-/// The piece with how many cores this machine has, if that is where work is done.
+/// The piece with the number of cores of the machine that does the work.
 const CORES: &str = "cores";
-/// Where the runs of a sweep lie. Git does not keep them.
+/// The subfolder with the runs of a sweep. Git ignores it.
 pub(crate) const RUNS: &str = "runs";
 
-/// A finished piece on the disk.
+/// A finished piece as stored on the disk.
 #[derive(Serialize, Deserialize)]
 struct Kept<T> {
-    /// Of what it was made, such as the hash of weights; empty if of the settings alone.
+    /// What the piece was made from, such as the hash of weights; empty if it depends on the settings alone.
     #[serde(default)]
     of: String,
     seconds: f64,
     result: T,
 }
 
-/// An experiment under way.
+/// The open folder of an experiment, with its progress and the time of its pieces.
 #[derive(Debug)]
 pub(crate) struct Session {
     folder: PathBuf,
@@ -57,15 +57,15 @@ pub(crate) struct Session {
     report_only: bool,
     progress: Progress,
     seconds: f64,
-    /// Of how many pieces at once this is the sum.
+    /// How many runs were made at once; `seconds` is the sum over all of them.
     at_once: u32,
-    /// Runs that are planned and not finished.
+    /// The names of the runs that are planned and not finished.
     missing: Vec<String>,
 }
 
 impl Session {
-    /// Opens the folder, or makes it. `units` is the work of all pieces together; runs announce their own. A report alone
-    /// needs runs with their calls; it writes down no settings, as they made nothing.
+    /// Opens or creates the folder. `units` is the work of all pieces together; `sweep::queue` adds the work of runs. With `report_only`
+    /// the folder must have pieces or runs, and the settings are not written because they made nothing.
     pub(crate) fn open(
         name: &str,
         flags: &ExperimentFlags,
@@ -112,7 +112,7 @@ impl Session {
         Ok(session)
     }
 
-    /// The piece of this name if it is there and can be read, whatever it was made of.
+    /// Returns the piece of this name if it exists and can be read, whatever it was made from.
     pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         self.read(key).map(|kept| kept.result)
     }
@@ -149,20 +149,20 @@ impl Session {
         &mut self.progress
     }
 
-    /// Whether only what is there is reported.
+    /// Whether this session only reports what the folder already has.
     pub(crate) const fn report_only(&self) -> bool {
         self.report_only
     }
 
-    /// Counts runs, which are kept elsewhere: the time of all together, made `at_once` at a time, and the names of those that are not
-    /// finished.
+    /// Counts runs, which `sweep::runs` keeps: the time of all of them together, how many were made at once, and the names of the
+    /// unfinished ones.
     pub(crate) fn count_runs(&mut self, seconds: f64, at_once: u32, missing: Vec<String>) {
         self.seconds += seconds;
         self.at_once = at_once;
         self.missing = missing;
     }
 
-    /// Makes sure that no run is missing, unless a report of what there is was asked for.
+    /// Returns an error if a run is missing, unless this session only reports.
     pub(crate) fn check_made(&self) -> anyhow::Result<()> {
         ensure!(
             self.missing.is_empty() || self.report_only,
@@ -172,7 +172,7 @@ impl Session {
         Ok(())
     }
 
-    /// Makes sure that there is something to report of these finished runs.
+    /// Returns an error if no run is finished.
     pub(crate) fn check_any<T>(&self, made: &[T]) -> anyhow::Result<()> {
         if made.is_empty() {
             self.check_made()?;
@@ -181,8 +181,8 @@ impl Session {
         Ok(())
     }
 
-    /// The piece of this name, which is `units` of work: read if it is there, else made and kept. `of` names what it is made of, which may
-    /// have changed since, and then it is made anew; nothing if it is made of the settings alone.
+    /// Returns the piece of this name, `units` of work: reads it if it exists, else makes and keeps it. `of` names what the piece is made
+    /// from, empty if from the settings alone. If `of` has changed since, the piece is made again.
     pub(crate) fn piece_of<T: Serialize + DeserializeOwned>(
         &mut self,
         of: &str,
@@ -190,7 +190,7 @@ impl Session {
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        // A piece that cannot be read is made again.
+        // A piece that cannot be read is made again, like a missing one.
         if let Some(kept) = self.read::<T>(key).filter(|kept| kept.of == of) {
             self.progress.find(units);
             self.seconds += kept.seconds;
@@ -211,14 +211,14 @@ impl Session {
         };
         self.write(key, &kept)?;
         self.seconds += kept.seconds;
-        // What it has not counted itself; only now, so that an interrupt finds the piece kept.
+        // Counts the units that `make` did not count. This comes after the write, so that an interrupt here does not lose the piece.
         let rest = units.saturating_sub(self.progress.done() - before);
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
         counted.inspect_err(stopped)?;
         Ok(kept.result)
     }
 
-    /// [`Session::piece_of`] what this program makes of `what`: another program's is made anew, but for a report.
+    /// Like [`Session::piece_of`] for what this program computes from `what`. A piece of another program is remade, except for a report.
     pub(crate) fn computed<T: Serialize + DeserializeOwned>(
         &mut self,
         what: &str,
@@ -234,7 +234,7 @@ impl Session {
         self.piece_of(&of, key, units, make)
     }
 
-    /// Writes rows as `name.csv`, below the names of their columns, parted by commas.
+    /// Writes rows as `name.csv` below a header. `columns` are the column names, separated by commas.
     pub(crate) fn csv<R: Serialize>(
         &self,
         name: &str,
@@ -260,8 +260,8 @@ impl Session {
         Ok(())
     }
 
-    /// Writes the page of this template with these values and the runs that are `missing`, says where it is, and ends: with an error if
-    /// a run failed, which the page is then without.
+    /// Fills the page template with these values and the `missing` runs, writes the page and prints its path. Returns an error if a run
+    /// failed and is therefore not on the page.
     pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
         let time = time(self.seconds, self.at_once, self.kept_piece(CORES));
@@ -274,19 +274,19 @@ impl Session {
     }
 }
 
-/// The settings that the experiment's pieces were made with; none if there are none yet, or they cannot be read.
+/// Returns the settings that made the experiment's pieces; `None` if there are none yet or they cannot be read.
 pub(crate) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
     let text = fs::read_to_string(folder(name, flags).join(PIECES).join(SETTINGS)).ok()?;
     serde_json::from_str(&text).ok()
 }
 
-/// The folder of the experiment `name`, by what the flags say.
+/// Returns the folder of the experiment `name`: `--out`, or the default.
 fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
     let default = || Path::new("experiments").join(name);
     flags.out.clone().unwrap_or_else(default)
 }
 
-/// Names this program and the processor it runs on, for [`Session::piece_of`]: the size of its file and when that was written.
+/// Identifies this program and its processor, for [`Session::piece_of`]: the size and modification time of its file, and the model.
 pub(crate) fn program() -> anyhow::Result<String> {
     let file = process_env::program();
     let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
@@ -317,7 +317,7 @@ mod tests {
         let report = |settings: &str| Session::open("walk", &flags, &settings, 40, true);
         assert!(report("a").unwrap_err().is::<Usage>());
         assert!(!folder.path().join("walk").exists());
-        // Of runs that were copied there, with the wrong flags: they are not what is kept.
+        // A folder with copied runs, opened with wrong flags: the flags are not stored.
         fs::create_dir_all(folder.path().join("walk/runs")).unwrap();
         let copied = report("wrong").unwrap();
         assert_eq!(copied.kept_piece::<u32>(CORES), None, "of another machine");
@@ -329,15 +329,15 @@ mod tests {
         let made = |key: &str, made: u32| open("a").unwrap().piece_of("", key, 2, |_| Ok(made));
         assert_eq!(made("one", 8).unwrap(), 7, "it is kept");
         assert_eq!(made("two", 8).unwrap(), 8);
-        // Cut off in the middle of a write by a crash of the machine.
+        // A crash of the machine cut the file off in the middle of a write.
         fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();
         assert_eq!(made("one", 9).unwrap(), 9);
         assert!(open("b").unwrap_err().is::<Usage>());
-        // What it was made of has changed.
+        // The source of the piece has changed.
         let mut of = |of: &str, made: u32| session.piece_of(of, "played", 1, |_| Ok(made)).unwrap();
         let all = [of("x", 1), of("x", 2), of("y", 3), of("y", 4)];
         assert_eq!(all, [1, 1, 3, 3]);
-        // Read whatever it was made of.
+        // `kept_piece` reads a piece whatever it was made from.
         assert_eq!(session.kept_piece::<u32>("played"), Some(3));
         assert_eq!(session.kept_piece::<u32>("never"), None);
         session.keep("calls", ["driml tradeoff"]).unwrap();
@@ -355,7 +355,7 @@ mod tests {
         assert_eq!(computed(&mut session, "w", 3), 3);
         assert_eq!(computed(&mut reported, "v", 4), 4);
         assert!(report("b").unwrap_err().is::<Usage>());
-        // Ctrl-C while it is made: first it is kept.
+        // Ctrl-C while a piece is made: the piece is kept first.
         let stopped = session.piece_of("", "slow", 1, |progress| {
             nix::sys::signal::raise(nix::sys::signal::Signal::SIGINT)?;
             progress.shutdown().ending.wait();
@@ -363,7 +363,7 @@ mod tests {
         });
         assert!(stopped.unwrap_err().is::<Interrupted>());
         assert_eq!(session.kept_piece::<u32>("slow"), Some(5));
-        // Runs that failed are no fault of the call.
+        // Failed runs are not a usage error.
         for (session, is_usage) in [(&mut session, false), (&mut reported, true)] {
             session.count_runs(0.0, 1, vec!["a".into()]);
             let said = session.check_any::<u32>(&[]).unwrap_err();

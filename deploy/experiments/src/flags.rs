@@ -1,5 +1,5 @@
 //! The command line of `driml experiment`.
-//! What a value means is for the experiment that takes it; the settings of its full or smoke length are chosen here.
+//! Each experiment interprets its own values; this module also reads the built-in settings of the full or smoke length.
 
 use std::{collections::BTreeSet, path::PathBuf};
 
@@ -22,7 +22,7 @@ pub enum ExperimentCommand {
     Stability(ExperimentFlags),
 }
 
-/// Seeds that a run may have, and up to which finished runs are looked for.
+/// The largest seed of a run. Finished runs are looked for up to this seed.
 pub(crate) const SEEDS_MAX: u32 = 1000;
 
 /// What every experiment takes.
@@ -155,7 +155,7 @@ pub struct SweepArgs {
     pub(crate) out: Option<PathBuf>,
 }
 
-/// The table `full` or `smoke` of an experiment's settings, which are built in.
+/// Reads the table `full` or `smoke` of an experiment's built-in settings.
 pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
     let length = if smoke { "smoke" } else { "full" };
     let read = || -> Result<T, toml::de::Error> {
@@ -168,7 +168,7 @@ pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool)
     })
 }
 
-/// What the names of a list stand for, each once: two runs of one name would be one.
+/// Expands each name with `of` and drops duplicates, because runs of the same name would share a folder.
 pub(crate) fn once(
     names: &[String],
     of: impl Fn(&str) -> Result<Vec<String>, Usage>,
@@ -180,7 +180,7 @@ pub(crate) fn once(
     Ok(all.into_iter().filter(new).collect())
 }
 
-/// The command that this process was called with, for a page: without where it writes, and without asking for a report alone.
+/// Returns the command line of this process for a page, without `--out` and `--report`.
 pub(crate) fn this_command() -> String {
     let mut words = vec!["driml".to_owned()];
     let args = std::env::args_os().skip(1);
@@ -207,7 +207,7 @@ pub(crate) mod tests {
         args: T,
     }
 
-    /// What a command takes from these words.
+    /// Parses the arguments of a command from these words.
     pub(crate) fn parsed<T: Args>(words: &str) -> T {
         let words = ["driml"].into_iter().chain(words.split_whitespace());
         CommandLine::parse_from(words).args

@@ -1,16 +1,16 @@
-//! `driml experiment`, `driml sweep`, `driml tradeoff` and `driml plot`: whatever is made of runs or of small trainings, and leaves
+//! Implements `driml experiment`, `driml sweep`, `driml tradeoff` and `driml plot`. They make runs or small trainings, and write
 //! figures, data and a page.
 //!
-//! * `sweep` is the engine for runs: it makes, resumes and keeps those of every combination of settings and seed. `sweeps` are the
-//!   experiments that consist of runs, each a TOML file, a page template and what is special about it.
-//! * `studies` are the experiments that train something of their own; `stability` measures numeric routines.
+//! * `sweep` is the engine for runs: it makes, resumes and keeps the runs of every combination of settings and seed. `sweeps` has the
+//!   experiments that consist of runs: for each a TOML file, a page template and its special code.
+//! * `studies` has the experiments that train small networks without runs; `stability` measures the errors of numeric routines.
 //! * `cache` keeps finished pieces of work in an experiment's folder, `stats` has the statistics, `page` fills in templates, `plot` draws
-//!   what runs recorded, `small` makes the smallest networks.
+//!   the metrics of runs, `small` makes the smallest networks.
 //!
-//! A new experiment of runs is three files in `sweeps` and a variant of [`flags::ExperimentCommand`]. Results that are kept are in
+//! A new experiment of runs needs three files in `sweeps` and a variant of [`flags::ExperimentCommand`]. Published results are in
 //! `deploy/experiments/results/`.
 //!
-//! Start with [`run`]; what it takes comes from a command line, here the one of Fig. 1 in its short form:
+//! Start with [`run`]. Its argument comes from a command line, here the short form of the experiment of Fig. 1:
 //!
 //! ```no_run
 //! use clap::Parser;
@@ -51,7 +51,7 @@ pub use crate::{sweep::command::run as sweep, sweeps::tradeoff::run as tradeoff}
 /// Runs the experiment that the command names.
 ///
 /// # Errors
-/// A folder of other settings, a file system that refuses, an interrupt; a promise of a routine that is not kept.
+/// The folder was made with other settings, a file cannot be read or written, the user interrupts, or a routine breaks its promise.
 pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
     match command {
         ExperimentCommand::RandomWalk(flags) => random_walk::run(flags),

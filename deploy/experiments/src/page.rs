@@ -1,5 +1,5 @@
-//! The page that an experiment leaves: claim, command, time, expected, got, differences.
-//! Its text is a minijinja template beside the experiment; its numbers come from results alone, so that none can be stale.
+//! The page that an experiment writes: claim, command, time, expected and actual results, differences.
+//! The text is a minijinja template beside the experiment. All numbers come from the results, so that none can be stale.
 
 use driml_machine::units::rough_duration;
 use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context};
@@ -12,8 +12,8 @@ use crate::{
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
 
-/// What a page says of the time that all pieces took together, made `at_once` at a time, on a machine with so many `cores` where that is
-/// known.
+/// Describes for a page the time that all pieces took together: `at_once` runs were made at a time, on a machine with `cores` cores if
+/// that is known.
 pub(crate) fn time(seconds: f64, at_once: u32, cores: Option<u32>) -> String {
     let at_once = match at_once {
         1 => String::new(),
@@ -26,9 +26,9 @@ pub(crate) fn time(seconds: f64, at_once: u32, cores: Option<u32>) -> String {
     }
 }
 
-/// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
-/// smoke length or not.
-/// The values are none of JSON's, which would make a null of NaN, and a mean would leave that out.
+/// Returns the page of `template` as Markdown, filled with `values`. `smoke` adds a warning that the numbers mean nothing. The command
+/// is that of this process unless `values` has another.
+/// Do not build `values` through JSON: it turns NaN into null, which a mean would silently leave out.
 pub(crate) fn page(template: &str, values: Value, smoke: bool, time: &str) -> String {
     let values = context! {
         time,
@@ -40,16 +40,16 @@ pub(crate) fn page(template: &str, values: Value, smoke: bool, time: &str) -> St
     })
 }
 
-/// What came out, for the terminal: the list below "Results".
+/// Returns the list below "Results" of a page, for the terminal.
 pub(crate) fn summary(page: &str) -> String {
     let list = page.split("**Results.**\n\n").nth(1).unwrap_or_default();
     list.split("\n\n").next().unwrap_or_default().to_owned() + "\n"
 }
 
-/// The text that `template` becomes. Blocks of which nothing is left are left out.
+/// Fills `template` with `values`. Empty blocks are dropped.
 ///
 /// # Errors
-/// The template is not one, or names a value that its experiment does not give.
+/// The template has a syntax error, or names a value that its experiment does not provide.
 pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
@@ -93,13 +93,13 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     Ok(blocks.join("\n\n") + "\n")
 }
 
-/// A number times `unit`, which is 1 where it is not given.
+/// Formats a number times `unit` (1 by default) with fixed decimals.
 fn fixed(value: Value, decimals: usize, unit: Option<f64>) -> Result<String, Error> {
     let unit = unit.unwrap_or(1.0);
     written(&value, |it| format!("{:.decimals$}", it * unit))
 }
 
-/// A number as a template has it, a dash if it is none. One that its experiment does not give is a mistake.
+/// Formats a number with `text`, or a dash for `None`. An undefined value is an error.
 fn written(value: &Value, text: impl Fn(f64) -> String) -> Result<String, Error> {
     match value.is_none() || value.as_str() == Some("-") {
         true => Ok("-".into()),
@@ -107,7 +107,7 @@ fn written(value: &Value, text: impl Fn(f64) -> String) -> Result<String, Error>
     }
 }
 
-/// The numbers of a list, those of runs and seeds that have one.
+/// Returns the numbers of a list without the `None` entries, which are runs and seeds that lack the number.
 fn list_of(list: &Value) -> Result<Vec<f64>, Error> {
     if list.is_undefined() {
         return Err(ErrorKind::UndefinedError.into());
@@ -116,12 +116,12 @@ fn list_of(list: &Value) -> Result<Vec<f64>, Error> {
     known.map(f64::try_from).collect()
 }
 
-/// What follows from a list's numbers, a dash if nothing does.
+/// Applies `of` to the numbers of a list; a dash if the result is `None`.
 fn of_list<T: Into<Value>>(list: &Value, of: impl Fn(&[f64]) -> Option<T>) -> Result<Value, Error> {
     Ok(of(&list_of(list)?).map_or_else(|| "-".into(), Into::into))
 }
 
-/// The mean, with the standard deviation of several values, `in_words` or behind a sign.
+/// Formats the mean, and for several values the standard deviation: `in_words` or after "±".
 fn mean_and_sd(values: &[f64], decimals: usize, in_words: bool) -> Option<String> {
     let spread = Spread::of(values.iter().copied())?;
     let [mean, sd] = [spread.mean, spread.sd].map(|it| format!("{it:.decimals$}"));
@@ -133,7 +133,7 @@ fn mean_and_sd(values: &[f64], decimals: usize, in_words: bool) -> Option<String
     })
 }
 
-/// A picture with its caption below it, and a link to the SVG.
+/// Returns the Markdown of a picture with its caption below and a link to the SVG.
 fn figure(stem: &str, caption: &str) -> String {
     format!("![{caption}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
 }

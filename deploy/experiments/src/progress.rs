@@ -1,5 +1,5 @@
-//! How far an experiment is and how long the rest will take: a bar on a terminal, a line now and then elsewhere.
-//! It also notices Ctrl-C, after every unit of work.
+//! Shows the progress of an experiment and the time left: a bar on a terminal, else a line from time to time.
+//! It also checks for Ctrl-C after every unit of work.
 
 use std::time::Instant;
 
@@ -14,7 +14,7 @@ const TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
 pub(crate) struct Progress {
     total: u64,
     done: u64,
-    /// Done before this start: known, so no measure of speed.
+    /// The units that an earlier start did; they do not count for the speed.
     found: u64,
     started: Instant,
     what: String,
@@ -54,7 +54,7 @@ impl Progress {
         self.done
     }
 
-    /// Announces more work: what is found to be needed on the way, and what was done in vain and has to be done again.
+    /// Adds units to the total: work that turns out to be needed, or that failed and must be done again.
     pub(crate) fn again(&mut self, units: u64) {
         self.total += units;
         if let Some(bar) = self.screen.bar() {
@@ -76,7 +76,7 @@ impl Progress {
         self.screen.line(line);
     }
 
-    /// Whether Ctrl-C or a signal has asked to stop, once and again.
+    /// The shutdown flags: `ending` is set by the first Ctrl-C or signal, `now` by the second.
     pub(crate) const fn shutdown(&self) -> &GracefulShutdown {
         &self.shutdown
     }
@@ -98,7 +98,7 @@ impl Progress {
         });
     }
 
-    /// At the speed so far; none before there is one.
+    /// Returns the seconds left at the speed so far; `None` until this start has done some work.
     pub(crate) fn seconds_left(&self, elapsed: f64) -> Option<f64> {
         let fresh = self.done - self.found;
         let left = self.total.saturating_sub(self.done);

@@ -1,11 +1,11 @@
-//! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once.
+//! The smallest possible networks, to pass given numbers through routines that work on all parameters at once.
 
 use std::{collections::HashMap, iter};
 
 use candle_core::{Device, Tensor};
 use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result, TorsoName};
 
-/// A network of one pixel, one action and these atoms; its head's weight has `atoms` times `hidden` scalars.
+/// Returns the config of a network with one pixel, one action and `atoms` atoms. The weight of its head has `atoms * hidden` scalars.
 pub(crate) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
     ModelConfig {
         height: 1,
@@ -32,19 +32,19 @@ pub(crate) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
     }
 }
 
-/// The network of least parameters: eight in all.
+/// Returns the config of the network with the fewest parameters: eight scalars.
 pub(crate) fn least() -> ModelConfig {
     config(2, 1, (-1.0, 1.0))
 }
 
-/// Scalars in all parameters together.
+/// Returns the number of scalars in all parameters together.
 pub(crate) fn len(config: &ModelConfig) -> usize {
     let shapes = config.parameter_shapes().into_iter();
     let scalars = |(_, shape): (_, Vec<usize>)| shape.iter().product::<usize>();
     shapes.map(scalars).sum()
 }
 
-/// Tensors with these scalars, one after the other; 0 where there are no more.
+/// Fills the tensors of the parameters with these scalars, one tensor after the other. Missing scalars are 0.
 pub(crate) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<String, Tensor>> {
     let mut rest = values.iter().copied().chain(iter::repeat(0.0));
     let each = config.parameter_shapes().into_iter().map(|(name, shape)| {
@@ -54,12 +54,12 @@ pub(crate) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<St
     each.collect()
 }
 
-/// Parameters with these scalars, which are finite, as [`tensors`] takes them.
+/// Returns parameters with these finite scalars, in the order of [`tensors`].
 pub(crate) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
     Parameters::from_tensors(config, tensors(config, values)?, &Device::Cpu)
 }
 
-/// The scalars of all parameters, in the order of [`parameters`].
+/// Returns the scalars of all parameters, in the order of [`parameters`].
 pub(crate) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Vec<f32>> {
     let mut values = Vec::new();
     for (name, _) in config.parameter_shapes() {

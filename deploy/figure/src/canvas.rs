@@ -1,32 +1,32 @@
-//! Shapes in figure units, written as SVG in the order in which they are drawn, with numbers cut to two decimals.
-//! It knows no axis and no file.
+//! A canvas that writes shapes as SVG, in figure units, in the order in which they are drawn. Numbers are rounded to two decimals.
+//! The canvas knows nothing about axes and files.
 
 use super::{
     colours::{Colour, INK},
     font::{self, Weight},
 };
 
-/// Fonts of a viewer: the one by which widths are measured, or one nearly as wide.
+/// Fonts for the viewer to choose from: the one used to measure widths, then fonts that are nearly as wide.
 const FONTS: &str = "DejaVu Sans, Verdana, Segoe UI, Helvetica, Arial, sans-serif";
 
-/// A point: x to the right, y downwards.
+/// A point (x, y): x points to the right, y downwards.
 pub(super) type Point = (f64, f64);
 
-/// An upright rectangle by its upper left corner.
+/// An axis-aligned rectangle, given by its upper left corner and its size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rect {
-    /// Distance of its left edge from the picture's, in pixels.
+    /// The distance of the left edge from the left edge of the picture, in pixels.
     pub x: f64,
-    /// Distance of its upper edge from the picture's, in pixels.
+    /// The distance of the upper edge from the upper edge of the picture, in pixels.
     pub y: f64,
-    /// Pixels from its left to its right edge.
+    /// The width in pixels.
     pub width: f64,
-    /// Pixels from its upper to its lower edge.
+    /// The height in pixels.
     pub height: f64,
 }
 
 impl Rect {
-    /// The rectangle of this corner and size.
+    /// Creates a rectangle with this upper left corner and this size.
     pub const fn new(x: f64, y: f64, width: f64, height: f64) -> Self {
         Self {
             x,
@@ -45,7 +45,7 @@ impl Rect {
     }
 }
 
-/// Where a text stands from its point.
+/// Which end of a text lies at its point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Anchor {
     Start,
@@ -59,14 +59,14 @@ pub(super) struct TextStyle {
     pub(super) weight: Weight,
     pub(super) colour: Colour,
     pub(super) anchor: Anchor,
-    /// Turned to run upwards.
+    /// Whether the text is rotated to run upwards.
     pub(super) upright: bool,
-    /// The length to which a text is cut.
+    /// The length at which a text is cut.
     length_max: f64,
 }
 
 impl TextStyle {
-    /// Regular letters from left to right.
+    /// Creates a style with regular weight, horizontal and without a length limit.
     pub(super) const fn new(size: f64, colour: Colour, anchor: Anchor) -> Self {
         Self {
             size,
@@ -96,9 +96,9 @@ impl TextStyle {
 /// How letters are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Letters {
-    /// As text, in a font of the viewer.
+    /// As text, in a font that the viewer has.
     Text,
-    /// As outlines, in the font that comes along.
+    /// As outlines, in the built-in font.
     Outlines,
 }
 
@@ -121,7 +121,7 @@ impl Canvas {
         }
     }
 
-    /// The picture as a text that ends with a line's end.
+    /// Returns the SVG text, which ends with a newline.
     pub(super) fn svg(&self) -> String {
         let [width, height] = [self.width, self.height].map(number);
         let size = format!(r#"width="{width}" height="{height}" viewBox="0 0 {width} {height}""#);
@@ -145,7 +145,7 @@ impl Canvas {
     }
 
     fn polyline(&mut self, points: &[Point], pen: &str) {
-        // A line without length has no direction to be drawn in.
+        // Points that all coincide give no visible line.
         if points.iter().any(|point| *point != points[0]) {
             let points = format!(r#"points="{}""#, corners(points));
             self.add(&format!(r#"<polyline {points} fill="none" {pen}/>"#));
@@ -177,7 +177,7 @@ impl Canvas {
         self.add(&format!("<circle {place} {ink}/>"));
     }
 
-    /// Draws filled rectangles of one colour, with hard edges; none for a side of 0 or NaN.
+    /// Draws filled rectangles of one colour with sharp edges. Rectangles with a side of 0 or NaN are skipped.
     pub(super) fn rects(&mut self, rects: &[Rect], fill: Colour) {
         let seen = rects.iter().filter(|it| it.width > 0.0 && it.height > 0.0);
         let path = seen.map(|it| {
@@ -192,20 +192,20 @@ impl Canvas {
         }
     }
 
-    /// Draws a rectangle's rim.
+    /// Draws the outline of a rectangle.
     pub(super) fn frame(&mut self, rect: Rect, colour: Colour, width: f64) {
         let (sides, pen) = (sides(rect), pen(colour, width));
         self.add(&format!(r#"<rect {sides} fill="none" {pen}/>"#));
     }
 
-    /// Draws a background with round corners.
+    /// Draws a filled rectangle with round corners and a border.
     pub(super) fn card(&mut self, rect: Rect, fill: Colour, border: Colour) {
         let pen = pen(border, 1.0);
         let (sides, brush) = (sides(rect), brush(fill));
         self.add(&format!(r#"<rect {sides} rx="8" {brush} {pen}/>"#));
     }
 
-    /// Writes a line of text whose baseline is at the point, cut to the style's length.
+    /// Writes a line of text with its baseline at the point. Text longer than the style allows is cut.
     pub(super) fn text(&mut self, (x, y): Point, text: &str, style: TextStyle) {
         let text = font::fit(text, style.size, style.weight, style.length_max);
         if text.is_empty() {
@@ -259,12 +259,12 @@ fn pen(colour: Colour, width: f64) -> String {
     format!(r#"stroke="{hex}" stroke-width="{width}""#)
 }
 
-/// Two decimals; more would make the file longer, not the picture better.
+/// Rounds to two decimals: more would make the file longer without a visible gain.
 fn number(value: f64) -> f64 {
     (value * 100.0).round() / 100.0
 }
 
-/// Draws a panel's title and returns what is left below it.
+/// Draws a panel's title and returns the rectangle below it.
 pub(super) fn titled(canvas: &mut Canvas, place: Rect, title: &str) -> Rect {
     const SIZE: f64 = 14.0;
     let style = TextStyle::new(SIZE, INK, Anchor::Start).bold();

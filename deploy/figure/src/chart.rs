@@ -1,5 +1,5 @@
-//! A chart: series as lines, points and bands over two axes, with its legend above the plot so that it hides nothing.
-//! It computes no statistics; what a band means is for the caller to say.
+//! A chart: series as lines, points and bands over two axes. The legend is above the plot, so that it hides no data.
+//! The chart computes no statistics: the caller decides what a band means.
 
 use super::{
     canvas::{Anchor, Canvas, Point, Rect, TextStyle, titled},
@@ -17,24 +17,24 @@ const BAND_ALPHA: f32 = 0.18;
 const LINE_WIDTH: f64 = 1.8;
 const DOT_RADIUS: f64 = 3.0;
 const RING_RADIUS: f64 = 5.0;
-/// Share of an axis's range that is left free at its ends.
+/// The share of an axis's range that stays free at each end.
 const SLACK: f64 = 0.05;
 
-/// One axis of a chart: its name, how it spreads values and what it must span.
+/// One axis of a chart: its label, its scale (linear, logarithmic or names) and the values that it must cover.
 #[derive(Clone, Debug, Default)]
 pub struct Axis {
-    /// What it counts, with its unit.
+    /// The quantity on this axis, with its unit.
     pub label: String,
-    /// Whether it spreads values by their logarithm; those of 0 and below are left out.
+    /// Whether the axis is logarithmic. Values of 0 and below are then left out.
     is_log: bool,
-    /// Values that it shows whatever the series have.
+    /// Values that the axis always covers, whatever values the series have.
     shows: Vec<f64>,
-    /// Names of 0, 1, 2, ... instead of numbers; empty for numbers.
+    /// Names for the values 0, 1, 2, ..., written instead of numbers. Empty if the axis has numbers.
     names: Vec<String>,
 }
 
 impl Axis {
-    /// An even axis.
+    /// Creates a linear axis.
     pub fn linear(label: &str) -> Self {
         Self {
             label: label.to_owned(),
@@ -42,7 +42,7 @@ impl Axis {
         }
     }
 
-    /// An axis of things: the first at 0, the next at 1.
+    /// Creates an axis of names: the first name is at 0, the next at 1.
     pub fn names(label: &str, names: &[String]) -> Self {
         let last = names.len().saturating_sub(1) as f64;
         Self {
@@ -51,7 +51,7 @@ impl Axis {
         }
     }
 
-    /// A logarithmic axis.
+    /// Creates a logarithmic axis.
     pub fn log(label: &str) -> Self {
         Self {
             is_log: true,
@@ -59,7 +59,7 @@ impl Axis {
         }
     }
 
-    /// The same axis, showing these values too.
+    /// Returns the same axis, which also covers these values.
     pub fn showing(mut self, values: &[f64]) -> Self {
         self.shows.extend(values);
         self
@@ -69,7 +69,7 @@ impl Axis {
         value.is_finite() && (!self.is_log || value > 0.0)
     }
 
-    /// The value where equal steps are equally long: itself or its logarithm.
+    /// Maps a value to the scale of the axis: the value itself, or its decimal logarithm.
     fn spread(&self, value: f64) -> f64 {
         match self.is_log {
             true => value.log10(),
@@ -77,7 +77,7 @@ impl Axis {
         }
     }
 
-    /// Its range for these values, with slack; none without values.
+    /// Returns the axis's range for these values, widened by `slack`; `None` without values.
     fn scale(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<Scale<'_>> {
         let all = values.chain(self.shows.iter().copied());
         let kept = all.filter(|value| self.keeps(*value));
@@ -94,7 +94,7 @@ impl Axis {
     }
 }
 
-/// An axis, and the first and last value, evenly spread, that its side of the plot stands for.
+/// An axis with its range: `low` and `high` are the values at the ends, after [`Axis::spread`].
 struct Scale<'a> {
     axis: &'a Axis,
     low: f64,
@@ -102,12 +102,12 @@ struct Scale<'a> {
 }
 
 impl Scale<'_> {
-    /// Where on the side a value lies, in 0..=1.
+    /// Returns the position of a value along the axis, in 0..=1 for values within the range.
     fn share(&self, value: f64) -> f64 {
         (self.axis.spread(value) - self.low) / (self.high - self.low)
     }
 
-    /// Values to mark on a side of this length, about one each so many units, with their labels.
+    /// Returns the tick values and their labels for an axis of this length: about one tick every `each` units.
     fn ticks(&self, length: f64, each: f64) -> Vec<(f64, String)> {
         let ticks = match (&self.axis.names[..], self.axis.is_log) {
             ([], true) => ticks::log(10f64.powf(self.low), 10f64.powf(self.high)),
@@ -129,29 +129,29 @@ pub enum Mark {
     Line,
     /// A dashed line through the points.
     Dashed,
-    /// Open circles, which leave another point on them visible.
+    /// Open circles, so that points of another series inside them stay visible.
     Rings,
-    /// The points, each with a vertical bar from its band's low to its high.
+    /// The points, each with a vertical bar from the low to the high end of its band.
     Bars,
 }
 
-/// Points of one colour and one entry of the legend.
+/// Points that share one colour and one legend entry.
 #[derive(Clone, Debug)]
 pub struct Series {
-    /// Its entry in the legend; empty for none.
+    /// The legend entry; empty if the series has none.
     pub name: String,
-    /// The colour of its marks and of its entry in the legend.
+    /// The colour of the marks and of the legend entry.
     pub colour: Colour,
-    /// How it is drawn.
+    /// How the points are drawn.
     pub mark: Mark,
-    /// (x, y) in the order of x.
+    /// The points (x, y), sorted by x.
     pub points: Vec<(f64, f64)>,
-    /// (x, low, high) in the order of x; empty for no band.
+    /// The band (x, low, high), sorted by x; empty if the series has none.
     pub band: Vec<(f64, f64, f64)>,
 }
 
 impl Series {
-    /// A line in the colour of this index, dashed where the colours come again.
+    /// Creates a line in the colour of this index. Lines of the second round of colours are dashed.
     pub fn line(name: &str, index: usize, points: Vec<(f64, f64)>) -> Self {
         Self {
             name: name.to_owned(),
@@ -165,25 +165,25 @@ impl Series {
         }
     }
 
-    /// The same series, drawn otherwise.
+    /// Returns the same series with another mark.
     pub fn marked(mut self, mark: Mark) -> Self {
         self.mark = mark;
         self
     }
 
-    /// The same series in another colour.
+    /// Returns the same series in another colour.
     pub fn coloured(mut self, colour: Colour) -> Self {
         self.colour = colour;
         self
     }
 
-    /// The same series with a band.
+    /// Returns the same series with a band.
     pub fn banded(mut self, band: Vec<(f64, f64, f64)>) -> Self {
         self.band = band;
         self
     }
 
-    /// Draws its marks at these places.
+    /// Draws the marks of the series at these positions.
     fn marks(&self, canvas: &mut Canvas, places: &[Point]) {
         let (colour, has_length) = (self.colour, places.len() > 1);
         match self.mark {
@@ -193,7 +193,7 @@ impl Series {
                 let ring = |place: &Point| canvas.ring(*place, RING_RADIUS, colour);
                 places.iter().for_each(ring);
             }
-            // A line of one point would be invisible.
+            // A line of one point would be invisible, so draw a dot.
             Mark::Bars | Mark::Line | Mark::Dashed => {
                 let dot = |place: &Point| canvas.dot(*place, DOT_RADIUS, colour);
                 places.iter().for_each(dot);
@@ -212,7 +212,7 @@ pub struct Chart {
 }
 
 impl Chart {
-    /// A chart of these series; later ones lie on top.
+    /// Creates a chart of these series. Later series lie on top of earlier ones.
     pub fn new(title: &str, x: Axis, y: Axis, series: Vec<Series>) -> Self {
         Self {
             title: title.to_owned(),
@@ -253,7 +253,7 @@ impl Chart {
         }
     }
 
-    /// Draws the legend in as many rows as it needs; returns what is left below it.
+    /// Draws the legend in as many rows as it needs, and returns the rectangle below the legend.
     fn legend(&self, canvas: &mut Canvas, place: Rect) -> Rect {
         let named = || self.series.iter().filter(|series| !series.name.is_empty());
         if named().next().is_none() {
@@ -287,7 +287,7 @@ impl Chart {
     }
 }
 
-/// The plot's place, and what its sides stand for.
+/// The rectangle of the plot, and the ranges of its axes.
 struct Plot<'a> {
     rect: Rect,
     x: Scale<'a>,
@@ -306,7 +306,7 @@ impl Plot<'_> {
         self.x.axis.keeps(x) && self.y.axis.keeps(y)
     }
 
-    /// Draws the grid and what stands around it, from `left` on.
+    /// Draws the grid, tick labels and axis labels. `left` is the x of the panel's left edge.
     fn axes(&self, canvas: &mut Canvas, y_ticks: &[(f64, String)], left: f64) {
         let plot = self.rect;
         let x_ticks = self.x.ticks(plot.width, 74.0);

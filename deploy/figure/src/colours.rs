@@ -1,7 +1,7 @@
-//! Colours that stay apart in print and for colour-blind readers, on a light card.
-//! It draws nothing.
+//! Colours that readers can tell apart in print and with colour blindness, on a light card.
+//! This module draws nothing.
 
-/// A colour and how much it covers, in 0..=1.
+/// A colour with its opacity `alpha` in 0..=1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Colour {
     pub(super) rgb: [u8; 3],
@@ -16,7 +16,7 @@ impl Colour {
         }
     }
 
-    /// The colour without its alpha, as #rrggbb.
+    /// Returns the colour without its alpha, as #rrggbb.
     pub(super) fn hex(self) -> String {
         let [r, g, b] = self.rgb;
         format!("#{r:02x}{g:02x}{b:02x}")
@@ -34,18 +34,18 @@ pub(super) const CARD_BORDER: Colour = Colour::new(208, 213, 221);
 pub(super) const INK: Colour = Colour::new(26, 30, 36);
 /// Notes and tick labels.
 pub(super) const INK_SOFT: Colour = Colour::new(72, 80, 92);
-/// Lines across a chart.
+/// Grid lines of a chart.
 pub(super) const GRID: Colour = Colour::new(228, 231, 236);
-/// What a chart compares with.
+/// The grey of reference lines, with which a chart compares its series.
 pub const GREY: Colour = Colour::new(120, 126, 135);
-/// Dark cells of a lattice, and the outline on top of it.
+/// Dark cells of a lattice. The next two are its light cells, and the frame that marks part of a map.
 pub(super) const CELL_DARK: Colour = Colour::new(38, 42, 48);
 pub(super) const CELL_LIGHT: Colour = Colour::new(246, 247, 249);
 pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
-/// A cell of a heat map without a value.
+/// A heat map cell without a value.
 const NO_VALUE: Colour = Colour::new(220, 222, 226);
 
-/// How many series there are before a colour comes again.
+/// The number of series colours.
 pub(crate) const SERIES_COLOURS: usize = 7;
 /// Colours of series. Source: Okabe and Ito 2008, without the yellow, which is faint on white.
 const SERIES: [Colour; SERIES_COLOURS] = [
@@ -58,7 +58,7 @@ const SERIES: [Colour; SERIES_COLOURS] = [
     Colour::new(0, 0, 0),
 ];
 
-/// The colour of the series with this index; after seven they come again.
+/// Returns the colour of the series with this index. The colours repeat after seven series.
 pub(crate) const fn series_colour(index: usize) -> Colour {
     SERIES[index % SERIES.len()]
 }
@@ -76,7 +76,7 @@ const VIRIDIS: [[u8; 3]; 9] = [
     [253, 231, 37],
 ];
 
-/// The colour of `share` in 0..=1: dark to light, of even steps to the eye, apart for colour-blind readers; grey for no number.
+/// Returns the viridis colour of `share` in 0..=1, dark to light; grey if not finite. Viridis is even to the eye, also if colour-blind.
 pub(super) fn heat_colour(share: f64) -> Colour {
     if !share.is_finite() {
         return NO_VALUE;
@@ -91,7 +91,7 @@ pub(super) fn heat_colour(share: f64) -> Colour {
     Colour::new(mix(0), mix(1), mix(2))
 }
 
-/// Black or white, whichever reads better on `colour`.
+/// Returns dark or light ink, whichever is easier to read on `colour`.
 pub(super) fn ink_on(colour: Colour) -> Colour {
     let [r, g, b] = colour.rgb.map(f64::from);
     let brightness = 0.299 * r + 0.587 * g + 0.114 * b;

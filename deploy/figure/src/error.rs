@@ -1,17 +1,17 @@
-//! What kept a figure, a picture or a film from its file.
+//! The errors of making and writing figures, pictures and films.
 
 use std::path::{Path, PathBuf};
 
-/// What kept a figure from its file.
+/// Why a figure, a picture or a film could not be made or written.
 #[derive(Debug, thiserror::Error)]
 pub enum FigureError {
-    /// The name asks for no kind of picture that there is.
+    /// The extension of the name is not that of a supported format.
     #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
     Extension(PathBuf),
-    /// The name is not a film's.
+    /// The name of a film does not end in `.gif`.
     #[error("{} is not the name of a film: use one that ends in .gif", .0.display())]
     NoFilm(PathBuf),
-    /// A picture or film of no area, or too large.
+    /// The picture or film has no area or is too large.
     #[error("a picture of {width} x {height} pixels cannot be made")]
     Size {
         /// Width in pixels.
@@ -19,21 +19,21 @@ pub enum FigureError {
         /// Height in pixels.
         height: usize,
     },
-    /// A picture cannot be encoded.
+    /// The picture cannot be encoded.
     #[error("encoding a picture: {0}")]
     Encode(String),
-    /// The file system refused.
+    /// The file cannot be written.
     #[error("writing {}", .path.display())]
     Write {
-        /// The file that was to be written.
+        /// The path of the file.
         path: PathBuf,
-        /// What the file system said.
+        /// The error of the file system.
         source: std::io::Error,
     },
 }
 
 impl FigureError {
-    /// A file that cannot be written.
+    /// Creates the error for a file that cannot be written.
     pub(super) fn write(path: &Path, source: std::io::Error) -> Self {
         let path = path.to_owned();
         Self::Write { path, source }

@@ -1,4 +1,4 @@
-//! A figure: panels in a grid under a title, and the file that it is written to.
+//! A figure: panels in a grid under a title, and how it is written to a file.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use crate::{
     render,
 };
 
-/// Pixels of a PNG for one unit of the figure: sharp on a dense screen and in print.
+/// PNG pixels for each unit of the figure: enough for a sharp picture on a dense screen and in print.
 const PNG_ZOOM: f32 = 1.5;
 /// Space around the panels and between them.
 const MARGIN: f64 = 18.0;
@@ -21,45 +21,45 @@ const TITLE_SIZE: f64 = 17.0;
 const NOTE_SIZE: f64 = 12.5;
 const NOTE_LEADING: f64 = 17.0;
 
-/// One part of a figure.
+/// One panel of a figure.
 #[derive(Debug)]
 pub enum Panel {
     /// Lines, points and bands over two axes.
     Chart(Chart),
-    /// A matrix as colours.
+    /// A matrix, drawn as colours.
     Heat(Heat),
-    /// Black and white cells.
+    /// A square grid of black and white cells.
     Lattice(Lattice),
 }
 
 /// Panels in a grid under a title.
 #[derive(Debug)]
 pub struct Figure {
-    /// What it shows.
+    /// The title above the panels.
     pub title: String,
-    /// Lines under the title: how the numbers were made.
+    /// Lines under the title that say how the numbers were made.
     pub notes: Vec<String>,
-    /// Panels side by side.
+    /// The number of panels in a row.
     pub columns: usize,
-    /// Width and height of each panel.
+    /// Width and height of each panel, in figure units.
     pub panel_size: (f64, f64),
     /// The panels, row by row.
     pub panels: Vec<Panel>,
 }
 
-/// The kind of picture that a file's name asks for.
+/// The file format of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// Scalable, with text as text.
+    /// Vector graphics with text as text.
     Svg,
-    /// Scalable, with text as outlines.
+    /// Vector graphics with text as outlines.
     Pdf,
-    /// Pixels, with the font that comes along.
+    /// Pixels, with text in the built-in font.
     Png,
 }
 
 impl Format {
-    /// By the file's extension: `.svg`, `.pdf` or `.png`.
+    /// Returns the format for the file's extension: `.svg`, `.pdf` or `.png`.
     pub fn of(path: &Path) -> Result<Self, FigureError> {
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("svg") => Ok(Self::Svg),
@@ -70,12 +70,12 @@ impl Format {
     }
 }
 
-/// What stands around the panels.
+/// What is drawn around the panels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Look {
-    /// A card with title and notes; each chart has its legend: for a screen, where nothing else says what is seen.
+    /// A card with title and notes, and a legend in each chart: for a screen, where no caption explains the figure.
     Card,
-    /// The panels alone, and a legend in the first: for a paper, whose caption says the rest.
+    /// The panels alone, with a legend only in the first: for a paper, whose caption explains the rest.
     Plain,
 }
 
@@ -128,7 +128,7 @@ impl Figure {
         canvas
     }
 
-    /// The card, the title and the notes.
+    /// Draws the card, the title and the notes.
     fn head(&self, canvas: &mut Canvas, notes: &[String]) {
         let (width, height) = (canvas.width, canvas.height);
         let whole = Rect::new(0.5, 0.5, width - 1.0, height - 1.0);

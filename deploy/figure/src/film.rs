@@ -1,5 +1,5 @@
-//! Pictures in turn, as an animated GIF that plays over and over. Pixels that did not change are stored as transparent.
-//! It keeps no picture but the last, and knows nothing of what they show.
+//! A sequence of pictures as an animated GIF that repeats forever. Pixels that did not change are stored as transparent.
+//! Only the last picture is kept in memory.
 
 use std::{
     fs::File,
@@ -12,27 +12,27 @@ use tempfile::TempPath;
 
 use crate::{error::FigureError, picture::Picture};
 
-/// Hundredths of a second that viewers show a picture at least; some take less for none.
+/// The shortest delay that viewers respect, in hundredths of a second. Some viewers ignore a shorter delay.
 const DELAY_MIN: u16 = 2;
 
-/// A film that is being written.
+/// A film (animated GIF) that is being written.
 ///
-/// It lies beside its place under another name until it is whole: one that is dropped before that is removed, and leaves the older one
-/// there.
+/// The film is written to `PATH.tmp`; [`Film::finish`] renames it to its path. If a film is dropped before that, its file is removed
+/// and an older file at the path stays.
 pub struct Film {
     path: PathBuf,
     aside: TempPath,
     encoder: Encoder<BufWriter<File>>,
     width: u16,
     height: u16,
-    /// Hundredths of a second of each picture, and what is owed as delays are whole numbers.
+    /// The delay of each picture in hundredths of a second. `owed` carries the rounding error, because GIF delays are whole numbers.
     delay: f64,
     owed: f64,
     shown: Option<Vec<[u8; 3]>>,
 }
 
 impl Film {
-    /// Whether a film can have this name: it ends in `.gif`.
+    /// Returns an error unless the name ends in `.gif`.
     pub fn check_name(path: &Path) -> Result<(), FigureError> {
         match path.extension() {
             Some(extension) if extension == "gif" => Ok(()),
@@ -40,10 +40,10 @@ impl Film {
         }
     }
 
-    /// Begins a film of pictures of `size`, (width, height), so many of them a second.
+    /// Creates a film of pictures of `size` (width, height), shown at `pictures_per_second`.
     ///
     /// # Errors
-    /// A name that does not end in `.gif`, a size that no GIF has, a file that cannot be written.
+    /// The name does not end in `.gif`, a side is 0 or above 65,535 pixels, or the file cannot be written.
     pub fn create(
         path: &Path,
         size: (usize, usize),
@@ -78,10 +78,10 @@ impl Film {
         })
     }
 
-    /// Adds a picture, which is shown `times` as long as the film's pictures are.
+    /// Adds a picture, shown for `times` the film's usual delay.
     ///
     /// # Panics
-    /// If the picture is of another size than the film.
+    /// The size of the picture differs from that of the film.
     pub fn add(&mut self, picture: &Picture, times: f64) -> Result<(), FigureError> {
         let size = (usize::from(self.width), usize::from(self.height));
         assert_eq!(picture.size(), size, "a film has pictures of one size");
@@ -101,7 +101,7 @@ impl Film {
         written.map_err(|e| FigureError::write(&self.path, io::Error::other(e)))
     }
 
-    /// Ends the film and gives it its name.
+    /// Completes the film and renames its file to the final path.
     pub fn finish(self) -> Result<(), FigureError> {
         let ended = self.encoder.into_inner().map_err(io::Error::other);
         let ended = ended.and_then(|mut file| file.flush());
@@ -128,7 +128,7 @@ mod tests {
         picture
     }
 
-    /// Delays of a film of these pictures, and whole pictures as a viewer builds them.
+    /// Writes a film of these pictures; returns the delays, and the whole pictures as a viewer composes them.
     fn played(pictures: &[Picture], rate: f64) -> (Vec<u16>, Vec<Vec<[u8; 3]>>) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.gif");
@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn a_viewer_sees_the_pictures_at_their_rate() {
         let mut pixels: Vec<u8> = (0..3 * 200).map(|i| (i * 7 % 251) as u8).collect();
-        // One pixel, then none, changes.
+        // From picture to picture either one pixel changes or none.
         let pictures = [1, 2, 2, 3, 4, 4].map(|value| {
             pixels[3 * 47] = value;
             picture(&pixels, 20)
@@ -174,7 +174,7 @@ mod tests {
     fn more_colours_than_a_gif_has_are_brought_near() {
         let pixel = |i: i32| [(i % 64) * 4, (i / 64) * 4, 128].map(|c| c as u8);
         let pixels: Vec<u8> = (0..64 * 64).flat_map(pixel).collect();
-        // Of the second picture only the lower half is new.
+        // In the second picture only the lower half changes.
         let mut later = pixels.clone();
         later[3 * 32 * 64..].reverse();
         let pictures = [pixels, later].map(|pixels| picture(&pixels, 64));
@@ -206,7 +206,7 @@ mod tests {
             let said = create(name, width).unwrap_err();
             assert!(said.contains(why), "{said}");
         }
-        // One that is given up leaves the older one there, and nothing else.
+        // A film that is dropped unfinished leaves the older file and no other.
         let path = folder.path().join("x.gif");
         std::fs::write(&path, "older").unwrap();
         create("x.gif", 4).unwrap();

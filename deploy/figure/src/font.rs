@@ -1,5 +1,5 @@
-//! The font that comes along (DejaVu Sans, an open licence): widths and outlines of text.
-//! It knows no kerning and no right-to-left script; figures are in English.
+//! Widths and outlines of text in the built-in font (DejaVu Sans, which has an open licence).
+//! Kerning and right-to-left scripts are not supported: figures are in English.
 
 use std::{fmt::Write as _, sync::LazyLock};
 
@@ -29,7 +29,7 @@ pub(super) fn width(text: &str, size: f64, weight: Weight) -> f64 {
     units * size / f64::from(face.units_per_em())
 }
 
-/// Width of the longest of these texts in regular letters.
+/// Returns the width of the widest of these texts in regular weight.
 pub(super) fn widest<'a>(texts: impl IntoIterator<Item = &'a String>, size: f64) -> f64 {
     let texts = texts.into_iter();
     let widths = texts.map(|text| width(text, size, Weight::Regular));
@@ -41,7 +41,7 @@ fn advance(face: &Face<'_>, c: char) -> f64 {
     f64::from(face.glyph_hor_advance(glyph).unwrap_or_default())
 }
 
-/// `text` cut so that it fits `width_max`, with an ellipsis if anything was cut.
+/// Cuts `text` to fit `width_max`, and adds an ellipsis if anything was cut. Empty if not even the ellipsis fits.
 pub(super) fn fit(text: &str, size: f64, weight: Weight, width_max: f64) -> String {
     if width(text, size, weight) <= width_max {
         return text.to_owned();
@@ -56,7 +56,7 @@ pub(super) fn fit(text: &str, size: f64, weight: Weight, width_max: f64) -> Stri
     String::new()
 }
 
-/// `text` in lines of at most `width_max`, broken at spaces; a longer word has its own line, cut. Sized as if bold.
+/// Breaks `text` at spaces into lines of at most `width_max`, measured in bold. A longer word gets a separate line and is cut.
 pub(super) fn wrap(text: &str, size: f64, width_max: f64) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -72,7 +72,7 @@ pub(super) fn wrap(text: &str, size: f64, width_max: f64) -> Vec<String> {
     lines
 }
 
-/// Outlines of a line of text as an SVG path: it starts at (`left`, 0), and y runs downwards.
+/// Returns the outlines of a line of text as an SVG path that starts at (`left`, 0), with y pointing downwards.
 pub(super) fn outline(text: &str, size: f64, weight: Weight, left: f64) -> String {
     let face = weight.face();
     let mut pen = Pen {

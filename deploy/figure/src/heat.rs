@@ -1,5 +1,5 @@
-//! A matrix as a heat map with square cells, its scale beside it.
-//! It scales no number by itself beyond the range it is given or finds.
+//! A heat map: a matrix as square coloured cells, with a colour scale beside them.
+//! The colours cover the range that the caller gives, or else the range of the values.
 
 use super::{
     canvas::{Anchor, Canvas, Rect, TextStyle, titled},
@@ -10,60 +10,60 @@ use super::{
 const TICK_SIZE: f64 = 11.5;
 const LABEL_SIZE: f64 = 12.5;
 const BAR_WIDTH: f64 = 12.0;
-/// Smallest side of a cell in which its value is written.
+/// The smallest side of a cell that has its value written inside.
 const CELL_TEXT_MIN: f64 = 25.0;
-/// Steps of colour along the scale.
+/// The number of colour steps in the drawn scale.
 const BAR_STEPS: usize = 64;
 
-/// A square to point out, in cells, or in units of the field: left, top, side.
+/// A square frame that marks part of a map. Lengths are in cells, or in units of the [`Field`] if the map has one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outline {
-    /// Cells left of it.
+    /// Cells to the left of the square.
     pub left: f64,
-    /// Cells above it.
+    /// Cells above the square.
     pub top: f64,
-    /// Cells along a side.
+    /// Cells along a side of the square.
     pub side: f64,
 }
 
-/// Where the cells lie in a larger square field, such as the places of a feature map in the picture it looks at.
+/// The position of the cells in a larger square, such as the locations of a feature map in the input frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Field {
-    /// Side of the field.
+    /// The side of the field; it defines the unit of the other lengths.
     pub side: f64,
-    /// From the field's edge to the first cell.
+    /// The distance from the field's left and top edges to the first cell.
     pub first: f64,
-    /// Side of a cell.
+    /// The side of a cell.
     pub cell: f64,
 }
 
-/// A square matrix.
+/// A square matrix with its title, names and scale.
 #[derive(Clone, Debug, Default)]
 pub struct Heat {
-    /// Over the panel.
+    /// The title above the panel.
     pub title: String,
-    /// Cells in a row and in a column.
+    /// The number of cells in a row and in a column.
     pub side: usize,
-    /// Row by row; a cell without a value is grey.
+    /// The values, row by row. A cell without a value is grey.
     pub values: Vec<Option<f64>>,
-    /// Names of rows and columns, from the first; empty for none.
+    /// The names of the rows, which are also those of the columns; empty if there are none.
     pub names: Vec<String>,
-    /// Under the columns, beside the rows.
+    /// The label under the columns and the label beside the rows.
     pub labels: (String, String),
-    /// Beside the scale: what a value is, with its unit.
+    /// The label beside the scale: what a value means, with its unit.
     pub unit: String,
-    /// The ends of the scale; none for the smallest and largest value.
+    /// The ends of the scale; `None` takes the smallest and the largest value.
     pub range: Option<(f64, f64)>,
-    /// Decimals of the values written into cells that are large enough; none to write none.
+    /// The number of decimals of values written into cells that are large enough; `None` writes no values.
     pub decimals: Option<usize>,
-    /// The field in which the cells lie; none if they fill the map.
+    /// The larger square in which the cells lie; `None` if the cells fill the map.
     pub field: Option<Field>,
-    /// A square to point out.
+    /// A square frame that marks part of the map.
     pub outline: Option<Outline>,
 }
 
 impl Heat {
-    /// A heat map without names.
+    /// Creates a heat map without names.
     pub fn new(title: &str, side: usize, values: Vec<Option<f64>>) -> Self {
         assert_eq!(values.len(), side * side, "a square matrix");
         Self {
@@ -98,7 +98,7 @@ impl Heat {
             (_, false) => names_width + LABEL_SIZE + 12.0,
         };
         let right = 14.0 + BAR_WIDTH + 6.0 + bar_labels_width + LABEL_SIZE + 8.0;
-        // Names of columns stand upright if they are longer than a cell is wide.
+        // Column names are rotated if they are longer than a cell is wide.
         let cell_guess = (place.width - left - right) / self.side as f64;
         let turned = names_width > cell_guess - 2.0;
         let names_below = match (self.names.is_empty(), turned) {
@@ -160,7 +160,7 @@ impl Heat {
             let (row, column) = (index / self.side, index % self.side);
             let (x, y) = (map.x + column as f64 * cell, map.y + row as f64 * cell);
             let colour = heat_colour((value.unwrap_or(f64::NAN) - low) / (high - low));
-            // A little over the next cell, so that no line shows between them.
+            // Each cell overlaps the next a little, so that no line shows between them.
             canvas.rects(&[Rect::new(x, y, cell + 0.3, cell + 0.3)], colour);
             if let (Some(value), Some(decimals)) = (value, self.decimals)
                 && cell >= CELL_TEXT_MIN
@@ -189,7 +189,7 @@ impl Heat {
     }
 }
 
-/// Draws an outline over a map of square cells.
+/// Draws a marking frame over a map of square cells. `cell` is the drawn length of a unit of the outline.
 pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
     let Outline { left, top, side } = outline;
     let [left, top, side] = [left, top, side].map(|length| length * cell);

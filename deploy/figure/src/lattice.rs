@@ -1,5 +1,5 @@
-//! A square field of black and white cells, such as spins.
-//! Runs of dark cells are one rectangle, so that a picture of thousands of cells stays small.
+//! A square grid of black and white cells, such as spins.
+//! Adjacent dark cells of a row become one rectangle, so that a picture of thousands of cells stays small.
 
 use super::{
     canvas::{Canvas, Rect, titled},
@@ -7,16 +7,16 @@ use super::{
     heat::{Outline, point_out},
 };
 
-/// A field of cells.
+/// A square grid of cells.
 #[derive(Clone, Debug)]
 pub struct Lattice {
-    /// Over the panel.
+    /// The title above the panel.
     pub title: String,
-    /// Cells in a row and in a column.
+    /// The number of cells in a row and in a column.
     pub side: usize,
-    /// Row by row: whether a cell is dark.
+    /// Whether each cell is dark, row by row.
     pub dark: Vec<bool>,
-    /// A square to point out.
+    /// A square frame that marks part of the lattice.
     pub outline: Option<Outline>,
 }
 
@@ -24,7 +24,7 @@ impl Lattice {
     pub(super) fn draw(&self, canvas: &mut Canvas, place: Rect) {
         let place = titled(canvas, place, &self.title);
         let room = place.width.min(place.height);
-        // Whole units where there is room for them: short numbers, sharp edges.
+        // Whole units if a cell is at least one unit wide: this gives short numbers and sharp edges.
         let cell = match (room / self.side as f64).floor() {
             whole if whole >= 1.0 => whole,
             _ => room / self.side as f64,

@@ -1,8 +1,8 @@
-//! Figures: charts, heat maps and lattices on a light card, written as SVG, PDF or PNG from one description.
+//! Draws charts, heat maps and lattices on a light card, and writes them as SVG, PDF or PNG from one description.
 //!
-//! Start with [`Figure`]: a title, notes, and panels in a grid, each a [`Chart`], a [`Heat`] map or a [`Lattice`]. The same
-//! figure gives the same bytes on every machine, as the font comes along. A [`Film`] is [`Picture`]s in turn, as a GIF. It knows no run
-//! and no experiment.
+//! Start with [`Figure`]: a title, notes, and panels in a grid. Each panel is a [`Chart`], a [`Heat`] map or a [`Lattice`]. The same
+//! figure gives the same bytes on every machine because the font is built in. A [`Film`] is a sequence of [`Picture`]s, written as a
+//! GIF. The crate knows nothing about runs and experiments.
 //!
 //! ```
 //! use driml_figure::{Axis, Chart, Figure, Look, Panel, Series};

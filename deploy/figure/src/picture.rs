@@ -1,5 +1,5 @@
-//! A picture of pixels, one of many: images enlarged, and above them text, bars and cells of heat.
-//! Unlike a [`Figure`](crate::Figure) it is written as pixels alone.
+//! A picture made of pixels, such as a frame of a [`Film`](crate::Film): enlarged images, and above them text, bars and heat cells.
+//! A [`Figure`](crate::Figure) can be written as SVG or PDF; a picture cannot.
 
 use resvg::tiny_skia::{Color, Pixmap, PremultipliedColorU8, Transform};
 
@@ -10,40 +10,40 @@ use crate::{
     render,
 };
 
-/// Bytes of an image [H, W, C], channels last: of three channels as red, green and blue, of any other number the first as grey.
+/// An image [H, W, C] of bytes, channels last. Three channels are red, green and blue; otherwise the first channel is drawn as grey.
 #[derive(Clone, Copy, Debug)]
 pub struct Image<'a> {
-    /// The bytes.
+    /// The bytes, row by row.
     pub pixels: &'a [u8],
-    /// H.
+    /// The height H in pixels.
     pub height: usize,
-    /// W.
+    /// The width W in pixels.
     pub width: usize,
-    /// C.
+    /// The number of channels C.
     pub channels: usize,
 }
 
-/// How a line of text looks.
+/// The style of a line of text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ink {
-    /// As running text.
+    /// Regular weight, for running text.
     Plain,
-    /// What is looked at first.
+    /// Bold, for what the viewer should read first.
     Bold,
-    /// What explains.
+    /// Regular weight in a softer colour, for explanations.
     Soft,
 }
 
-/// Pixels on a light card, places in pixels from its upper left corner.
+/// Pixels on a light card. Positions are in pixels from the upper left corner.
 pub struct Picture {
     /// The card and the images.
     images: Pixmap,
-    /// What lies above them.
+    /// The shapes drawn above the images.
     shapes: Canvas,
 }
 
 impl Picture {
-    /// An empty picture of this size in pixels.
+    /// Creates an empty picture of this size in pixels.
     pub fn new(width: usize, height: usize) -> Result<Self, FigureError> {
         let mut images = render::pixmap(width, height)?;
         let [r, g, b] = CARD.rgb;
@@ -52,12 +52,12 @@ impl Picture {
         Ok(Self { images, shapes })
     }
 
-    /// Pixels across and down.
+    /// Returns the width and the height in pixels.
     pub fn size(&self) -> (usize, usize) {
         (self.images.width() as usize, self.images.height() as usize)
     }
 
-    /// Puts an image at (x, y), each of its pixels as a square of `zoom` pixels; what lies outside is left out.
+    /// Draws an image at (x, y). Each image pixel becomes a square of `zoom` pixels; parts outside the picture are cut off.
     pub fn image(&mut self, (x, y): (usize, usize), zoom: usize, image: Image<'_>) {
         let (width, height) = self.size();
         for row in y..(y + image.height * zoom).min(height) {
@@ -73,7 +73,7 @@ impl Picture {
         }
     }
 
-    /// Writes a line whose baseline starts at `at`, cut to `width_max`.
+    /// Writes a line of text whose baseline starts at `at`. Text wider than `width_max` is cut.
     pub fn text(&mut self, at: Point, width_max: f64, ink: Ink, text: &str) {
         let style = |colour| TextStyle::new(13.0, colour, Anchor::Start).within(width_max);
         let style = match ink {
@@ -84,8 +84,8 @@ impl Picture {
         self.shapes.text(at, text, style);
     }
 
-    /// Bars that stand on the lower edge of `area` beside each other, of these heights in 0..=1; and a line across at `mark`, a place in
-    /// 0..=1 from left to right.
+    /// Draws bars of these heights (0..=1) side by side on the lower edge of `area`, and a vertical line at `mark`. `mark` is a share of
+    /// the width in 0..=1, from the left.
     pub fn bars(&mut self, area: Rect, heights: &[f64], mark: f64) {
         let step = area.width / heights.len().max(1) as f64;
         let gap = if step > 3.0 { 1.0 } else { 0.0 };
@@ -103,11 +103,11 @@ impl Picture {
         self.shapes.line(&line, series_colour(1), 2.0);
     }
 
-    /// Rows of `columns` cells that fill `area`, dark to light for values in 0..=1; one that is not a number is grey.
+    /// Draws rows of `columns` cells that fill `area`. Values in 0..=1 are drawn dark to light; a value that is not finite is grey.
     pub fn cells(&mut self, area: Rect, columns: usize, values: &[f64]) {
         let columns = columns.max(1);
         let rows = values.len().div_ceil(columns).max(1);
-        // Edges at whole pixels, so that no line shows between cells.
+        // Edges lie at whole pixels, so that no line shows between cells.
         let edge = |at: usize, of: usize, length: f64| (at as f64 * length / of as f64).floor();
         for (index, &value) in values.iter().enumerate() {
             let (row, column) = (index / columns, index % columns);
@@ -118,15 +118,15 @@ impl Picture {
         }
     }
 
-    /// The picture as a PNG.
+    /// Encodes the picture as a PNG.
     pub fn png(&self) -> Result<Vec<u8>, FigureError> {
         render::packed(&self.pixels())
     }
 
-    /// Red, green and blue of every pixel.
+    /// Returns red, green and blue of every pixel, row by row.
     pub(crate) fn rgb(&self) -> Vec<[u8; 3]> {
         let pixels = self.pixels();
-        // A card lies under everything, so nothing is transparent.
+        // The opaque card lies under everything, so no pixel is transparent.
         let rgb = |it: &PremultipliedColorU8| [it.red(), it.green(), it.blue()];
         pixels.pixels().iter().map(rgb).collect()
     }
@@ -162,7 +162,7 @@ mod tests {
         assert_eq!([at(0, 1), at(1, 0)], [[255; 3]; 2]);
         assert_eq!([at(1, 1), at(3, 3)], [[1, 2, 3]; 2]);
         assert_eq!([at(4, 1), at(4, 3)], [[40, 50, 60]; 2]);
-        // One byte a pixel is grey.
+        // An image with one channel is drawn as grey.
         let grey = Image {
             pixels: &[7],
             height: 1,

@@ -1,5 +1,5 @@
-//! SVG as pixels or as PDF. Its letters are outlines, so no font of the machine is needed.
-//! It decides nothing about a figure's look: that is done where its SVG is written.
+//! Converts SVG to pixels or to PDF. Letters in the SVG are outlines, so no installed font is needed.
+//! The look of a figure is decided where its SVG is written, not here.
 
 use resvg::{
     tiny_skia::{Pixmap, Transform},
@@ -9,7 +9,7 @@ use svg2pdf::{ConversionOptions, PageOptions};
 
 use super::error::FigureError;
 
-/// The picture as PNG, `zoom` pixels to a unit; what no shape covers is transparent.
+/// Renders the SVG as a PNG with `zoom` pixels for each unit. Pixels that no shape covers are transparent.
 pub(super) fn png(svg: &str, zoom: f32) -> Result<Vec<u8>, FigureError> {
     let tree = tree(svg)?;
     let sides = [tree.size().width(), tree.size().height()];
@@ -20,7 +20,7 @@ pub(super) fn png(svg: &str, zoom: f32) -> Result<Vec<u8>, FigureError> {
     packed(&pixmap)
 }
 
-/// The picture as PDF of one page; a unit is a CSS pixel, of which an inch has 96.
+/// Converts the SVG to a PDF of one page. A unit is a CSS pixel, 1/96 inch.
 pub(super) fn pdf(svg: &str) -> Result<Vec<u8>, FigureError> {
     let page = PageOptions { dpi: 96.0 };
     let packed = svg2pdf::to_pdf(&tree(svg)?, ConversionOptions::default(), page);
@@ -32,14 +32,14 @@ pub(super) fn tree(svg: &str) -> Result<Tree, FigureError> {
     tree.map_err(|e| FigureError::Encode(e.to_string()))
 }
 
-/// A picture of transparent pixels, to draw on.
+/// Creates a buffer of transparent pixels to draw on.
 pub(super) fn pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
     let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
     let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
     pixmap.ok_or(FigureError::Size { width, height })
 }
 
-/// The pixels as a file. tiny-skia's own takes three times the room, as it packs fast.
+/// Encodes the pixels as a PNG file. tiny-skia's encoder compresses fast and gives a file three times as large.
 pub(super) fn packed(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
     let mut file = Vec::new();
     let mut encoder = png::Encoder::new(&mut file, pixmap.width(), pixmap.height());

@@ -1,26 +1,26 @@
-//! Round numbers along an axis, and how they are written.
-//! It draws nothing.
+//! Round tick values for an axis, and their labels.
+//! This module draws nothing.
 
-/// Round numbers in `low..=high`, about `count` of them: steps of 1, 2 or 5 times a power of ten.
+/// Returns about `count` round numbers in `low..=high`. The step is 1, 2 or 5 times a power of ten.
 pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
     let raw = (high - low) / count.max(1) as f64;
     if !(raw.is_finite() && raw > 0.0) {
         return vec![low];
     }
     let power = 10f64.powf(raw.log10().floor());
-    // The round step nearest to the one asked for, by ratio.
+    // Choose the round step whose ratio to `raw` is closest to 1.
     let off = |step: &f64| (step / raw).ln().abs();
     let steps = [1.0, 2.0, 5.0, 10.0].map(|times| times * power);
     let nearest = steps.into_iter().min_by(|a, b| off(a).total_cmp(&off(b)));
     let step = nearest.unwrap_or(power);
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;
-    // At most a few more than asked for; the bound keeps an odd range from filling memory.
+    // Usually at most a few more than `count`; the limit keeps an unusual range from filling the memory.
     let all = first..=last.min(first + 50);
     all.map(|i| i as f64 * step).collect()
 }
 
-/// Powers of ten in `low..=high`; with multiples of them where there are fewer than three.
+/// Returns the powers of ten in `low..=high`, with multiples of them if there are fewer than three.
 pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
     let among = |times: &[f64]| -> Vec<f64> {
@@ -40,10 +40,10 @@ pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     among(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
 }
 
-/// Numbers on an axis whose largest is in here are written out; those of others as powers of ten.
+/// Labels of an axis are plain decimals if the largest tick is in this range, else they have powers of ten.
 const WRITTEN_OUT: std::ops::Range<f64> = 1e-4..1e10;
 
-/// The numbers as labels of one axis: the same decimals for all, thousands and millions as k and M.
+/// Formats the ticks of one axis: all with the same number of decimals, thousands and millions as k and M.
 pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     let sizes = ticks.iter().map(|tick| tick.abs());
     let (_, largest) = bounds(sizes.clone()).unwrap_or_default();
@@ -68,7 +68,7 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     labels.map(|it| it.replace('-', "\u{2212}")).collect()
 }
 
-/// The smallest and the largest of these numbers; none if there is none.
+/// Returns the smallest and the largest number; `None` if there are no numbers.
 pub(super) fn bounds(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
     values.fold(None, |bounds, value| {
         let (low, high) = bounds.unwrap_or((value, value));
@@ -84,7 +84,7 @@ fn unit_of(size: f64) -> (f64, &'static str) {
     }
 }
 
-/// One number on its own, in as few characters as it needs.
+/// Formats one number by itself, in as few characters as possible.
 fn plain(value: f64) -> String {
     if !WRITTEN_OUT.contains(&value.abs()) {
         return power_of_ten(value);
@@ -93,7 +93,7 @@ fn plain(value: f64) -> String {
     format!("{}{unit}", (value / divisor * 1e6).round() / 1e6)
 }
 
-/// A number as a few digits and a power of ten; more digits would be the rounding of a multiple of the step.
+/// Formats a number as a few digits and a power of ten. Further digits would only show the rounding error of a multiple of the step.
 fn power_of_ten(value: f64) -> String {
     let rounded = format!("{value:.6e}").parse().unwrap_or(value);
     format!("{rounded:e}")

@@ -1,5 +1,5 @@
-//! Which weights of a run's folder are meant, and where they lie.
-//! It reads the settings alone; weights are read by the player.
+//! Selects a checkpoint and weights in a run's folder.
+//! This module reads only the settings; the player reads the weights.
 
 use std::{path::PathBuf, str::FromStr};
 
@@ -11,15 +11,15 @@ use driml_settings::config::RunConfig;
 
 use crate::run_folder::RunFolder;
 
-/// Which checkpoint of a run.
+/// Which checkpoint of a run to use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Which {
-    /// The one with the most updates behind it.
+    /// The checkpoint with the most updates.
     #[default]
     Newest,
-    /// The one after so many updates.
+    /// The checkpoint after this many updates.
     After(u64),
-    /// The one that earned most when checkpoints were played.
+    /// The checkpoint that earned most when checkpoints were evaluated.
     Best,
 }
 
@@ -52,7 +52,7 @@ impl FromStr for Which {
     }
 }
 
-/// The settings of the run in `folder`.
+/// Reads the settings of the run in `folder`.
 pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     let path = folder.config();
     let text = std::fs::read_to_string(&path).map_err(|e| {

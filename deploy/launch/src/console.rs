@@ -1,5 +1,5 @@
 //! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
-//! A closed terminal or pipe is not an error here; `driml_protocol::Shutdown` notices it.
+//! A closed terminal or pipe is not an error in this module; `driml_protocol::Shutdown` notices it.
 
 use std::{
     collections::BTreeMap,
@@ -21,12 +21,12 @@ use tracing_subscriber::{
 };
 
 const DRAWS_PER_SECOND: u8 = 20;
-/// How often a line says how far something is where there is no progress bar.
+/// How often progress is printed as a plain line without a progress bar.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 
-/// Writes a line to stderr. What cannot be written is dropped: the pipe is closed or the disk is full, and a run continues.
+/// Writes a line to stderr. A line that cannot be written is dropped, as the run continues after a closed pipe or on a full disk.
 pub fn line(text: &str) {
-    // In one write, so that lines of several threads do not mix.
+    // A single write, so that lines of several threads do not mix.
     let _ = stderr().write_all(format!("{text}\n").as_bytes());
 }
 
@@ -35,7 +35,7 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     print_unless_closed(text).map(drop)
 }
 
-/// [`print`]; false if the pipe is closed.
+/// [`print`] that returns false if the pipe is closed.
 pub(crate) fn print_unless_closed(text: &str) -> anyhow::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -44,7 +44,7 @@ pub(crate) fn print_unless_closed(text: &str) -> anyhow::Result<bool> {
     }
 }
 
-/// [`print_unless_closed`] of a page that takes the place of the one before, on a terminal; elsewhere pages follow each other.
+/// [`print_unless_closed`] for a page. On a terminal the page replaces the one before; elsewhere pages follow each other.
 pub(crate) fn print_page(text: &str) -> anyhow::Result<bool> {
     let on_terminal = io::stdout().is_terminal().then(Term::stdout);
     match on_terminal.map(|it| it.clear_screen()) {
@@ -53,7 +53,7 @@ pub(crate) fn print_page(text: &str) -> anyhow::Result<bool> {
     }
 }
 
-/// [`print`] of lines that a narrow terminal would break inside words: a line continues after `indent` blanks.
+/// [`print`] for lines that a narrow terminal would break inside words: a wrapped line continues after `indent` blanks.
 pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
     match io::stdout().is_terminal() {
         true => print(&wrapped(text, " ", indent)),
@@ -61,8 +61,8 @@ pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
     }
 }
 
-/// `text` with its lines broken where `separator` stands, so that none is wider than the terminal where that can be; a line continues
-/// after `indent` blanks.
+/// Breaks the lines of `text` at `separator`, so that no line is wider than the terminal where that is possible. A wrapped line
+/// continues after `indent` blanks.
 pub(crate) fn wrapped(text: &str, separator: &str, indent: usize) -> String {
     let size = Term::stderr().size_checked();
     let width = size.map_or(usize::MAX, |it| it.1.into());
@@ -90,7 +90,7 @@ fn wrapped_to(text: &str, separator: &str, indent: usize, width: usize) -> Strin
     lines
 }
 
-/// Rows as lines whose columns are aligned: to the left, or to the right for the columns in `right`.
+/// Formats rows as lines with aligned columns: to the right for the columns in `right`, to the left for all others.
 pub fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
     let width_of = |column: usize| {
         let cells = rows.iter().filter_map(|row| row.get(column));
@@ -110,12 +110,12 @@ pub fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
     rows.iter().map(line).collect()
 }
 
-/// Whether writing failed because the pipe's reader has ended or the terminal was closed.
+/// Whether writing failed because the pipe's reader has exited or the terminal was closed.
 fn is_gone(e: &io::Error) -> bool {
     e.kind() == ErrorKind::BrokenPipe || e.raw_os_error() == Some(nix::libc::EIO)
 }
 
-/// An error with its causes, each said once: many errors name their cause in their own text too.
+/// Formats an error with its causes, each once: the text of many errors already contains their cause.
 pub fn describe(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
@@ -129,7 +129,7 @@ pub fn describe(error: &anyhow::Error) -> String {
     text
 }
 
-/// Lines of the form `WHAT are lost: WHY`, those of the same cause in one.
+/// Joins lines of the form `WHAT are lost: WHY` that have the same cause into one. Other lines come first, unchanged.
 pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String> {
     const LOST: &str = " are lost: ";
     let mut by_cause = BTreeMap::<String, Vec<String>>::new();
@@ -145,13 +145,13 @@ pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String
     joined
 }
 
-/// What is logged of zenoh and quinn, whatever is logged of driml.
+/// The log filter for zenoh and quinn, at any level of driml's own crates.
 ///
-/// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
-/// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
-/// that no answer is wanted any more. Nor that it does not know a liveliness token any more (`Unknown token`, the only error of that
-/// module) which a process that leaves drops while its link closes, over QUIC now and then: it is gone, as it should be. Nor what quinn
-/// warns of. Connections over QUIC that were rejected are logged with zenoh's own warning: the other side learns only that it failed.
+/// zenoh warns of each failed attempt to reach an absent process, which driml judges itself, so only zenoh's errors are logged. Some
+/// are off too. Its session reports messages that arrive while it closes, as at the end of every run. Its handlers report replies
+/// that are not wanted any more. The only error of its token module, `Unknown token`, comes up now and then over QUIC: a process that
+/// leaves drops its liveliness token while its link closes. quinn's warnings are off. Warnings of zenoh's QUIC link stay: they name
+/// rejected connections, of which the other side learns only that they failed.
 const OF_OTHERS: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
                          zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=warn,quinn=error";
 
@@ -159,8 +159,8 @@ fn usual_filter(level: &str) -> String {
     format!("warn,driml={level},{OF_OTHERS}")
 }
 
-/// The filter that `DRIML_LOG` asks for. A level alone is that of driml's own crates, whose lines zenoh's would bury. All else is
-/// used unchanged, `off` too: it is for everything.
+/// The log filter for a value of `DRIML_LOG`. A level alone applies to driml's own crates only, as zenoh's lines would bury theirs.
+/// Any other value is used unchanged: `off`, for example, applies to everything.
 fn wanted_filter(wanted: &str) -> String {
     let level = wanted.trim().to_ascii_lowercase();
     match level.as_str() {
@@ -169,7 +169,7 @@ fn wanted_filter(wanted: &str) -> String {
     }
 }
 
-/// Sends the log to stderr. `DRIML_LOG` says what is logged: a level of driml's own crates, or a filter in the form of `RUST_LOG`.
+/// Sends the log to stderr. `DRIML_LOG` sets what is logged: a level for driml's own crates, or a filter in the syntax of `RUST_LOG`.
 pub fn log_to_stderr() {
     let usual = || EnvFilter::new(usual_filter("info"));
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
@@ -184,10 +184,10 @@ pub fn log_to_stderr() {
     });
     let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)
-        // It would say with `eprintln!`, which panics, that stderr cannot be written to.
+        // It would report a stderr that cannot be written to with `eprintln!`, which panics then.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
-        // Paths of modules are for those who debug.
+        // Module paths are for debugging only.
         .with_target(is_debugged)
         .with_filter(filter.clone());
     tracing_subscriber::registry()
@@ -196,7 +196,7 @@ pub fn log_to_stderr() {
         .init();
 }
 
-/// Keeps the last warning or error of the log for those who ask this process how it is.
+/// A log layer that keeps the last warning or error, which this process reports in its status.
 struct LastWarning;
 
 impl<S: Subscriber> Layer<S> for LastWarning {
@@ -213,20 +213,20 @@ impl<S: Subscriber> Layer<S> for LastWarning {
     }
 }
 
-/// How long one line about a full disk stands for those of all processes and files.
+/// For how long one line about a full disk stands for the lines of all processes and files.
 const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
 
-/// Where messages go: stderr, above a progress bar if stderr is a terminal and there is one. Clones share the bar;
-/// each has its own time of the next plain line.
+/// Where messages go: stderr, above a progress bar if there is one and stderr is a terminal. Clones share the bar, but each
+/// has a separate time of its next plain line.
 #[derive(Clone, Debug, Default)]
 pub struct Screen {
     bar: Option<ProgressBar>,
     full_disk: Arc<Mutex<FullDisk>>,
-    /// When the next line says how far something is.
+    /// When the next plain line of progress is due.
     plain_next: Option<Instant>,
 }
 
-/// When a full disk was last reported, and how many lines about it were left out since.
+/// When a full disk was last reported, and how many lines about it were left out.
 #[derive(Debug, Default)]
 struct FullDisk {
     said: Option<Instant>,
@@ -250,10 +250,10 @@ impl FullDisk {
 }
 
 impl Screen {
-    /// With a progress bar of this `template` and length on a terminal, else without.
+    /// A screen with a progress bar of this length and `template` on a terminal, and without a bar elsewhere.
     ///
     /// # Panics
-    /// If the template is none: it is a constant, and tests make each.
+    /// The template is invalid. Templates are constants, and a test makes each.
     pub fn new(length: u64, template: &str) -> Self {
         let target = ProgressDrawTarget::stderr_with_hz(DRAWS_PER_SECOND);
         let bar = (!target.is_hidden()).then(|| {
@@ -273,7 +273,7 @@ impl Screen {
         self.bar.as_ref()
     }
 
-    /// Writes one line. Of many about a full disk the first stands for all.
+    /// Writes one line. A line about a full disk is left out if another one was written less than ten minutes ago.
     pub fn line(&self, text: &str) {
         if !lock(&self.full_disk).is_due(text, Instant::now()) {
             return;
@@ -284,12 +284,12 @@ impl Screen {
         }
     }
 
-    /// Writes some lines, each as [`Self::line`] does.
+    /// Writes several lines, each with [`Self::line`].
     pub(crate) fn lines(&self, lines: impl IntoIterator<Item = String>) {
         lines.into_iter().for_each(|it| self.line(&it));
     }
 
-    /// Says how far something is: beside the bar, or now and then in a line; `text` is told whether it is beside the bar.
+    /// Shows progress beside the bar, or every ten seconds in a plain line. The argument of `text` is true for text beside the bar.
     pub fn show(&mut self, position: u64, text: impl FnOnce(bool) -> String) {
         let now = Instant::now();
         if let Some(bar) = &self.bar {
@@ -301,7 +301,7 @@ impl Screen {
         }
     }
 
-    /// Takes the progress bar away.
+    /// Removes the progress bar, and reports how many lines about a full disk were left out.
     pub fn clear(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();

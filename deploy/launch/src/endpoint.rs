@@ -1,5 +1,5 @@
-//! Where the processes of a run meet: endpoints that zenoh can open, and the prefix of the run's keys.
-//! It keeps nothing open.
+//! The endpoints at which the processes of a run meet, checked for what zenoh can open, and the prefix of the run's keys.
+//! This module keeps no connection open.
 
 use std::{
     fs,
@@ -13,20 +13,20 @@ use anyhow::Context;
 use driml_machine::error::{Usage, usage};
 use driml_protocol::{Shutdown, reach};
 
-/// The prefix of a run's keys unless it is told otherwise.
+/// The default prefix of a run's keys.
 pub const NAMESPACE: &str = "driml";
 
 /// The longest path of a unix socket, bytes: `sun_path` of `unix(7)`, whose last byte is 0.
 pub(crate) const SOCKET_PATH_MAX: usize = 107;
-/// Behind them zenoh takes further settings, which could undo ours and cut a path.
+/// After these characters zenoh reads further settings, which could override ours and cut off a path.
 pub(crate) const ADDRESS_ENDS: [char; 2] = ['#', '?'];
 
-/// How long the replay server may take to listen.
+/// How long the replay server may take until it listens.
 const LISTEN_MAX: Duration = Duration::from_secs(60);
-/// How often it is looked whether it does.
+/// How often to check whether the replay server listens.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// Refuses endpoints to connect to that zenoh could not open, or that do not fit `--tls-dir`.
+/// Rejects endpoints to connect to that zenoh cannot open, or that do not fit `--tls-dir`.
 pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
     endpoints.iter().try_for_each(|it| {
         check_endpoint(it, tls)?;
@@ -39,8 +39,8 @@ pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
     })
 }
 
-/// Refuses endpoints to listen on that zenoh could not open or that do not fit `--tls-dir`, and without `--allow-insecure` those that
-/// others can reach and nothing guards.
+/// Rejects endpoints to listen on that zenoh cannot open or that do not fit `--tls-dir`. Without `--allow-insecure`, also rejects
+/// endpoints that other machines can reach without a certificate.
 pub fn check_listening(endpoints: &[String], tls: bool, allow_insecure: bool) -> Result<(), Usage> {
     for endpoint in endpoints {
         check_endpoint(endpoint, tls)?;
@@ -61,8 +61,8 @@ pub fn check_listening(endpoints: &[String], tls: bool, allow_insecure: bool) ->
     Ok(())
 }
 
-/// Refuses endpoints to listen on that another process has, before anything is made; zenoh would say so in its own words. And a
-/// path that is taken, which zenoh would delete, whatever is there.
+/// Rejects endpoints to listen on that another process uses, before anything is created, with a clearer error than zenoh's. Also
+/// rejects a socket path at which another file lies, because zenoh would delete that file.
 pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
     for endpoint in endpoints {
         let path = endpoint.strip_prefix("unixsock-stream/");
@@ -88,7 +88,7 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
     Ok(())
 }
 
-/// Waits until something listens at `endpoint`; false once it is `interrupted`. `check_alive` says whether it still can.
+/// Waits until something listens at `endpoint`; false once `interrupted`. `check_alive` fails if the process that should listen ended.
 pub fn wait_until_listening(
     endpoint: &str,
     interrupted: &Shutdown,
@@ -143,12 +143,12 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
     }
 }
 
-/// Whether other machines may reach an endpoint, and nothing tells who they are.
+/// Whether other machines may reach an endpoint without a certificate.
 fn is_open(endpoint: &str) -> bool {
     let Some(("tcp", address)) = endpoint.split_once('/') else {
         return false;
     };
-    // A name that is not known is none of this machine's; zenoh says what is wrong with it.
+    // An unknown name is not an address of this machine; zenoh's error says what is wrong with it.
     let Ok(mut addresses) = address.to_socket_addrs() else {
         return false;
     };
@@ -166,7 +166,7 @@ mod tests {
         checked.map_err(|e| e.to_string())
     }
 
-    /// Endpoints to connect to, with or without certificates, and a part of the answer; none to one that can work.
+    /// Each case is an endpoint to connect to, whether certificates are used, and a part of the error; empty for a valid endpoint.
     #[test]
     fn endpoints_that_zenoh_cannot_open_are_refused() {
         let none = "not an endpoint";

@@ -1,5 +1,5 @@
-//! Whole episodes with a run's weights, and a random policy's beside them.
-//! It trains nothing and changes nothing in the run folder.
+//! Plays whole episodes with a run's weights, and with a random policy for comparison.
+//! This module trains nothing and changes nothing in the run folder.
 
 use std::{ops::ControlFlow, path::Path};
 
@@ -22,13 +22,13 @@ use crate::{
     run_folder::RunFolder,
 };
 
-/// Probability of a random action where none is asked for. Source: section 2 of the project's specification, after rlpyt.
+/// Default probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 pub const EPSILON: f64 = 0.001;
 const COPIES_MAX: usize = 32;
-/// Steps of each environment after which an evaluation is given up: an episode of Atari has up to 27,000, one of Procgen whose levels
-/// follow one another has no bound.
+/// Steps of each environment, per round of episodes, after which an evaluation fails. An Atari episode has up to 27,000 steps; a
+/// Procgen episode whose levels follow one another has no bound.
 const STEPS_A_ROUND_MAX: u64 = 200_000;
-/// The stream of the exploring policy's generator. A world seeded alike gives its environments streams that count from 0.
+/// The stream of the policy's random generator. A world with the same seed gives its environments streams that count from 0.
 const POLICY_STREAM: u64 = u64::MAX;
 
 /// Which levels to play.
@@ -42,12 +42,12 @@ pub enum Levels {
     Unseen,
 }
 
-/// Who chooses the actions.
+/// The policy that chooses the actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Who {
     /// The run's network.
     Agent,
-    /// Every action equally likely.
+    /// A random policy, with the same probability for each action.
     Random,
 }
 
@@ -55,18 +55,18 @@ pub enum Who {
 pub struct Player {
     /// The settings of the run that trained them.
     pub config: RunConfig,
-    /// The network as it was learned, with DIM's heads if they are known. It plays with what actors get of it.
+    /// The trained network, with DIM's heads if they are known. It plays without them, with weights in the data type of the actors.
     pub(crate) network: Parameters,
-    /// Updates behind its weights.
+    /// Updates of the weights.
     pub updates: u64,
-    /// They are an average over updates.
+    /// Whether the weights are an average over updates.
     pub is_averaged: bool,
     /// Probability of a random action.
     pub epsilon: f64,
 }
 
 impl Player {
-    /// Reads one of the checkpoints in a run's folder.
+    /// Loads a checkpoint from a run's folder.
     pub fn load_at(folder: &RunFolder, which: Which, weights: Weights) -> anyhow::Result<Self> {
         Self::read(config_of(folder)?, &checkpoint_at(folder, which)?, weights)
     }
@@ -90,7 +90,7 @@ impl Player {
         })
     }
 
-    /// What its weights are: "averaged" or "online".
+    /// The kind of the weights: "averaged" or "online".
     pub const fn weights_name(&self) -> &'static str {
         match self.is_averaged {
             true => "averaged",
@@ -98,7 +98,7 @@ impl Player {
         }
     }
 
-    /// The same with f32 weights and arithmetic, whatever the actors of the run have.
+    /// The same player with f32 weights and arithmetic, whatever the actors of the run use.
     #[must_use]
     pub fn exact(mut self) -> Self {
         self.config.learner.publish_dtype = StoredAs::F32;
@@ -106,7 +106,7 @@ impl Player {
         self
     }
 
-    /// Returns of whole episodes on the levels asked for; none if the world does not have them.
+    /// Plays whole episodes on the given levels. Returns their returns; none if the world does not have these levels.
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.
@@ -125,8 +125,8 @@ impl Player {
         played.map(Some)
     }
 
-    /// Returns of whole episodes in `world`, which is the run's, with other levels. Every step is shown to `watch`, which may end it
-    /// before all episodes are over.
+    /// Plays whole episodes in `world`, which is the run's world, perhaps with other levels. Returns their returns. `watch` sees every
+    /// step, and may end the play before all episodes are over.
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.
@@ -153,12 +153,12 @@ impl Player {
         play_with(config, policy, world, episodes, epsilon, seed, watch)
     }
 
-    /// Environments that play so many episodes.
+    /// The number of environments that play `episodes` episodes: one each, up to `COPIES_MAX`.
     pub fn envs(episodes: usize) -> usize {
         episodes.min(COPIES_MAX)
     }
 
-    /// What the network that plays makes of the states it sees.
+    /// A viewer that shows what the network computes for the states it sees.
     pub fn viewer(&self) -> anyhow::Result<Viewer> {
         let mut model = self.config.model.clone();
         if self.network.iter().count() < model.parameter_shapes().len() {
@@ -179,14 +179,14 @@ impl Player {
     }
 }
 
-/// Returns of whole episodes of a random policy in a run's world, on the levels trained on. It needs no checkpoint.
+/// Plays whole episodes with a random policy in a run's world, on the training levels. Returns their returns. Needs no checkpoint.
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
     let world = levels(&config.world, Levels::Train)?;
     let (policy, watch) = (&mut random_policy(config)?, &mut until(|| false));
     play_with(config, policy, &world, episodes, EPSILON, seed, watch)
 }
 
-/// Watches, and ends it once it `is_over`.
+/// A watcher that ends the play once `is_over` returns true.
 pub(crate) fn until(
     is_over: impl Fn() -> bool,
 ) -> impl FnMut(&Step<'_>, &[f64]) -> ControlFlow<()> {
@@ -223,13 +223,13 @@ fn play_with(
         .with_context(|| format!("playing {}", config.run.world))
 }
 
-/// Rows and columns of a frame as it travels.
+/// Rows and columns of a frame as actors send it.
 const fn sent(config: &RunConfig) -> (usize, usize) {
     let spec = &config.run;
     (spec.frame_height as usize, spec.frame_width as usize)
 }
 
-/// Sees what the policy sees.
+/// Shows what the network computes for the states that the policy sees.
 #[derive(Debug)]
 pub struct Viewer {
     /// The network.
@@ -239,12 +239,12 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// What the network makes of a step's states.
+    /// What the network computes for the states of a step.
     pub fn look(&mut self, states: &[u8]) -> Result<Seen, UpdateError> {
         let Some(enlarge) = &self.enlarge else {
             return self.insight.look(states);
         };
-        // An input has as many states as there were, whatever their sizes.
+        // Enlarging keeps the number of states.
         let count = states.len() / enlarge.input_bytes();
         self.enlarged.resize(count * enlarge.output_bytes(), 0);
         enlarge.apply(states, &mut self.enlarged);
@@ -252,14 +252,14 @@ impl Viewer {
     }
 }
 
-/// What the policy explores with: other numbers than those of any environment, which has the same seed.
+/// The generator of the policy's random actions. Its numbers differ from those of every environment, which has the same seed.
 fn policy_rng(seed: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(POLICY_STREAM);
     rng
 }
 
-/// The world with the levels asked for.
+/// The world with the given levels.
 pub fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
     let levels = match levels {
         Levels::Train => driml_envs::Levels::Train,

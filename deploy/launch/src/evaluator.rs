@@ -1,5 +1,5 @@
-//! Plays a run's checkpoints and keeps the best: `keep` plays one, in this process; `Evaluator` starts a process for each during a run.
-//! What the best is worth, `driml evaluate` says on other episodes: the best of many is best by luck, too.
+//! Evaluates a run's checkpoints and keeps the best: `keep` evaluates one in this process, `Evaluator` starts a process for each.
+//! `driml evaluate` measures the best on other episodes, as the best of many checkpoints is partly the luckiest.
 
 use std::{
     ffi::OsStr,
@@ -23,25 +23,25 @@ use crate::{
 /// The seed of the episodes on which checkpoints are compared; reports use other seeds.
 pub const SELECTION_SEED: u64 = 1 << 32;
 
-/// What a checkpoint earned, and whether it is the run's best.
+/// The evaluation of a checkpoint, and whether the checkpoint is the run's best.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Judged {
-    /// What it earned.
+    /// The evaluation of the checkpoint.
     pub earned: Evaluated,
-    /// It was kept.
+    /// Whether the checkpoint was kept.
     pub is_best: bool,
-    /// The best, as it was judged before this one came: over at least as many episodes.
+    /// The evaluation of the best checkpoint before this one, over at least as many episodes.
     pub best_before: Option<Evaluated>,
 }
 
-/// Plays a checkpoint of a run, its averaged weights if there are some, on the levels trained on, adds what it earned to the run's
-/// table, and keeps it where it earned more than the best before it.
+/// Plays a checkpoint of a run on the training levels, with averaged weights if it has them. Adds the evaluation to the run's table, and
+/// keeps the checkpoint if it earned more than the best before it.
 ///
-/// Both are compared over the same episodes. A best that was played for fewer is played again; a checkpoint that is played for fewer
-/// does not take its place.
+/// Both are compared over the same episodes. A best checkpoint that was played for fewer episodes is played again. A checkpoint that is
+/// played for fewer episodes than the best does not replace it.
 ///
 /// # Errors
-/// A file system error; [`Interrupted`] once it `is_stopped`, and nothing is kept.
+/// A file system error; [`Interrupted`] once `is_stopped` returns true: then nothing is kept.
 pub fn keep(
     folder: &RunFolder,
     which: Which,
@@ -83,15 +83,15 @@ pub fn keep(
 const LAST_MAX: Duration = Duration::from_secs(3600);
 const POLL: Duration = Duration::from_millis(100);
 
-/// Which checkpoints of a run are to be played.
+/// Decides which checkpoints of a run are evaluated.
 pub(crate) struct Due {
     config: Option<EvaluationConfig>,
-    /// Updates of the newest checkpoint that was played or is.
+    /// Updates of the newest checkpoint that was evaluated or is being evaluated.
     newest: u64,
 }
 
 impl Due {
-    /// Those after the checkpoints that the run's folder lists as played.
+    /// The checkpoints that are newer than those in the run's table of evaluations.
     pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let config = config.local.evaluation;
         let played = match config {
@@ -102,7 +102,7 @@ impl Due {
         Ok(Self { config, newest })
     }
 
-    /// How many episodes the checkpoint after so many updates is now played for, if it is due: the last one of a run unless it was played.
+    /// The number of episodes for the checkpoint after `updates`, if it is due. The last one is due unless it was evaluated before.
     pub(crate) fn take(&mut self, updates: u64, is_last: bool) -> Option<u32> {
         let config = self.config?;
         let step = if is_last { 1 } else { config.every_updates };
@@ -114,7 +114,7 @@ impl Due {
     }
 }
 
-/// Plays the checkpoints that are due, one at a time.
+/// Evaluates the checkpoints that are due, one at a time.
 pub(crate) struct Evaluator {
     due: Due,
     run_dir: RunFolder,
@@ -130,7 +130,7 @@ impl Evaluator {
         })
     }
 
-    /// Says what an evaluation that has ended found, and begins the next if there is a checkpoint for it.
+    /// Reports an evaluation that has ended, and begins the next one if a checkpoint is due.
     pub(crate) fn look(&mut self, screen: &Screen) {
         self.take_result(screen);
         if self.playing.is_none() {
@@ -138,7 +138,7 @@ impl Evaluator {
         }
     }
 
-    /// Plays the last checkpoint, and waits for it unless the run is told to stop.
+    /// Evaluates the last checkpoint. Waits for the result up to an hour, or until the run is told to stop.
     pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
         let deadline = Instant::now() + LAST_MAX;
         let mut last = false;
@@ -159,7 +159,7 @@ impl Evaluator {
         }
     }
 
-    /// Begins to play the newest checkpoint if it is due. Says whether it did.
+    /// Begins to evaluate the newest checkpoint if it is due. Returns whether it did.
     fn begin(&mut self, is_last: bool, screen: &Screen) -> bool {
         if self.due.config.is_none() {
             return false;
@@ -186,7 +186,7 @@ impl Evaluator {
         self.playing.is_some()
     }
 
-    /// Takes note of an evaluation that has ended. One that failed costs the run nothing but a line.
+    /// Reports an evaluation that has ended. A failed evaluation costs the run nothing but a printed line.
     fn take_result(&mut self, screen: &Screen) {
         let Some(process) = &mut self.playing else {
             return;

@@ -1,5 +1,5 @@
-//! What a finished run's weights earn, played greedily beside a random policy: the number that the run was for.
-//! It fails no run: what goes wrong is a line on stderr.
+//! Plays a finished run's weights greedily, and a random policy for comparison. The return is the number that the run was for.
+//! A failure in this module does not fail the run: it is reported as a line on stderr.
 
 use std::time::{Duration, Instant};
 
@@ -13,15 +13,15 @@ use crate::{
     run_folder::{Earned, LastPlay, RunFolder, Summary},
 };
 
-/// Episodes that are played at once, one in each environment. They count together, so that long ones are not left out.
+/// Episodes played at once, one per environment. A batch counts as a whole, so that long episodes are not left out.
 const BATCH: usize = 20;
 const BATCHES_MAX: u32 = 5;
-/// How long all of it may take; the first batch may take longer.
+/// Time limit for all batches; the first batch may take longer.
 const PLAY_MAX: Duration = Duration::from_secs(30);
-/// How long the first batch may.
+/// Time limit for the first batch.
 const FIRST_BATCH_MAX: Duration = Duration::from_secs(120);
 
-/// Plays the weights of a finished run and adds what they earned to its summary, if its settings ask for that and until it `is_stopped`.
+/// Plays the weights of a finished run and adds their returns to its summary, if the settings ask for it. Stops once `is_stopped`.
 pub(crate) fn play(
     summary: &mut Summary,
     config: &RunConfig,
@@ -47,7 +47,7 @@ pub(crate) fn play(
     }
 }
 
-/// What the weights in `folder` earn; none if it was stopped before there was anything to say.
+/// What the weights in `folder` earn; none if stopped before the first batch was complete.
 fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<Option<LastPlay>> {
     let started = Instant::now();
     let player = Player::load_at(folder, Which::default(), Weights::default())?;
@@ -55,7 +55,7 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
     let watch = &mut until(|| is_stopped() || started.elapsed() > FIRST_BATCH_MAX);
     let (mut agent, mut random) = (Vec::new(), Vec::new());
     for batch in 0..BATCHES_MAX {
-        // It takes about as long as each before it.
+        // The next batch takes about as long as the mean batch before it.
         if batch > 0 && started.elapsed() * (batch + 1) > PLAY_MAX * batch {
             break;
         }

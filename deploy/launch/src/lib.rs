@@ -1,7 +1,7 @@
-//! Starting, watching and ending a run on this machine, and what it leaves in its folder.
+//! Starts, watches and ends a run on this machine, and writes and reads the files in its folder.
 //!
-//! Start with [`launcher::run`], which trains with replay servers, learner and actors as processes, or [`lockstep::run`], which
-//! does it in this process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
+//! Start with [`launcher::run`], which trains with replay servers, learner and actors as processes. [`lockstep::run`] runs all of
+//! them in this process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
 //!
 //! ```
 //! use driml_launch::run_folder::{RunFolder, Summary, progress};
@@ -16,7 +16,7 @@
 //! # Ok::<(), anyhow::Error>(())
 //! ```
 //!
-//! It compares no runs, and draws nothing but the pictures among a run's events: figures are for `driml-experiments`.
+//! This crate compares no runs. It draws only the images among a run's events: `driml-experiments` draws figures.
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 

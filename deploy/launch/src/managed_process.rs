@@ -1,5 +1,5 @@
-//! A child process of a run: started, watched, asked to stop, and some of them together waited for.
-//! It does not know what the processes do or in which order they end.
+//! A child process of a run: starts it, watches it, asks it to stop, and waits for several of them together.
+//! This module does not know what the processes do or in which order they end.
 
 use std::{
     ffi::OsStr,
@@ -11,6 +11,7 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_machine::{
+    error::EXIT_INTERRUPTED,
     process_env::program,
     units::{duration, kib},
 };
@@ -21,16 +22,16 @@ use nix::{
 
 use crate::{console::Screen, process_log::ProcessLog, rendezvous::Rendezvous};
 
-/// A process that ends with an error within this time of its start would do so again.
+/// A process that fails within this time of its start would fail again after a restart.
 const AT_ONCE: Duration = Duration::from_secs(10);
-/// How long a process may take to end once it was killed.
+/// How long a killed process may take to end.
 const KILLED_MAX: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(20);
 
-/// A process that was started.
+/// A child process that was started.
 #[derive(Debug)]
 pub struct ManagedProcess {
-    /// Its name: `replay-server`, `learner`, `actor-0`.
+    /// The process's name: `replay-server`, `learner`, `actor-0`.
     pub name: String,
     child: Child,
     started: Instant,
@@ -38,19 +39,19 @@ pub struct ManagedProcess {
     pub(crate) log: ProcessLog,
 }
 
-/// The variable that says how many threads a process has for arithmetic.
+/// The environment variable that sets the number of threads that a process uses for arithmetic.
 pub const THREADS: &str = "RAYON_NUM_THREADS";
 
-/// Flags for a child that is to end when this process does. They name this process, as it may have died before the child looks
-/// who its parent is.
+/// Flags for a child that must exit when this process does. They name this process, because it may have died before the child
+/// looks up its parent.
 pub fn exit_with_this_process() -> [String; 2] {
     ["--exit-with-parent".into(), std::process::id().to_string()]
 }
 
 impl ManagedProcess {
-    /// Starts this program with other arguments, in its own process group so that Ctrl-C does not reach it. It ends when
-    /// this process does. Its log is in the folder `logs`, its warnings are shown on `screen`; where the processes of a run meet
-    /// stays there as long as it lives.
+    /// Starts this program with other arguments, in its own process group so that Ctrl-C does not reach the child. The child exits
+    /// when this process does. Its log is written into the folder `logs`, and its warnings are shown on `screen`. The folder of
+    /// `rendezvous` stays as long as the child lives.
     pub fn start(
         name: &str,
         args: &[impl AsRef<OsStr>],
@@ -64,7 +65,7 @@ impl ManagedProcess {
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program());
-        // Everything else that it needs of its environment it has from this one.
+        // The child inherits the rest of its environment from this process.
         command
             .env(THREADS, threads.to_string())
             .args(args)
@@ -97,37 +98,37 @@ impl ManagedProcess {
         })
     }
 
-    /// Whether it has ended in a way that a restart may mend: in order, killed, or after it had run for a while. A broken
-    /// invariant of our own aborts it.
+    /// Whether the process ended in a way that a restart may fix: it exited in order, a signal other than SIGABRT killed it, or it
+    /// had run for longer than `AT_ONCE`. SIGABRT comes from a broken invariant of our own.
     pub(crate) fn may_be_started_again(&mut self) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;
         let had_run = self.started.elapsed() > AT_ONCE;
         self.end().is_some_and(|status| {
-            status.success() || status.signal().is_some_and(killed) || had_run
+            is_orderly(status) || status.signal().is_some_and(killed) || had_run
         })
     }
 
-    /// Checks that it has not ended.
+    /// Returns an error if the process has ended.
     pub fn check_alive(&mut self) -> anyhow::Result<()> {
         ensure!(self.end().is_none(), "{}", self.exit_report());
         Ok(())
     }
 
-    /// How it ended, if it has.
+    /// The exit status of the process, if it has ended.
     pub fn end(&mut self) -> Option<ExitStatus> {
         if self.end.is_none() {
-            // An error here means that there is no such child any more, which cannot be before it was waited for.
+            // An error means that the child does not exist any more, which cannot happen before it was waited for.
             self.end = self.child.try_wait().ok().flatten();
         }
         self.end
     }
 
-    /// Asks it to drain and end.
+    /// Asks the process to drain and exit.
     pub fn ask_to_stop(&mut self) {
         self.signal(Signal::SIGTERM);
     }
 
-    /// Ends it at once.
+    /// Kills the process at once.
     pub fn kill(&mut self) {
         self.signal(Signal::SIGKILL);
     }
@@ -138,7 +139,7 @@ impl ManagedProcess {
         }
     }
 
-    /// Waits for its end until `deadline`, or until `abort` says that there is no time for that.
+    /// Waits until the process has ended, until `deadline`, or until `abort` returns true.
     pub fn wait_until(
         &mut self,
         deadline: Instant,
@@ -153,7 +154,7 @@ impl ManagedProcess {
         self.end
     }
 
-    /// Resident memory, MiB; none once it has ended.
+    /// Resident memory, MiB; none once the process has ended.
     pub fn rss_mib(&mut self) -> Option<f64> {
         if self.end().is_some() {
             return None;
@@ -162,7 +163,7 @@ impl ManagedProcess {
         Some(kib(&status, "VmRSS:")? as f64 / 1024.0)
     }
 
-    /// How it ended and its last lines, as one message.
+    /// How the process ended, and its error or the last lines of its log, as one message.
     pub fn exit_report(&mut self) -> String {
         self.wait_until(Instant::now(), || false);
         let how = match self.end.map(|it| (it.code(), it.signal())) {
@@ -182,7 +183,7 @@ impl ManagedProcess {
 impl Drop for ManagedProcess {
     fn drop(&mut self) {
         self.kill();
-        // Without end where the kernel does not let it go, as a driver that hangs.
+        // The exit status is missing if the kernel cannot end the process, for example because a driver hangs.
         let end = self.wait_until(Instant::now() + KILLED_MAX, || false);
         if end.is_none() {
             tracing::warn!("{} (process {}) does not end", self.name, self.child.id());
@@ -190,20 +191,25 @@ impl Drop for ManagedProcess {
     }
 }
 
-/// Asks a child process that was not waited for yet to drain and end.
+/// Whether a process exited because its run is over or because it was asked to stop.
+pub(crate) fn is_orderly(status: ExitStatus) -> bool {
+    status.success() || status.code() == Some(EXIT_INTERRUPTED.into())
+}
+
+/// Asks a child process to drain and exit. The child must not have been waited for yet.
 pub fn ask_to_stop(child: &Child, name: &str) {
     send(child, name, Signal::SIGTERM);
 }
 
 fn send(child: &Child, name: &str, signal: Signal) {
-    // Once it was waited for, its number may belong to another process.
+    // No caller has waited for the child, so its PID cannot belong to another process yet.
     if let Err(e) = kill(Pid::from_raw(child.id() as i32), signal) {
         tracing::debug!("sending {signal} to {name}: {e}");
     }
 }
 
-/// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
-/// asked before it listens for signals dies of the request, and has nothing to save.
+/// Waits for processes to end, after SIGTERM to each if `ask`. Kills those that do not end in time, and reports failures. A process
+/// that receives SIGTERM before it listens for signals dies of it, which is not a failure: it has nothing to save.
 pub(crate) fn stop<'a>(
     processes: impl IntoIterator<Item = &'a mut ManagedProcess>,
     ask: bool,
@@ -218,7 +224,7 @@ pub(crate) fn stop<'a>(
     let mut late = Vec::new();
     for process in processes {
         match process.wait_until(deadline, abort) {
-            Some(status) if status.success() => {}
+            Some(status) if is_orderly(status) => {}
             Some(status) if ask && status.signal() == Some(Signal::SIGTERM as i32) => {}
             Some(_) => late.push(process.exit_report()),
             None => {

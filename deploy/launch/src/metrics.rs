@@ -1,6 +1,6 @@
-//! Every metric of a run, once: [`COLUMNS`]. `metrics.csv`, `--json`, Prometheus' file, TensorBoard's events and the labels of plots
-//! loop over it.
-//! It asks no process and writes no file.
+//! Every metric of a run, defined once in [`COLUMNS`]. `metrics.csv`, `--json`, Prometheus' file, TensorBoard's events and the labels
+//! of plots loop over this table.
+//! This module asks no process and writes no file.
 
 use std::collections::BTreeMap;
 
@@ -8,43 +8,43 @@ use driml_protocol::LearnerStatus;
 
 use crate::run_view::RunView;
 
-/// A metric: its column in `metrics.csv`, or its columns where it is one of several things.
+/// A metric: its column in `metrics.csv`, or its columns if it has several members.
 #[derive(Clone, Copy, Debug)]
 pub struct Column {
-    /// Its name in `metrics.csv` and in JSON. Prometheus' is `driml_NAME`, of a counter `driml_NAME_total`.
+    /// The metric's name in `metrics.csv` and in JSON. In Prometheus it is `driml_NAME`, or `driml_NAME_total` for a counter.
     pub name: &'static str,
     pub(crate) help: &'static str,
-    /// What its numbers count.
+    /// The unit of the metric's numbers.
     pub unit: &'static str,
-    /// The title of its chart.
+    /// The title of the metric's chart.
     pub plot_label: &'static str,
-    /// TensorBoard shows the curves of a group beside each other.
+    /// The group in which TensorBoard shows the curve.
     pub(crate) group: &'static str,
     pub(crate) value: Value,
 }
 
-/// How a metric is taken from a view of a run; none where it is not known yet.
+/// How a metric is read from a view of a run. The result is none where the value is not known yet.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Value {
-    /// A number that rises, until the run is started anew; those of faults and waits, until it is resumed without its replay.
+    /// A number that only rises until the run is started anew; for faults and waits, until it is resumed without its replay.
     Counter(fn(&RunView) -> Option<f64>),
     /// A number that may fall.
     Gauge(fn(&RunView) -> Option<f64>),
-    /// A gauge for each of several things, such as each auxiliary loss: a column each, its name after the prefix.
+    /// A gauge with several members, such as the auxiliary losses: a column per member, named `prefix` and the member's name.
     Each {
-        /// What tells them apart, as Prometheus' label.
+        /// The Prometheus label that distinguishes the members.
         label: &'static str,
         prefix: &'static str,
         members: fn(&RunView) -> Vec<Member>,
     },
-    /// Words, which are in `metrics.csv` and JSON alone.
+    /// Words, which only `metrics.csv` and JSON contain.
     Words(fn(&RunView) -> String),
 }
 
-/// The name of one of several things, and its value in the metric's unit; none where it is not known.
+/// A member's name, and its value in the metric's unit; none if it is not known.
 pub(crate) type Member = (String, Option<f64>);
 
-/// Makes [`COLUMNS`]: a row has a metric's name, unit, group and title, then what it measures, then how it is taken.
+/// Makes [`COLUMNS`]. A row has a metric's name, unit, group and title, then its help text, then how its value is read.
 macro_rules! columns {
     ($($name:literal, $unit:literal, $group:literal, $plot_label:literal: $help:literal, $value:expr;)+) => {
         /// All metrics, in the order of the columns of `metrics.csv`. The auxiliary losses stand between C51's loss and the total.
@@ -152,7 +152,7 @@ fn updates(it: &RunView) -> Option<f64> {
     updates.map(|it| it as f64)
 }
 
-/// What the last update computed; none before the first, as a 0 would look like a loss.
+/// A number of the last update; none before the first update, as a 0 would look like a loss.
 fn learned(it: &RunView, value: fn(&LearnerStatus) -> f64) -> Option<f64> {
     it.learner_shown().filter(|it| it.updates > 0).map(value)
 }
@@ -164,7 +164,7 @@ fn losses(it: &RunView) -> Vec<Member> {
 }
 
 impl Column {
-    /// Its numbers: one under its name, or one for each of several things; none of a text.
+    /// The numbers of the metric: one under its name, or one per member; empty for words.
     pub(crate) fn members(&self, view: &RunView) -> Vec<Member> {
         match self.value {
             Value::Counter(value) | Value::Gauge(value) => vec![(self.name.into(), value(view))],
@@ -173,7 +173,7 @@ impl Column {
         }
     }
 
-    /// The column of `metrics.csv` in which a member stands.
+    /// The column of `metrics.csv` for a member.
     fn column_of(&self, member: &str) -> String {
         match self.value {
             Value::Each { prefix, .. } => prefix.to_owned() + &member.replace('-', "_"),
@@ -182,7 +182,7 @@ impl Column {
     }
 }
 
-/// The text of a cell; what is not known is empty.
+/// The text of a cell; empty if the value is not known.
 pub(crate) fn cell(value: Option<impl ToString>) -> String {
     value.map_or(String::new(), |it| it.to_string())
 }
@@ -201,7 +201,7 @@ pub(crate) fn cells(view: &RunView) -> Vec<(String, String)> {
     cells.collect()
 }
 
-/// The curves of TensorBoard, `GROUP/COLUMN`, and their points. Frames are what they are drawn over.
+/// TensorBoard's curves, named `GROUP/COLUMN`, with their newest points. They are drawn over frames.
 pub(crate) fn points(view: &RunView) -> Vec<(String, f64)> {
     let drawn = COLUMNS.iter().filter(|it| it.name != "frames");
     let points = drawn.flat_map(|column| {
@@ -212,7 +212,7 @@ pub(crate) fn points(view: &RunView) -> Vec<(String, f64)> {
     points.collect()
 }
 
-/// The metrics as JSON by name, whole numbers as such; what is not known is null. Metrics of several things are objects.
+/// The metrics as JSON by name. Whole numbers are integers, unknown values are null, and a metric with several members is an object.
 pub(crate) fn json(view: &RunView) -> BTreeMap<&'static str, serde_json::Value> {
     let value = |column: &Column| match column.value {
         Value::Counter(value) | Value::Gauge(value) => {
@@ -228,9 +228,9 @@ pub(crate) fn json(view: &RunView) -> BTreeMap<&'static str, serde_json::Value> 
     COLUMNS.iter().map(|it| (it.name, value(it))).collect()
 }
 
-/// A number of JSON, which has none for NaN and infinity.
+/// A JSON number; null for NaN and infinity, which JSON does not have.
 fn json_number(value: f64) -> serde_json::Value {
-    /// Below this every whole number is one of f64's.
+    /// Below this, f64 represents every whole number exactly.
     const WHOLE_MAX: f64 = 9_007_199_254_740_992.0;
     match value.fract() == 0.0 && value.abs() < WHOLE_MAX {
         true => (value as i64).into(),
@@ -238,7 +238,7 @@ fn json_number(value: f64) -> serde_json::Value {
     }
 }
 
-/// The metric of a column of `metrics.csv`, if it is one of a fixed name; processes differ by run.
+/// The metric of a column of `metrics.csv`, also for the memory of a process, whose name differs by run. None for an auxiliary loss.
 pub fn column(name: &str) -> Option<&'static Column> {
     COLUMNS.iter().find(|it| match it.value {
         Value::Each {
@@ -248,7 +248,7 @@ pub fn column(name: &str) -> Option<&'static Column> {
     })
 }
 
-/// Six decimals, without the digits that a conversion from f32 added: -0.6, not -0.5999999940395355. Small numbers keep seven digits.
+/// Rounds to six decimals, which drops digits from a conversion of f32: -0.6, not -0.5999999940395355. Small numbers keep seven digits.
 pub fn rounded(value: f64) -> f64 {
     let text = match value.abs() < 1e-3 {
         true => format!("{value:.6e}"),
@@ -268,7 +268,7 @@ mod tests {
         testing::{view, with},
     };
 
-    /// A view of a run that is recorded, or not and whose learner does not answer.
+    /// The view of a run that is recorded, or, without `learner`, of a run that is not recorded and whose learner does not answer.
     fn of_two_losses(replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
         let is_recorded = learner.is_some();
         let plan = with(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
@@ -352,7 +352,7 @@ mod tests {
         assert!(column("dim_4t4").is_none());
     }
 
-    /// `UPDATE_EXPECT=1` writes the page anew.
+    /// `UPDATE_EXPECT=1` rewrites the page.
     #[test]
     fn the_page_has_every_metric() {
         let mut page = "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n\

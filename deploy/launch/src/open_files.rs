@@ -1,23 +1,23 @@
-//! How many open files the processes of a run need, so that one that cannot have them is not started. It opens none.
+//! How many open files the processes of a run need, checked before a process starts. This module opens none.
 //!
-//! Measured on runs of 1, 4 and 12 actors: a replay server has 40 and 4 for each actor (2 where none shares memory), the launcher 40 and 3
-//! for each process, the others 33.
+//! Measured on runs of 1, 4 and 12 actors: a replay server has 40 open files and 4 per actor (2 without shared memory), the launcher
+//! 40 and 3 per process, each other process 33.
 
 use driml_machine::error::Usage;
 use driml_settings::config::RunConfig;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
-/// Of each process, and some for what it opens for a moment.
+/// Open files of each process, with some room for files that are open only briefly.
 const BASE: u64 = 48;
-/// Of the launcher for each process: the ends of two pipes, and a log.
+/// Additional open files of the launcher per process: the ends of two pipes, and a log.
 const OF_LAUNCHER: u64 = 3;
 
-/// Of a replay server for so many actors: a socket and a segment of zenoh's for each, and what an actor sends in.
+/// Open files of a replay server for this many actors: per actor a socket, a segment of zenoh's, and the memory in which it sends.
 fn of_server(actors: u64, shared_memory: bool) -> u64 {
     BASE + actors * if shared_memory { 4 } else { 2 }
 }
 
-/// Whether this process, or one that it starts, may have so many open files. What may be raised is.
+/// Checks that this process, or a child of it, may have `needed` open files. Raises the soft limit to the hard limit.
 fn check(needed: u64, whose: &str) -> Result<(), String> {
     let max = match getrlimit(Resource::RLIMIT_NOFILE) {
         Ok((_, hard)) if setrlimit(Resource::RLIMIT_NOFILE, hard, hard).is_ok() => hard,
@@ -33,7 +33,7 @@ fn check(needed: u64, whose: &str) -> Result<(), String> {
     ))
 }
 
-/// Checks that the launcher and its replay servers may open as many files as the run's actors take.
+/// Checks that the launcher and its replay servers may open as many files as the run's actors need.
 pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
     let actors = u64::from(config.local.actors);
     let shards = u64::from(config.replay.shards);
@@ -46,7 +46,7 @@ pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
     check(needed, &format!("{whose} of a run with {actors} actors")).map_err(Usage)
 }
 
-/// Warns if a replay server that is started by hand may not open as many files as the actors take that its settings know of.
+/// Warns if a replay server that is started by hand may not open as many files as the actors in its settings need.
 pub fn warn_of_server(config: &RunConfig) {
     let actors = u64::from(config.local.actors);
     let needed = of_server(actors, config.transport.shared_memory);

@@ -1,4 +1,4 @@
-//! A panic in any thread ends the process: one that continues without one of its threads looks alive and no longer works.
+//! A panic in any thread ends the process: a process that has lost a thread looks alive but no longer works.
 //! Nothing in this program catches a panic.
 
 use std::{
@@ -10,13 +10,13 @@ use std::{
 
 use driml_machine::limits;
 
-/// The thread that ends the process, once it has decided how.
+/// The thread that ends the process, set once the exit code is decided.
 static ENDING: OnceLock<ThreadId> = OnceLock::new();
 
-/// Makes every panic say thread, place and message on stderr in one line, and then abort the process. That of a library says too what
-/// the system has nearly no more of: it may be why.
+/// Makes every panic print its thread, place and message on stderr in one line, and then abort the process. For a panic of a library,
+/// the line also names the resources of the system that are nearly used up: they may be the cause.
 ///
-/// The launcher shows that line and says which process it was; processes whose launcher aborts end in order.
+/// The launcher shows that line with the name of the process. If a launcher aborts, its processes exit in order.
 pub fn end_the_process() {
     std::panic::set_hook(Box::new(|panic| {
         let thread = std::thread::current();
@@ -40,21 +40,21 @@ pub fn end_the_process() {
     }));
 }
 
-/// Says that this thread now ends the process, and with which code is decided.
+/// Notes that this thread now ends the process, and that the exit code is decided.
 ///
-/// While it does, what a library keeps for the whole process is taken down: a thread of the library's own that still looks at it
-/// panics (zenoh's shared memory does so). That changes nothing any more, so such a thread is stopped without a word.
+/// During the exit, libraries destroy their global state. A library's thread that still uses that state panics (zenoh's shared
+/// memory does so). That must not change the exit code any more, so the hook parks such a thread silently.
 pub fn process_ends() {
     ENDING.get_or_init(|| std::thread::current().id());
 }
 
-/// Writes without the lock of `std::io::stderr`, which another thread may hold forever, and without a buffer.
+/// Writes without a buffer and without the lock of `std::io::stderr`, which another thread may hold forever.
 fn say(text: &str) {
-    // Nothing is left to be done if stderr is gone.
+    // Nothing can be done if stderr is closed.
     let _ = nix::unistd::write(std::io::stderr(), format!("{text}\n").as_bytes());
 }
 
-/// Whether a file is one of this program's own sources, whose names begin at the root of the repository.
+/// Whether a file is one of this program's own sources, whose paths are relative to the root of the repository.
 fn is_ours(file: &str) -> bool {
     !file.starts_with('/')
 }
@@ -64,7 +64,7 @@ fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]) -> S
     let text = message.downcast_ref::<String>().map(String::as_str);
     let text = text.or_else(|| message.downcast_ref::<&str>().copied());
     let message = text.unwrap_or("without a message");
-    // What `assert_eq!` says takes several lines.
+    // The message of `assert_eq!` has several lines.
     let message: Vec<_> = message.lines().map(str::trim).collect();
     let place = panic.location().map(|it| format!(" at {it}"));
     let place = place.unwrap_or_default();
@@ -92,10 +92,10 @@ mod tests {
 
     pub(super) static STOPPED: AtomicBool = AtomicBool::new(false);
 
-    /// Set where this test is the process that panics, to what it says before.
+    /// Set in the child process that panics, to `ends` if the process notes that it ends before the panic.
     const CHILD: &str = "DRIML_TEST_PANICS";
 
-    /// Runs one of these tests as the process that panics, started by a shell's script.
+    /// Runs one of these tests in a child process that panics, started by a shell script.
     fn run_as_child(script: &str, name: &str, says: &str) -> Output {
         let mut command = Command::new("sh");
         command.args(["-c", script]);
@@ -142,7 +142,7 @@ mod tests {
             let pool = ShmProviderBuilder::default_backend(1 << 12).wait().unwrap();
             let open = || File::open("/dev/null").ok();
             let _files: Vec<_> = std::iter::from_fn(open).collect();
-            // zenoh makes its own part with the first piece.
+            // zenoh makes its metadata with the first allocation.
             let _ = pool.alloc(1).wait();
             std::process::exit(5);
         }

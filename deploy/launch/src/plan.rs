@@ -1,5 +1,5 @@
-//! What a run will do and about how long it takes, printed before it starts.
-//! It decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
+//! What a run will do and about how long it takes, printed before the run starts.
+//! This module decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
 use std::time::Duration;
 
@@ -15,17 +15,17 @@ use driml_settings::{
 
 use crate::run_folder::{ResumePoint, RunFolder};
 
-/// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
+/// Arithmetic that one core sustains over a whole run, learner and actors together, in GFLOP/s.
 ///
 /// Measured on 2 cores of an AMD EPYC with AVX-512: an update of `driml-ada` on bigfish alone, 16 GFLOP, takes 54 ms, which is
-/// 150 a core (`driml bench learner`); actors and replay server share the cores with it, and other machines
-/// have narrower registers, so this is half of it.
+/// 150 per core (`driml bench learner`). The constant is half of that, as actors and replay server share the cores with the
+/// learner, and other machines have narrower registers.
 const GFLOPS_PER_CORE: f64 = 75.0;
 
-/// Columns before the facts of the plan.
+/// Width in characters of the labels in front of the plan's facts.
 pub const INDENT: usize = 12;
 
-/// About how long the run takes on `cores` cores: its updates, and one forward pass a frame.
+/// Estimates how long the run takes on `cores` cores: its updates, and one forward pass per frame.
 pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
     let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
     let update = UpdateCost::of(&config.model, &shape).total() as f64;
@@ -36,7 +36,7 @@ pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
     Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
 }
 
-/// The plan of a run that starts at `resume_point`, one fact a line.
+/// The plan of a run that starts at `resume_point`, one fact per line.
 pub fn describe(
     config: &RunConfig,
     from: &str,
@@ -99,7 +99,7 @@ fn size(bytes: u64) -> String {
     }
 }
 
-/// A time that pretends to no more precision than an estimate has.
+/// Formats a time with no more precision than an estimate has.
 fn about(time: Duration) -> String {
     let time = match time.as_secs() {
         0..60 => return "under a minute".into(),
@@ -123,7 +123,7 @@ mod tests {
         let config = config("paper", "procgen:bigfish", "driml-fix", &[]);
         let (folder, point) = (RunFolder::new("runs/x"), ResumePoint::default());
         let plan = describe(&config, "preset paper", &folder, false, point, &MACHINE);
-        // 199_000 transitions after the warm-up at 8 rows each, in batches of 256. The time depends on a measured constant.
+        // 199_000 transitions after the warm-up, at 8 rows each, in batches of 256. The time depends on a measured constant.
         let plan = plan.lines().filter(|line| !line.starts_with("time"));
         let plan: String = plan.map(|line| format!("{line}\n")).collect();
         expect![[r#"

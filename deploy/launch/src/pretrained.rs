@@ -1,5 +1,5 @@
-//! Networks that are played without a run: each one file, f16 weights with the run's settings in the metadata. Some are built in.
-//! It trains none, and such a file cannot be trained on: it has neither auxiliary heads nor an optimiser's state.
+//! Networks that are played without a run: each is one file, f16 weights with the run's settings in the metadata. Some are built in.
+//! Such a file cannot be trained on: it has neither auxiliary heads nor the state of an optimiser.
 
 use std::{fs, path::Path};
 
@@ -16,7 +16,7 @@ use serde_json::Value;
 
 use crate::evaluate::{EPSILON, Player};
 
-/// Each game with its file in `deploy/pretrained/`.
+/// Each game, with its file in `deploy/pretrained/`.
 macro_rules! built_in_games {
     ($($game:literal),+) => {
         &[$(($game, include_bytes!(concat!("../../pretrained/", $game, ".safetensors")))),+]
@@ -24,15 +24,15 @@ macro_rules! built_in_games {
 }
 
 const PREFIX: &str = "pretrained:";
-/// The ending of a weights file, which is not a run's folder.
+/// The extension of a weights file; other paths are run folders.
 const EXTENSION: &str = "safetensors";
-/// The built-in networks, by the game's name. To add one: `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`, and its name
-/// here.
+/// The built-in networks, by the name of the game. To add one, run `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`
+/// and add its name here.
 const BUILT_IN: &[(&str, &[u8])] = built_in_games!["bigfish", "coinrun", "fruitbot", "starpilot"];
 
 const EXPORTED: &str = "exported";
 
-/// What the description of an exported network has beside that of a checkpoint's.
+/// What the description of an exported network has in addition to that of a checkpoint.
 #[derive(Serialize, Deserialize)]
 struct Exported {
     /// The run's resolved settings, TOML.
@@ -41,10 +41,10 @@ struct Exported {
     is_averaged: bool,
 }
 
-/// The network that `name` names, built in or in a file; none if it is the name of a run's folder.
+/// Reads the network `name`, which is built in or a file; none if `name` is a run's folder.
 ///
 /// # Errors
-/// A name that no built-in network has, a file that cannot be read or holds something else.
+/// A name that no built-in network has, a file that cannot be read or is not an exported network.
 pub fn find(name: &Path) -> anyhow::Result<Option<Player>> {
     let shown = name.display().to_string();
     if let Some(game) = shown.strip_prefix(PREFIX) {
@@ -90,7 +90,7 @@ fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
     let settings = format!("the settings in {name}");
     let mut config = RunConfig::parse(&settings, &exported.settings)?;
     config.learner.publish_dtype = StoredAs::F16;
-    // It was chosen for the machine that trained.
+    // The run's precision was chosen for the machine that trained.
     if !is_bf16_fast() {
         config.actor.precision = Precision::F32;
     }
@@ -106,7 +106,7 @@ fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
     })
 }
 
-/// The network that plays, without DIM's heads, as the bytes of a file that [`find`] reads.
+/// Exports the network, without DIM's heads, as the bytes of a file that [`find`] reads.
 pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
     let config = &player.config;
     let exported = Exported {
@@ -157,7 +157,7 @@ mod tests {
             }
         }
         assert_eq!(played(&read).len(), 4);
-        // Of what is read nothing is rounded again.
+        // Exporting what was read rounds nothing again.
         let again = export(&read).unwrap();
         let again = built_in(&[("chain", &again[..])], "chain").unwrap();
         assert_eq!(played(&read), played(&again));

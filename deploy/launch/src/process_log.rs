@@ -1,5 +1,5 @@
-//! What a process writes: carried to its log file, its warnings and errors to the screen too, its last lines kept for the end.
-//! On a full disk lines wait as rows of a table do.
+//! The output of a child process: each line goes to its log file, warnings and errors also to the screen, and the last lines are kept.
+//! On a full disk, lines wait in memory as the rows of a table do.
 
 use std::{
     collections::VecDeque,
@@ -14,9 +14,9 @@ use driml_protocol::{fail_point, lock};
 
 use crate::{console::Screen, run_folder::AppendLog};
 
-/// Last lines that are kept to be shown if the process fails.
+/// How many of the last lines are kept, to be shown if the process fails.
 const TAIL_LINES_MAX: usize = 8;
-/// Lines that are kept while they cannot be written: with each one all of them are tried again.
+/// Lines kept in memory while the file cannot be written; each new line makes another attempt to write all of them.
 const WAITING_MAX: usize = 1000;
 
 #[derive(Debug)]
@@ -31,7 +31,7 @@ pub(crate) struct ProcessLog {
 struct Kept {
     file: AppendLog,
     tail: VecDeque<String>,
-    /// The error with which the process says that it ended, and how many lines followed: its causes may take several.
+    /// The error line with which the process ended, and how many lines followed it: the causes may take several lines.
     error: Option<(String, usize)>,
 }
 
@@ -51,7 +51,7 @@ impl ProcessLog {
         })
     }
 
-    /// Carries what comes through `pipe`, on its own thread, until its other end is closed.
+    /// Copies what comes through `pipe`, on a separate thread, until the other end is closed.
     pub(crate) fn follow(
         &mut self,
         pipe: impl Read + Send + 'static,
@@ -75,7 +75,7 @@ impl ProcessLog {
         Ok(())
     }
 
-    /// The error with which the process ended, if it said one, or else its last lines.
+    /// The error with which the process ended, if it printed one, or else its last lines.
     pub(crate) fn last_words(&self) -> String {
         let kept = lock(&self.kept);
         let last = |count: usize| -> String {
@@ -83,20 +83,20 @@ impl ProcessLog {
             lines.map(|line| format!("\n  {line}")).collect()
         };
         match &kept.error {
-            // It says all.
+            // The error and the lines after it say everything.
             Some((error, followed)) => format!(": {error}{}", last(*followed)),
             None if kept.tail.is_empty() => String::new(),
             None => format!("; its last lines:{}", last(TAIL_LINES_MAX)),
         }
     }
 
-    /// How many lines could not be written, and why; none if all were.
+    /// How many lines could not be written, and why; none if all were written.
     pub(crate) fn missing(&self) -> Option<String> {
         lock(&self.kept).file.missing()
     }
 
-    /// Waits until everything that the process wrote is in the log. The process has ended, and no other one holds the pipes'
-    /// other ends.
+    /// Waits until everything that the process wrote is in the log. The process must have ended, and no other process may hold the
+    /// other ends of the pipes.
     pub(crate) fn finish(&mut self) {
         for thread in self.threads.drain(..) {
             thread.join().expect("a panic has ended the process");
@@ -105,7 +105,7 @@ impl ProcessLog {
 }
 
 impl Kept {
-    /// Keeps a line. A warning is returned the first time that one cannot be written.
+    /// Adds a line. Returns a warning the first time that a line cannot be written.
     fn add(&mut self, line: String) -> Option<String> {
         let warning = self.file.add([format!("{line}\n").into_bytes()]);
         if self.tail.len() == TAIL_LINES_MAX {
@@ -121,8 +121,8 @@ impl Kept {
     }
 }
 
-/// Whether a log line is a warning or worse: the level is the second word, after the time. The `error:` with which a process ends is
-/// in its exit report.
+/// Whether a log line is a warning or an error: the level is the second word, after the time. The `error:` line with which a process
+/// ends does not count, as the exit report contains it.
 fn is_warning(line: &str) -> bool {
     let level = line.split_whitespace().nth(1);
     matches!(level, Some("WARN" | "ERROR"))

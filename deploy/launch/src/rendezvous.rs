@@ -1,9 +1,9 @@
-//! The folder in which the processes of a run meet at unix sockets: private, beside other temporary files, and removed with the
-//! last process that uses it. A socket's path must be short, so it is not in the run folder.
+//! The folder with the unix sockets of a run's processes. It is private, lies among the temporary files, and is removed with the
+//! last process that uses it. A socket's path must be short, so the folder is not in the run folder.
 //!
-//! The folder is in use as long as a process holds the lock of one file in it: the launcher, and each process that it started,
-//! which has the file as its standard input. A folder whose launcher was killed is recognised by this, and removed by the next
-//! launcher that starts or the last process that ends.
+//! The folder is in use as long as a process holds the lock on its file `in-use`: the launcher, and each process that the launcher
+//! started, which has that file as its standard input. A folder whose launcher was killed is recognised by its free lock. The next
+//! launcher that starts, or the last process that exits, removes it.
 
 use std::{
     fs::{self, File, Permissions},
@@ -19,13 +19,13 @@ use nix::unistd::{dup2_stdin, geteuid};
 use crate::endpoint::{ADDRESS_ENDS, SOCKET_PATH_MAX};
 
 const PREFIX: &str = "driml-run-";
-/// The longest name of a socket behind the folder for temporary files.
+/// The longest path of a socket below the folder for temporary files.
 const SOCKET: &str = "/driml-run-XXXXXX/replay-server-255.sock";
-/// Where the folder is if the one for temporary files has too long a name.
+/// Where the folder lies if the path for temporary files is too long, or has characters that an endpoint cannot have.
 const SHORT_PLACE: &str = "/tmp";
 const IN_USE: &str = "in-use";
 
-/// A run's folder for sockets. Dropping it removes it.
+/// A run's folder for sockets, removed on drop.
 #[derive(Debug)]
 pub struct Rendezvous {
     folder: tempfile::TempDir,
@@ -33,7 +33,7 @@ pub struct Rendezvous {
 }
 
 impl Rendezvous {
-    /// Makes one, and removes those that are no longer in use.
+    /// Makes a folder, and removes the folders that are no longer in use.
     pub(crate) fn create() -> anyhow::Result<Self> {
         let place = place_under(std::env::temp_dir());
         sweep(&place);
@@ -44,23 +44,23 @@ impl Rendezvous {
     }
 
     fn create_in(place: &Path) -> io::Result<Self> {
-        // Any process that can reach the socket can take part in the run.
+        // Private, because any process that can reach the socket can take part in the run.
         let folder = tempfile::Builder::new()
             .prefix(PREFIX)
             .permissions(Permissions::from_mode(0o700))
             .tempdir_in(place)?;
-        // Locked before it has the name by which it is known, or a process that sweeps just now would find it without a holder.
+        // Locked before it gets its final name; otherwise a process that sweeps just now would find a folder without a holder.
         let fresh = folder.path().join("new");
         let lock = File::create(&fresh)?;
         if let Err(e) = lock_file::try_lock(&lock) {
-            // What cannot be locked is not swept.
+            // A folder that cannot be locked is never swept.
             tracing::debug!("locking {}: {e}", fresh.display());
         }
         fs::rename(fresh, folder.path().join(IN_USE))?;
         Ok(Self { folder, lock })
     }
 
-    /// Where the folder lies: written into the run folder, so that `--resume` can see whether it is still used.
+    /// The path of the folder. It is written into the run folder, so that `--resume` can see whether the folder is still used.
     pub(crate) fn path(&self) -> &Path {
         self.folder.path()
     }
@@ -70,20 +70,20 @@ impl Rendezvous {
         format!("unixsock-stream/{}", path.display())
     }
 
-    /// The lock, for a process that uses the folder: its standard input.
+    /// A handle on the lock, for a process that uses the folder: its standard input.
     pub(crate) fn hold(&self) -> io::Result<File> {
         self.lock.try_clone()
     }
 }
 
-/// Where such folders are, beside other temporary files if these are in `folder`.
+/// Where such folders lie: in `folder`, the one for temporary files, if an endpoint can name a path there.
 fn place_under(folder: PathBuf) -> PathBuf {
     let path = folder.to_string_lossy();
     let fits = path.len() + SOCKET.len() <= SOCKET_PATH_MAX && !path.contains(ADDRESS_ENDS);
     if fits { folder } else { SHORT_PLACE.into() }
 }
 
-/// What a process does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
+/// Called at the orderly exit of a process: releases its lock on the folder, and sweeps, as its launcher may have been killed.
 pub fn leave() {
     let nothing = File::open("/dev/null");
     match nothing.and_then(|nothing| Ok(dup2_stdin(nothing)?)) {
@@ -92,7 +92,7 @@ pub fn leave() {
     }
 }
 
-/// Removes folders of this user in `place` that are no longer in use. What cannot be removed stays and does no harm.
+/// Removes this user's folders in `place` that are no longer in use. A folder that cannot be removed stays and does no harm.
 fn sweep(place: &Path) {
     let entries = fs::read_dir(place).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
@@ -105,7 +105,7 @@ fn sweep(place: &Path) {
     }
 }
 
-/// Whether the lock of the folder at `path` can be had; none if that is not known.
+/// Whether the lock of the folder at `path` is free; none if that is not known.
 fn is_free(path: &Path) -> Option<bool> {
     let lock = File::open(path.join(IN_USE)).ok()?;
     lock_file::try_lock(&lock).ok()
@@ -139,14 +139,14 @@ mod tests {
         assert_eq!(rendezvous.endpoint("learner"), endpoint);
         let mode = fs::metadata(rendezvous.folder.path()).unwrap().mode();
         assert_eq!(mode & 0o777, 0o700);
-        // Of another program, by its name or content.
+        // Folders of other programs, by their name or content.
         fs::create_dir(place.path().join("driml-run-other")).unwrap();
         fs::create_dir(place.path().join("else")).unwrap();
         fs::write(place.path().join("else").join(IN_USE), "").unwrap();
         sweep(place.path());
         assert_eq!(folders(place.path()), 3);
 
-        // As after the launcher was killed: a process still uses it.
+        // As after the launcher was killed, while a process still uses the folder.
         let process = rendezvous.hold().unwrap();
         let Rendezvous { folder, lock } = rendezvous;
         let path = folder.keep();

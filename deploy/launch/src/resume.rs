@@ -1,5 +1,5 @@
-//! `driml train --resume`: the settings of an interrupted run, and the point from which it continues.
-//! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
+//! `driml train --resume`: finds the settings of an interrupted run, and the point from which it continues.
+//! This module changes nothing in the run's folder. It waits until an earlier learner has saved there.
 
 use std::{
     ffi::OsStr,
@@ -30,14 +30,14 @@ use crate::{
     run_folder::{Outcome, ResumePoint, RunFolder, Summary},
 };
 
-/// How long the learner of a launcher that was killed may take to save.
+/// How long the learner may take to save after its launcher was killed.
 const SAVING_MAX: Duration = Duration::from_secs(120);
-/// How long its other processes may then take to end; a replay server stays for 10 s where one of them is frozen.
+/// How long the other processes may then take to exit; a replay server stays for 10 s if one of them is frozen.
 const ENDING_MAX: Duration = Duration::from_secs(20);
 const LOOK: Duration = Duration::from_millis(250);
 
-/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, and the world keeps no progress over episodes
-/// or is saved with it.
+/// Whether the run in `folder`, which plays `world`, can be resumed. It needs a checkpoint, and a world that keeps no progress across
+/// episodes or whose progress the checkpoint holds.
 pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     folder.config().exists()
@@ -47,13 +47,13 @@ pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
         })
 }
 
-/// The updates of the newest checkpoint of the run in `folder`, if it has one.
+/// The number of updates of the newest checkpoint of the run in `folder`, if it has one.
 pub fn newest_updates(folder: &RunFolder) -> Option<u64> {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     saved.last().map(|(updates, _)| *updates)
 }
 
-/// Prints how to resume a run that was interrupted or failed, if it can be.
+/// Prints how to resume a run that was interrupted or failed, if that is possible.
 pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::line(&format!(
@@ -63,10 +63,10 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     }
 }
 
-/// Prints what can be done after a run that has ended: commands, or how it is resumed.
+/// Prints what the user can do after a run has ended: commands, or how to resume it.
 ///
 /// # Errors
-/// [`Interrupted`] if it was.
+/// [`Interrupted`] if the run was interrupted.
 pub(crate) fn say_next(
     summary: &Summary,
     world: &WorldConfig,
@@ -79,7 +79,7 @@ pub(crate) fn say_next(
     console::print(&summary.next_steps(folder, is_resumable(world, folder)))
 }
 
-/// Waits until the learner of the run in `folder` has saved and its other processes have ended, if the run was ended.
+/// Waits until the learner of an ended run in `folder` has saved and the other processes of the run have exited.
 ///
 /// # Errors
 /// The run is still running, or its learner takes too long.
@@ -90,11 +90,14 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
         Some(Err(CheckpointError::InUse(_))) => Ok(false),
         locked => locked.transpose().map(|_| true),
     };
-    let why = format!("a learner still saves in {}", checkpoints.display());
+    let why = format!(
+        "a learner still uses {}, and must be stopped if it was kept alive",
+        checkpoints.display()
+    );
     if !wait_until(is_saved, SAVING_MAX, &why)? {
         checkpoint::lock(&checkpoints)?;
     }
-    // The replay server is the last: it holds its replay, and where it listens.
+    // The replay server exits last: until then it holds its replay and its endpoint.
     let is_left = || {
         let place = std::fs::read(folder.rendezvous());
         let is_used = |place: Vec<u8>| rendezvous::is_used(Path::new(OsStr::from_bytes(&place)));
@@ -104,7 +107,7 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     wait_until(is_left, ENDING_MAX, &why).map(drop)
 }
 
-/// Waits until it `is_so`, and says at first `why`. False if that takes too long.
+/// Waits until `is_so` returns true, and prints `why` if it has to wait. Returns false after `max`.
 fn wait_until(
     is_so: impl Fn() -> Result<bool, CheckpointError>,
     max: Duration,
@@ -124,28 +127,28 @@ fn wait_until(
     Ok(true)
 }
 
-/// How a run is resumed.
+/// Whether and how a run can be resumed.
 #[derive(Debug)]
 pub enum Found {
-    /// Nothing is left to do; a sentence that says so, and what else can be done.
+    /// Nothing is left to do. The text says so, and what else can be done.
     Nothing(String),
-    /// Something is, or the run has all its updates and did not come to its end.
+    /// Something is left to do, or the run has all its updates but did not come to its end.
     Resumed(Box<Resumed>),
 }
 
-/// How a run continues.
+/// What a resumed run continues with.
 #[derive(Debug)]
 pub struct Resumed {
-    /// Its settings.
+    /// The run's settings.
     pub config: RunConfig,
-    /// From where.
+    /// The point from which the run continues.
     pub point: ResumePoint,
-    /// All its processes are one, in a fixed order.
+    /// Whether all components run in one process, in a fixed order.
     pub lockstep: bool,
 }
 
-/// Checks that the run in `folder`, which has had the settings `before`, can continue with `config`: before they are written there, as
-/// it could not be resumed afterwards.
+/// Checks that the run in `folder` can change its settings from `before` to `config`. The check comes before `config` is written into
+/// the folder, as a run with settings that cannot work could not be resumed afterwards.
 fn check_changes(
     folder: &RunFolder,
     before: &RunConfig,
@@ -178,10 +181,10 @@ fn check_changes(
     Ok(())
 }
 
-/// The settings with which the run in `folder` continues, and from which point.
+/// Finds the settings with which the run in `folder` continues, and the point from which it continues.
 ///
 /// # Errors
-/// A folder that is not a run's, settings that cannot work, no checkpoint, a run that is still running.
+/// The folder is not a run's, the settings cannot work, it has no checkpoint, or the run is still running.
 pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Found> {
     let path = folder.config();
     let name = path.display().to_string();
@@ -190,7 +193,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
             "reading the settings {name}: {e}; --resume takes the folder of a run that was interrupted"
         )
     })?;
-    // First, as a run that is still ending holds memory.
+    // Wait first: a run that is still exiting holds memory.
     wait_until_free(folder)?;
     let before = RunConfig::parse(&name, &text)?;
     let mut config = Source::File(name, text).resolve(flags, machine)?;
@@ -201,7 +204,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
     })?;
     let (updates, progress) = checkpoint::progress(newest)?;
-    // A run in lockstep has one, which is empty where its world cannot be saved.
+    // A run in lockstep has a companion, which is empty if the state of its world cannot be saved.
     let companion = checkpoint::companion(newest)?;
     if companion.as_ref().is_some_and(Vec::is_empty) {
         bail!(usage!(
@@ -217,7 +220,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         ));
     }
     check_changes(folder, &before, &config, lockstep)?;
-    // Where nothing was learned, only a run in lockstep keeps what it has.
+    // Before the first update, only a run in lockstep keeps its frames and rows.
     let (frames, rows) = match updates {
         0 if !lockstep => (0, 0),
         _ => (progress.frames(), progress.rows()),
@@ -233,7 +236,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         });
     }
     let is_complete = updates >= config.updates();
-    // The last chunk is stored whole, so that a run may have more frames than its plan.
+    // The last chunk is stored whole, so a run may have more frames than planned.
     let is_shortened = config.frames() < frames.min(before.frames());
     if is_complete && (is_shortened || Summary::is_finished(folder)) {
         let run = folder.quoted();

@@ -1,5 +1,5 @@
-//! A run as its processes describe it: their last answers, how long ago each came, and how fast it is.
-//! It asks no process: the poller and the lockstep mode feed it.
+//! The state of a run as its processes report it: their last answers, the age of each answer, and the speed of the run.
+//! This module asks no process: the poller and the lockstep mode pass it the answers.
 
 use std::{
     collections::VecDeque,
@@ -13,20 +13,20 @@ use driml_protocol::{
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
-/// What the settings say of a run.
+/// What a run is planned to do, by its settings.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Plan {
     pub(crate) world: String,
     pub(crate) agent: String,
     pub(crate) seed: u64,
-    /// What all processes of the run agree on, as a hash: the same number is the same run.
+    /// Hash of everything on which all processes of the run agree: an equal hash means the same run.
     pub(crate) run_spec: String,
     pub(crate) frames_planned: u64,
     pub(crate) updates_planned: u64,
-    /// Rows an update and a transition.
+    /// Rows sampled per stored transition.
     pub(crate) replay_ratio_planned: f64,
     pub(crate) actors_planned: u32,
-    /// The probability with which all actors act at random; none where they differ in it.
+    /// The schedule of the probability of a random action, common to all actors; none if they differ in it.
     #[serde(skip)]
     pub(crate) epsilon: Option<Schedule>,
     #[serde(skip)]
@@ -34,7 +34,7 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Of a run with these settings.
+    /// The plan of a run with these settings.
     pub fn of(config: &RunConfig) -> Self {
         let is_common = config.actor.epsilon_ladder.is_none();
         Self {
@@ -46,38 +46,38 @@ impl Plan {
             updates_planned: config.updates(),
             replay_ratio_planned: config.replay.replay_ratio,
             actors_planned: config.local.actors,
-            // Without a ladder it is every actor's.
+            // Without a ladder, the schedule of actor 0 is the schedule of every actor.
             epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
             losses: config.learner.update.auxiliary_loss.loss_names(),
         }
     }
 }
 
-/// Updates whose batches were served when `rows` were sampled in the whole run: before it was resumed with other settings, and since.
+/// The updates whose batches have been served once the whole run has sampled `rows` rows, even if a resume changed the batch size.
 pub(crate) fn updates_served(config: &RunConfig, rows: u64) -> u64 {
     let start = config.replay.ratio_start();
     start.updates + rows.saturating_sub(start.rows) / u64::from(config.learner.batch_size)
 }
 
-/// Mean and standard deviation over the rows served.
+/// Mean and standard deviation of k over the rows served.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Spread {
     pub(crate) mean: f64,
     pub(crate) sd: f64,
 }
 
-/// The training's episodes so far, also over a resumption.
+/// The training episodes so far, including those before a resume.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Episodes {
     pub(crate) count: u64,
-    /// Mean return of the newest; none before the first.
+    /// Mean return of the newest episodes; none before the first one.
     pub(crate) mean_return: Option<f64>,
-    /// Episodes in the mean: 100, or as many as there were.
+    /// Number of episodes in the mean: 100, or all if there were fewer.
     pub(crate) mean_return_of: usize,
 }
 
 impl Spread {
-    /// Of the k of the rows that were served with a positive.
+    /// The spread of k over the rows that were served with a positive.
     pub(crate) fn of_k(replay: &ReplayStatus) -> Option<Self> {
         let both = replay.mean_k().zip(replay.sd_k());
         both.map(|(mean, sd)| Self { mean, sd })
@@ -85,7 +85,7 @@ impl Spread {
 }
 
 impl Episodes {
-    /// So many, of whose newest these are the returns.
+    /// `count` episodes, of which `newest` holds the newest returns.
     pub(crate) fn of<'a>(count: u64, newest: impl ExactSizeIterator<Item = &'a f64>) -> Self {
         let of = newest.len();
         let sum: f64 = newest.sum();
@@ -102,20 +102,20 @@ pub(crate) struct ServerAnswer {
     #[serde(skip)]
     pub(crate) name: String,
     pub(crate) endpoint: String,
-    /// Its counts; none if it does not answer, or not yet.
+    /// The server's counts; none if it does not answer, or has not answered yet.
     pub(crate) replay: Option<ReplayStatus>,
-    /// Who takes part; none if it does not answer, or not yet.
+    /// The processes that take part in the run; none if the server does not answer, or has not answered yet.
     pub(crate) processes: Option<ProcessesStatus>,
-    /// How far it is with reading its replay back from disk, before which it can answer nothing else.
+    /// Progress of reading the replay back from disk. The server answers no other request before that is done.
     pub(crate) recovering: Option<RecoveryProgress>,
     pub(crate) error: Option<String>,
-    /// Nothing listens there any more: its process has ended.
+    /// Nothing listens at the endpoint any more: the server's process has ended.
     pub(crate) is_gone: bool,
-    /// It answers, and for a run with other settings.
+    /// The server answers, but for a run with other settings.
     pub(crate) is_another_run: bool,
 }
 
-/// Frames and updates a second.
+/// Frames and updates per second.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Speed {
     pub(crate) frames: f64,
@@ -124,7 +124,7 @@ pub(crate) struct Speed {
 
 const RATE_WINDOW: Duration = Duration::from_secs(20);
 
-/// When counts were taken, and how many frames and updates they were.
+/// The time of a sample, and the frames and updates counted by then.
 type Sample = (Instant, u64, u64);
 
 #[derive(Clone, Debug, Default)]
@@ -138,7 +138,7 @@ impl Rates {
         }
     }
 
-    /// Each since the last time at which nothing of it had happened yet; 0 before the second sample.
+    /// The rate of each count since it last stood at its oldest value in the window; 0 before the second sample.
     fn speed(&self) -> Speed {
         let rate = |count: fn(&Sample) -> u64| {
             let (first, last) = (self.0.front()?, self.0.back()?);
@@ -154,38 +154,38 @@ impl Rates {
     }
 }
 
-/// What is known of a run.
+/// Everything that is known about a run.
 #[derive(Clone, Debug, Default)]
 pub struct RunView {
     pub(crate) plan: Plan,
-    /// Updates after which it was resumed; none before that is known.
+    /// Updates after which the run was last resumed, 0 if it never was; none before that is known.
     pub(crate) after_updates: Option<u64>,
     pub(crate) servers: Vec<ServerAnswer>,
-    /// The replay servers' counts when all of them answered last.
+    /// The replay servers' counts, from the last time that all of them answered.
     pub(crate) shards: Vec<ReplayStatus>,
-    /// The same, as of one.
+    /// The same counts, merged into one.
     pub replay: ReplayStatus,
     /// The learner's last status.
     pub learner: LearnerStatus,
     pub(crate) learner_answers: bool,
-    /// For how long not all replay servers have answered, and the learner has not.
+    /// For how long at least one replay server has not answered, and for how long the learner has not.
     pub(crate) replay_silence: Silence,
     pub(crate) learner_silence: Silence,
-    /// Whether the learner has answered ever, or the counts at the start are known without it.
+    /// Whether the learner has ever answered, or the counts at the start are known without it.
     is_learner_known: bool,
-    /// Episodes, and k of the rows served: by its recorder of the whole run, else since the replay began to count.
+    /// Episodes, and k of the rows served: of the whole run if a recorder fills them in, else since the replay began to count.
     pub(crate) episodes: Episodes,
     pub(crate) k: Option<Spread>,
-    /// Seconds of the whole run; none until its recorder has taken the last counts, or where it has none.
+    /// Duration of the whole run, seconds; none without a recorder, or before it has filled in the last answers.
     pub(crate) recorded_s: Option<f64>,
-    /// Resident memory of each process by name, MiB, by its recorder; none for one that ended.
+    /// Resident memory of each process by name, MiB, filled in by the recorder; none for a process that has ended.
     pub(crate) rss_mib: Vec<(String, Option<f64>)>,
     rates: Rates,
     pub(crate) speed: Speed,
 }
 
 impl RunView {
-    /// The view of a run without any report yet.
+    /// The view of a run without any answer yet.
     pub fn new(plan: Plan) -> Self {
         Self {
             plan,
@@ -193,7 +193,7 @@ impl RunView {
         }
     }
 
-    /// Of a run that begins now, with these counts.
+    /// The view of a run that begins now with these counts.
     pub(crate) fn beginning(plan: Plan, frames: u64, updates: u64) -> Self {
         let mut this = Self::new(plan);
         this.after_updates = Some(updates);
@@ -203,25 +203,25 @@ impl RunView {
         this
     }
 
-    /// Takes the learner's status; none if it does not answer.
+    /// Stores the learner's status; none if it does not answer.
     pub(crate) fn take_learner(&mut self, learner: Option<LearnerStatus>) {
         self.learner_answers = learner.is_some();
         if let Some(learner) = learner {
             self.learner = learner;
             self.learner_silence.answered();
             if !std::mem::replace(&mut self.is_learner_known, true) {
-                // Its updates did not come at once.
+                // The learner had done its updates before this first answer, so they say nothing about its speed.
                 self.rates = Rates::default();
             }
         } else {
             self.learner_silence.unanswered();
         }
-        // Until the learner of a resumed run has answered, too.
+        // A resumed run has the updates of its checkpoint even before its learner has answered.
         let before = self.after_updates.unwrap_or(0);
         self.learner.updates = self.learner.updates.max(before);
     }
 
-    /// Takes the counts of all replay servers, after the learner's.
+    /// Stores the counts of all replay servers. Call this after [`Self::take_learner`], as it also samples the updates.
     pub(crate) fn take_replay(&mut self, shards: Vec<ReplayStatus>) {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
@@ -234,13 +234,13 @@ impl RunView {
         self.speed = self.rates.speed();
     }
 
-    /// Each replay server that reads its replay back from disk, and how far it is.
+    /// The replay servers that read their replay back from disk, each with its progress.
     pub(crate) fn recovering(&self) -> impl Iterator<Item = (&ServerAnswer, RecoveryProgress)> {
         let servers = self.servers.iter();
         servers.filter_map(|it| Some((it, it.recovering?)))
     }
 
-    /// Whether all replay servers answered last time.
+    /// Whether all replay servers answered the last request.
     pub(crate) fn is_answered(&self) -> bool {
         self.servers.iter().all(|it| it.replay.is_some())
     }
@@ -255,41 +255,41 @@ impl RunView {
         self.replay.learner_finished || self.learner_status().is_some() && self.is_learned()
     }
 
-    /// Whether no more rows will be sampled and the learner has saved, by the last answers. A learner that was asked to end before has
-    /// saved, too.
+    /// Whether, by the last answers, no more rows will be sampled and the learner has saved. That the learner has saved is not
+    /// enough, as a learner that was stopped early has saved too.
     pub(crate) fn is_learned(&self) -> bool {
         self.replay.waiting == Waiting::Finished && self.learner.finished
     }
 
-    /// Whether everything is learned and saved, or the replay servers have ended after everything was sampled.
+    /// Whether everything is learned and saved, or the replay servers have ended after all rows were sampled.
     pub(crate) fn is_over(&self) -> bool {
         self.is_finished() || self.is_gone() && self.replay.waiting == Waiting::Finished
     }
 
-    /// Seconds since the run began, by its replay servers.
+    /// Seconds since the run began, by the clocks of its replay servers.
     pub(crate) fn up_s(&self) -> Option<f64> {
         let processes = self.servers.iter().filter_map(|it| it.processes.as_ref());
         processes.map(|it| it.up_s).reduce(f64::max)
     }
 
-    /// The learner's status: its answer, or its last one where no process is left to be asked.
+    /// The learner's status if it answers, or its last status if no process is left to ask.
     pub(crate) fn learner_status(&self) -> Option<&LearnerStatus> {
         let is_known = self.learner_answers || self.is_learner_known && self.is_gone();
         is_known.then_some(&self.learner)
     }
 
-    /// Seconds since the run began: without the time between its interruption and its resumption where it is recorded.
+    /// Seconds since the run began. In a recorded run, the time between an interruption and the resume does not count.
     pub(crate) fn seconds(&self) -> Option<f64> {
         self.recorded_s.or_else(|| self.up_s())
     }
 
-    /// The probability with which all actors act at random; none where they differ in it.
+    /// The probability with which all actors act at random; none if they differ in it.
     pub(crate) fn epsilon(&self) -> Option<f64> {
         let schedule = self.plan.epsilon?;
         Some(schedule.epsilon(self.replay.transitions_inserted))
     }
 
-    /// The learner's status that the metrics are taken from: where they are recorded its last one, until it answers.
+    /// The learner's status for the metrics. In a recorded run this is its last status, even if it does not answer.
     pub(crate) fn learner_shown(&self) -> Option<&LearnerStatus> {
         match self.recorded_s {
             Some(_) => Some(&self.learner),

@@ -1,6 +1,6 @@
-//! The shared memory that a process leaves behind in `/dev/shm`. zenoh's own bookkeeping keeps some of it open to the end of the
-//! process, so that it stays there until the next one sweeps; a process that ends in order removes it itself.
-//! What others use too, or could use, it leaves alone.
+//! The shared memory that a process leaves behind in `/dev/shm`. zenoh's own bookkeeping keeps some segments open until the process
+//! ends, so that they stay until another process sweeps. A process that exits in order therefore removes them itself.
+//! Segments that other processes use, or could use, stay.
 
 use std::{collections::BTreeSet, fs, path::PathBuf};
 
@@ -8,7 +8,7 @@ use driml_protocol::shared_memory::FOLDER;
 
 const EXTENSION: &str = ".zenoh";
 
-/// Removes the segments of shared memory that this process alone has in its memory. It must not use them any more.
+/// Removes the segments of shared memory that only this process has mapped. The process must not use them any more.
 pub fn remove_own() {
     let (mut own, this) = (segments("self"), std::process::id());
     for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
@@ -24,7 +24,7 @@ pub fn remove_own() {
     }
 }
 
-/// The segments that a process has in its memory.
+/// The segments that a process has mapped.
 fn segments(pid: &str) -> BTreeSet<PathBuf> {
     let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default();
     let lines = maps.lines();

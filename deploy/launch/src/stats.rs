@@ -1,5 +1,5 @@
-//! Mean, standard deviation and Student's interval: the statistics of returns that evaluations and experiments share.
-//! What compares several samples is in `driml-experiments`.
+//! The statistics of returns that evaluations and experiments share: mean, standard deviation and Student's interval.
+//! Comparisons of several samples are in `driml-experiments`.
 
 use std::fmt;
 
@@ -10,15 +10,15 @@ const T: [f64; 30] = [
     2.052, 2.048, 2.045, 2.042,
 ];
 
-/// The 0.975 quantile of Student's t for this many degrees of freedom, at least 1. Beyond the table it is expanded in 1 / `freedom`
-/// (Fisher and Cornish 1960), within 0.001.
+/// The 0.975 quantile of Student's t for this many degrees of freedom, at least 1. Beyond the table it is an expansion in
+/// 1 / `freedom` (Fisher and Cornish 1960), within 0.001.
 pub fn student_quantile(freedom: usize) -> f64 {
     let in_table = T.get(freedom.max(1) - 1).copied();
     let freedom = freedom as f64;
     in_table.unwrap_or_else(|| 1.960 + 2.372 / freedom + 2.822 / freedom.powi(2))
 }
 
-/// Mean and sample standard deviation (n - 1); the deviation of a single value is 0, the mean of no value NaN.
+/// Mean and sample standard deviation (n - 1). The deviation of a single value is 0; the mean of no values is NaN.
 pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
@@ -30,18 +30,18 @@ pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
     (mean, deviation)
 }
 
-/// A mean and the interval in which it lies with 95% confidence if values are normal.
+/// A mean and its 95% confidence interval, if the values are normally distributed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Interval {
-    /// Of the values, in their unit.
+    /// The mean, in the unit of the values.
     pub mean: f64,
-    /// None for a single value: it does not tell how far others would spread.
+    /// The ends of the interval; none for a single value, which does not tell how far others would spread.
     pub ends: Option<(f64, f64)>,
 }
 
-/// Student's interval of the mean; none of no value.
+/// Student's interval of the mean; none without values.
 ///
-/// A bootstrap of so few values as there are seeds is too narrow: of three, its 95% interval has the mean in 75% of cases.
+/// A bootstrap over as few values as there are seeds is too narrow: with three, its 95% interval contains the mean in 75% of cases.
 pub fn interval(values: &[f64]) -> Option<Interval> {
     let freedom = values.len().checked_sub(1)?;
     let (mean, deviation) = mean_and_deviation(values);
@@ -69,7 +69,7 @@ impl fmt::Display for Interval {
 mod tests {
     use super::*;
 
-    /// The quantiles are those of any textbook's table.
+    /// The quantiles are those in any textbook's table.
     #[test]
     fn the_interval_is_student_s_and_printed_with_its_mean() {
         for (freedom, quantile) in [(0, 12.706), (1, 12.706), (9, 2.262), (30, 2.042)] {

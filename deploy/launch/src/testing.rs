@@ -1,4 +1,4 @@
-//! Settings of runs, and what plays with them, for tests.
+//! Settings of runs, views and players, for tests.
 
 use driml_learner::Compute;
 use driml_machine::resources::Machine;
@@ -19,14 +19,14 @@ pub(crate) const MACHINE: Machine = Machine {
     fast_bf16: false,
 };
 
-/// A default of which some fields are `set`.
+/// A default value in which some fields are `set`.
 pub(crate) fn with<T: Default>(set: impl FnOnce(&mut T)) -> T {
     let mut it = T::default();
     set(&mut it);
     it
 }
 
-/// A run of one replay server after these answers.
+/// The view of a run with one replay server, after these answers.
 pub(crate) fn view(plan: Plan, replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
     let mut view = RunView::new(plan);
     view.take_learner(learner);
@@ -38,7 +38,7 @@ pub(crate) fn config(preset: &str, world: &str, agent: &str, sets: &[&str]) -> R
     of_names(preset, world, agent, sets, &MACHINE).unwrap()
 }
 
-/// An untrained network of this world's and agent's, with DIM's heads if the agent has them.
+/// An untrained network for this world and agent, with DIM's heads if the agent has them.
 pub(crate) fn untrained(world: &str, agent: &str) -> Player {
     let config = config("smoke", world, agent, &[]);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);

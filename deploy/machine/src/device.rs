@@ -1,5 +1,5 @@
-//! Which device a command computes on, and whether this program can compute there: on a GPU only if it was built with the feature
-//! `cuda`. It computes nothing.
+//! The device that a command computes on, and whether this program can compute there: on a GPU only if built with the feature
+//! `cuda`. This module computes nothing.
 
 use clap::Args;
 use driml_model::DeviceName;
@@ -18,7 +18,7 @@ pub struct DeviceFlag {
     pub device: DeviceName,
 }
 
-/// Makes sure that there is this device, and that this program was built for it; else says what to do.
+/// Checks that the device exists and that this program was built for it. Otherwise the error says what to do.
 pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
     let DeviceName::Cuda(ordinal) = device else {
         return Ok(());
@@ -33,7 +33,7 @@ pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
     checked.map_err(|why| usage!("cuda:{ordinal} cannot be used: {why}"))
 }
 
-/// A GPU's name, compute capability and memory; none if the CPU computes.
+/// Describes a GPU: its name, compute capability and memory. None for the CPU, or if the GPU cannot be used.
 pub fn gpu(device: DeviceName) -> Option<String> {
     match device {
         DeviceName::Cpu => None,
@@ -41,16 +41,16 @@ pub fn gpu(device: DeviceName) -> Option<String> {
     }
 }
 
-/// A GPU's name, and what it is, or why this program cannot compute there.
+/// A GPU's device name, such as `cuda:0`, and its description, or why this program cannot compute there.
 pub(crate) type Gpu = (String, Result<String, String>);
 
-/// Every GPU that the driver finds; else why there is none.
+/// Every GPU that the driver finds, or why there is none.
 pub(crate) fn gpus() -> Result<Vec<Gpu>, String> {
     let one = |ordinal| (format!("cuda:{ordinal}"), describe(ordinal));
     count().map(|count| (0..count).map(one).collect())
 }
 
-/// How many devices the driver finds, at least one; else why there is none.
+/// The number of devices that the driver finds, at least one, or why there is none.
 #[cfg(not(feature = "cuda"))]
 fn count() -> Result<usize, String> {
     Err(TO_BUILD.to_owned())
@@ -67,7 +67,7 @@ fn count() -> Result<usize, String> {
     }
 }
 
-/// A device's name, compute capability and memory; an error if it cannot be asked or this program was not built for it.
+/// Describes a device: its name, compute capability and memory. An error if the query fails or the program was not built for it.
 #[cfg(not(feature = "cuda"))]
 fn describe(_ordinal: usize) -> Result<String, String> {
     Err(TO_BUILD.to_owned())
@@ -95,10 +95,10 @@ fn describe(ordinal: usize) -> Result<String, String> {
     }
 }
 
-/// Whether kernels that were compiled for the capability `built`, such as 90 for 9.0, run on one of `major.minor`.
+/// Whether kernels compiled for the capability `built`, such as 90 for 9.0, run on a device of capability `major.minor`.
 ///
-/// Source: nvcc's rules. From 9.0 on candle's are compiled for the architecture's own instructions, which no other has;
-/// below, the driver compiles them for newer ones.
+/// Source: nvcc's rules. From 9.0 on, candle's kernels use instructions of one architecture, which no other architecture has.
+/// Kernels for older capabilities run on newer devices too, as the driver compiles them again.
 #[cfg(any(test, feature = "cuda"))]
 fn runs_on(built: i32, (major, minor): (i32, i32)) -> bool {
     let device = 10 * major + minor;

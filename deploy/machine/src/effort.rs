@@ -1,24 +1,24 @@
-//! The one measuring loop: how long something is measured, and how its speed is taken.
-//! It keeps no figure and judges none.
+//! The one measuring loop: how long a benchmark runs, and how its speed is computed.
+//! This module keeps no figures and judges none.
 
 use std::time::{Duration, Instant};
 
-/// What is measured; a call is what is timed.
+/// The function that is measured; each call is timed.
 pub type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
 
-/// How long each thing is measured.
+/// How long each piece of work is measured.
 #[derive(Clone, Copy, Debug)]
 pub struct Effort {
-    /// Calls before the first that counts.
+    /// Warm-up calls, which are not timed.
     warmup_calls: u32,
-    /// Calls that count, at least.
+    /// Minimum number of timed calls.
     calls_min: usize,
-    /// Time of the calls that count, at least.
+    /// Minimum total time of the timed calls.
     time_min: Duration,
 }
 
 impl Effort {
-    /// Four seconds, or a fifth of one.
+    /// At least 4 s of timed calls, or 0.2 s if `quick`.
     pub const fn new(quick: bool) -> Self {
         let (warmup_calls, calls_min, time_min) = match quick {
             true => (1, 2, Duration::from_millis(200)),
@@ -31,7 +31,7 @@ impl Effort {
         }
     }
 
-    /// Calls of `work` a second, by the median of their durations: for calls that all do the same.
+    /// Calls of `work` per second, from the median duration: for calls that all do the same.
     pub fn rate_by_median<'a>(
         &self,
         work: impl FnMut() -> anyhow::Result<()> + 'a,
@@ -39,7 +39,7 @@ impl Effort {
         Ok(self.rates_in_turn(&mut [Box::new(work)])?[0])
     }
 
-    /// Calls of `work` a second over all of them: for calls of which a few do much more than the others.
+    /// Calls of `work` per second over all calls: for work in which a few calls do much more than the others.
     pub fn rate_overall<'a>(
         &self,
         work: impl FnMut() -> anyhow::Result<()> + 'a,
@@ -48,13 +48,13 @@ impl Effort {
         Ok(durations.len() as f64 / durations.iter().sum::<f64>())
     }
 
-    /// Calls a second of each of `works`, by the median. They take turns, so that a load of the machine affects them alike.
+    /// Calls per second of each of `works`, from the median duration. The works take turns, so that load affects them alike.
     pub fn rates_in_turn(&self, works: &mut [Work<'_>]) -> anyhow::Result<Vec<f64>> {
         let durations = self.durations(works)?;
         Ok(durations.iter().map(|it| 1.0 / median(it)).collect())
     }
 
-    /// Seconds of each call of each work, in turn, after the warm-up.
+    /// The duration in seconds of each timed call of each work. The works take turns, after the warm-up.
     fn durations(&self, works: &mut [Work<'_>]) -> anyhow::Result<Vec<Vec<f64>>> {
         for _ in 0..self.warmup_calls {
             works.iter_mut().try_for_each(|work| work())?;
@@ -71,13 +71,13 @@ impl Effort {
         Ok(seconds)
     }
 
-    /// Whether something that began at `started` has been measured for long enough.
+    /// Whether a measurement that began at `started` has lasted long enough.
     pub fn is_spent(&self, started: Instant) -> bool {
         started.elapsed() >= self.time_min
     }
 }
 
-/// The middle value, or the mean of the two in the middle; NaN of none.
+/// The middle value, or the mean of the two middle values; NaN for no values.
 pub fn median(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

@@ -1,7 +1,7 @@
-//! The two kinds of failure of the program: a call that cannot work, and a run that went wrong.
-//! It prints nothing; the program does.
+//! The error types that decide the program's exit code: a call that cannot work, and a run that was interrupted.
+//! This module prints nothing; the program does.
 
-/// A call or a configuration that cannot work; the message says what to do. Exit code 64.
+/// An error for a call or a configuration that cannot work; its message says what to do. Exit code 64.
 #[derive(Clone, Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct Usage(pub String);
@@ -19,15 +19,15 @@ pub use __usage as usage;
 
 /// Exit code of a call or configuration that cannot work (`EX_USAGE`).
 pub const EXIT_USAGE: u8 = 64;
-/// Exit code after Ctrl-C, as shells have it.
+/// Exit code after Ctrl-C, the one that shells use.
 pub const EXIT_INTERRUPTED: u8 = 130;
 
-/// The run was asked to stop and has saved its state. Exit code 130, a shell's for Ctrl-C.
+/// The error of a run that was asked to stop and has saved its state. Exit code 130, a shell's code for Ctrl-C.
 #[derive(Debug, thiserror::Error)]
 #[error("interrupted")]
 pub struct Interrupted;
 
-/// ` (did you mean "..."?)` with the candidate most like `name`, or nothing if none is near.
+/// Returns ` (did you mean "..."?)` with the candidate most similar to `name`, or an empty string if none is similar.
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
     let distance = |candidate: &str| strsim::levenshtein(name, candidate);
     match candidates.into_iter().min_by_key(|it| distance(it)) {

@@ -1,8 +1,8 @@
-//! What this machine offers and lacks: cores, memory, devices.
+//! The hardware of this machine, cores, memory and devices, and what it lacks for a run.
 //!
-//! Start with [`resources::Machine`] for what sizes a run, with [`doctor::examine`] for what is missing, and with
-//! [`device::ready_for`] before anything is computed on a device. It starts no run and knows no setting. The errors that the
-//! program answers with exit code 64 are [`error::Usage`].
+//! Start with [`resources::Machine`] for the sizes of a run, with [`doctor::examine`] for what is missing, and with
+//! [`device::ready_for`] before computing on a device. This crate starts no run and reads no settings. The program exits with
+//! code 64 on an [`error::Usage`].
 //!
 //! ```
 //! use driml_machine::{resources::Machine, units::gib};

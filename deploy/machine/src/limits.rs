@@ -1,5 +1,5 @@
-//! What of all that the system grants a process is nearly used up.
-//! It ends nothing. A library's own words say what failed, and seldom of what there was too little.
+//! Detects which resources limited by the system this process has nearly used up.
+//! This module ends no process. A library's own error says what failed, but seldom which resource was short.
 
 use std::fs;
 
@@ -11,12 +11,12 @@ use nix::{
 
 use crate::{resources::Machine, units::kib};
 
-/// Open files that a library may want at once, to connect or to share memory: with fewer left, they are scarce.
+/// Open files that a library may need at once, to connect or to share memory. With fewer left, files are scarce.
 const FILES_SPARE: u64 = 8;
 const MAPS_SPARE: u64 = 64;
 const MEMORY_SPARE: u64 = 64 << 20;
 
-/// What this process has nearly used up of what the system grants it, with how much there is and what to do.
+/// Lists the resources that this process has nearly used up: each with its limit and what to do.
 pub fn scarce() -> Vec<String> {
     let all = [open_files(), shared_memory(), locked_memory()];
     let all = all.into_iter().chain([memory_maps(), memory()]);
@@ -26,7 +26,7 @@ pub fn scarce() -> Vec<String> {
 fn open_files() -> Option<String> {
     let (max, _) = getrlimit(Resource::RLIMIT_NOFILE).ok()?;
     let used = match fs::read_dir("/proc/self/fd") {
-        // This reading is one.
+        // Reading the folder takes one descriptor.
         Ok(entries) => (entries.count() as u64).saturating_sub(1),
         Err(e) if e.raw_os_error() == Some(Errno::EMFILE as i32) => max,
         Err(_) => return None,

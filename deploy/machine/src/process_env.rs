@@ -1,24 +1,24 @@
-//! The environment that a process of this program needs before its first allocation and its first tensor.
-//! It is read by the C library and by candle, each once: so a process that lacks it starts itself again with it.
+//! The environment variables that a process of this program needs before its first allocation and its first tensor.
+//! The C library and candle read them only once, so a process that lacks them starts itself again with them.
 
 use std::{env, ffi::OsString, io, os::unix::process::CommandExt, path::PathBuf, process::Command};
 
-/// What every process needs. candle's second pool of threads spins while it waits, which costs more than it gives on busy
-/// cores; and glibc returns each large tensor to the system and faults it in again unless told to keep it.
+/// The variables of every process. candle's second thread pool spins while it waits, which costs more than it gains on busy cores.
+/// glibc returns each large tensor's memory to the system and faults it in again, unless these thresholds forbid it.
 const EVERYONE: [(&str, &str); 3] = [
     ("CANDLE_NUM_THREADS", "1"),
     ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
     ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
 ];
-/// What a replay server needs beside it: glibc gives each thread its own heap, up to eight a core, and each keeps the
-/// chunks that were freed in it, which is memory that only grows in a run whose actors come and go.
+/// The additional variable of a replay server. glibc gives each thread its own heap, up to eight per core. Each heap keeps the
+/// chunks freed in it, so memory only grows in a run whose actors come and go.
 const REPLAY_SERVER: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
 
-/// Starts this program again, in the same process and with the same arguments, if the environment lacks something. What the user
-/// has set stays unchanged.
+/// Restarts this program in the same process with the same arguments if the environment lacks one of the variables. Variables
+/// that the user has set stay unchanged.
 ///
 /// # Errors
-/// The program cannot be started again. It may continue, only slower.
+/// The program cannot be started again. It may continue without the variables, only slower.
 pub fn settle(is_replay_server: bool) -> io::Result<()> {
     let missing = missing(is_replay_server, |name| env::var_os(name).is_some());
     if missing.is_empty() {
@@ -27,7 +27,7 @@ pub fn settle(is_replay_server: bool) -> io::Result<()> {
     start_again_with(missing)
 }
 
-/// Starts this program again, in the same process and with the same arguments, with these variables too. It returns only if that
+/// Restarts this program in the same process, with the same arguments and with these variables added. Returns only if that
 /// fails.
 pub fn start_again_with<'a>(
     variables: impl IntoIterator<Item = (&'a str, &'a str)>,
@@ -38,7 +38,7 @@ pub fn start_again_with<'a>(
     Err(again.arg0(name).args(args).envs(variables).exec())
 }
 
-/// This program, for another process of it: its file, or what the system holds of it once a build has put another in its place.
+/// The path of this program, to start another process of it. If a build has replaced the file, `/proc/self/exe` still reaches it.
 pub fn program() -> PathBuf {
     let file = env::current_exe().ok().filter(|it| it.exists());
     file.unwrap_or_else(|| "/proc/self/exe".into())
@@ -60,7 +60,7 @@ mod tests {
 
     use super::*;
 
-    /// Set where this test is the process whose file is gone.
+    /// Set in the child process of this test, whose file is removed.
     const CHILD: &str = "DRIML_TEST_REPLACED";
 
     #[test]
@@ -78,7 +78,7 @@ mod tests {
                 fs::copy(env::current_exe().unwrap(), &copy).unwrap();
                 assert!(status(copy).success());
             }
-            // It is the process that was started again.
+            // The first child removed this file, and then started this second child.
             Some(_) if fs::remove_file(env::current_exe().unwrap()).is_err() => {}
             Some(_) => assert!(status(program()).success()),
         }

@@ -1,5 +1,5 @@
-//! What this machine offers, and the sizes of a run that follow from it.
-//! It measures no speed: how long a run takes is estimated in `plan`.
+//! The resources of this machine, and the sizes of a run that follow from them.
+//! This module measures no speed: `plan` estimates how long a run takes.
 
 use std::{fs, path::Path};
 
@@ -7,21 +7,21 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::kib;
 
-/// Environments in one actor: enough for batched inference, few enough for a quick round of chunks.
+/// Environments of one actor: enough for batched inference, few enough that each environment soon completes a chunk.
 pub const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
-/// Share of the free memory that a replay may take whose size was asked for, where more of the run starts beside it.
+/// Share of the free memory that a replay of a requested size may take, where other processes of the run start beside it.
 const REPLAY_SHARE_MAX: f64 = 0.9;
 
-/// What a learner takes on Procgen (266 MiB measured), and some room.
+/// Memory of a learner on Procgen, bytes: 266 MiB measured, and some room.
 pub const LEARNER_BYTES: u64 = 512 << 20;
 
-/// The environment variable by which a sweep tells a run its part of the memory that was free, in bytes.
+/// The environment variable through which a sweep gives a run its share of the free memory, in bytes.
 pub const MEMORY_SHARE: &str = "DRIML_MEMORY_SHARE";
 
-/// About the bytes that `actors` processes of 16 environments take in a world: on Procgen the engine holds its pictures (410 to 423 MiB
-/// measured; 97 MiB on Ms. PacMan).
+/// Estimates the bytes that `actors` processes of 16 environments take in a world. Procgen's engine keeps its images in memory
+/// (410 to 423 MiB measured per actor; 97 MiB on Ms. PacMan).
 pub fn actors_bytes(actors: u32, world: &str) -> u64 {
     let each: u64 = match world.starts_with("procgen") {
         true => 430 << 20,
@@ -30,19 +30,19 @@ pub fn actors_bytes(actors: u32, world: &str) -> u64 {
     u64::from(actors) * each
 }
 
-/// What this machine offers.
+/// The resources of this machine.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Machine {
     /// Cores that this process may use.
     pub cores: u32,
-    /// Memory that can be taken now, bytes; for a run of a sweep no more than its part.
+    /// Memory that can be allocated now, bytes; a run of a sweep sees no more than its share.
     pub memory_bytes: u64,
-    /// Whether its processor multiplies faster in bf16 than in f32.
+    /// Whether the processor multiplies faster in bf16 than in f32.
     pub fast_bf16: bool,
 }
 
 impl Machine {
-    /// This one. Where the memory cannot be read, 4 GiB are assumed.
+    /// Reads the resources of this machine. Where the memory cannot be read, 4 GiB are assumed.
     pub fn this() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
         let share = std::env::var(MEMORY_SHARE).ok();
@@ -53,7 +53,7 @@ impl Machine {
         }
     }
 
-    /// Actor processes. Few: one actor feeds several learners' worth of cores, as an update takes 32 steps only.
+    /// The default number of actor processes. Few, as an update needs only 32 new steps: one actor feeds several learners' worth of cores.
     pub const fn actors(&self) -> u32 {
         match self.cores {
             0..4 => 1,
@@ -62,12 +62,12 @@ impl Machine {
         }
     }
 
-    /// Bytes that a replay sized by the machine may take, where what starts beside it takes `beside` bytes.
+    /// Bytes that a replay sized by the machine may take, if the processes that start beside it take `beside` bytes.
     pub fn replay_bytes(&self, beside: u64) -> u64 {
         self.share(REPLAY_SHARE, beside)
     }
 
-    /// Bytes that a replay may take whose size was asked for, where what starts beside it takes `beside` bytes.
+    /// Bytes that a replay of a requested size may take, if the processes that start beside it take `beside` bytes.
     pub fn replay_bytes_max(&self, beside: u64) -> u64 {
         match beside {
             0 => self.memory_bytes,
@@ -81,21 +81,21 @@ impl Machine {
     }
 }
 
-/// The machine that measured, as far as figures depend on it.
+/// A description of the machine that measured, as far as measured figures depend on it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MachineNote {
     /// The processor's name.
     pub processor: String,
     /// Cores that this process may use.
     pub cores: u32,
-    /// Mean number of tasks that wanted a core in the minute before.
+    /// Mean number of tasks that wanted a core in the last minute before the measurement.
     pub load: f64,
-    /// The GPU that computed, with its memory; none if the processor did.
+    /// The name and memory of the GPU that computed; none if the processor computed.
     pub gpu: Option<String>,
 }
 
 impl MachineNote {
-    /// What this machine is and how busy it is now; `gpu` computes, or the processor.
+    /// Describes this machine and its load now. `gpu` is the GPU that computes, or none for the processor.
     pub fn this(gpu: Option<String>) -> Self {
         Self {
             processor: processor(),
@@ -110,7 +110,7 @@ fn load(loadavg: &str) -> Option<f64> {
     loadavg.split_whitespace().next()?.parse().ok()
 }
 
-/// The processor's name; "unknown" where the kernel does not say it.
+/// The processor's name; "unknown" if the kernel does not report it.
 pub fn processor() -> String {
     let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     processor_in(&cpuinfo).unwrap_or("unknown").to_owned()
@@ -128,7 +128,7 @@ fn bounded(bytes: u64, share: Option<&str>) -> u64 {
     share.map_or(bytes, |share| bytes.min(share))
 }
 
-/// The kernel's estimate of available memory, or what the control groups leave, if that is less.
+/// The kernel's estimate of available memory, or what the control groups leave, whichever is less.
 fn free_memory_bytes() -> Option<u64> {
     let table = fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let system = kib(&table, "MemAvailable:").map(|kib| kib << 10);
@@ -137,8 +137,8 @@ fn free_memory_bytes() -> Option<u64> {
     system.into_iter().chain(left).min()
 }
 
-/// Bytes that the control groups of a process leave it: the least of its own and those around it, of either version.
-/// `groups` is the process's `/proc/PID/cgroup`. Pages of files count as free: the kernel takes them back.
+/// Bytes that a process's control groups leave it: the least over its group and all parents, for cgroup versions 1 and 2.
+/// `groups` is the process's `/proc/PID/cgroup`. The page cache of files counts as free, as the kernel reclaims it.
 fn left_by_groups(mount: &Path, groups: &str) -> Option<u64> {
     let left = |group: &Path, [max, used, cache]: [&str; 3]| {
         let text = |file: &str| fs::read_to_string(group.join(file)).ok();
@@ -163,7 +163,7 @@ fn left_by_groups(mount: &Path, groups: &str) -> Option<u64> {
             ),
             _ => return None,
         };
-        // In a container the mount may be the process's own group, whatever it is called outside.
+        // In a container the mount point may be the process's own group, whatever that group's path on the host.
         let all = Path::new(group).ancestors();
         all.filter_map(|group| left(&mount.join(group), files))
             .min()
@@ -205,7 +205,7 @@ mod tests {
         let files = format!("memory.max 1000, memory.current 900, memory.stat {stat}");
         group("job", &files);
         group("job/step", "memory.max max, memory.current 800");
-        // The parent's limit holds, less what is in use beside 300 bytes of files.
+        // The parent's limit of 1000 applies, less the 900 in use, of which 300 bytes are page cache.
         assert_eq!(left("0::/job/step\n"), Some(400));
         group("", "memory.max 700, memory.current 600");
         assert_eq!(left("0::/job/step\n"), Some(100));

@@ -1,8 +1,8 @@
-//! Words of commands that a person may paste into a shell.
+//! Quotes words of commands that a person may paste into a shell.
 
 use std::path::Path;
 
-/// The word as a shell takes it.
+/// Quotes a word for a shell if it needs quotes.
 pub fn quoted(word: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.,=:/".contains(c);
     match word.chars().all(plain) {
@@ -11,7 +11,7 @@ pub fn quoted(word: &str) -> String {
     }
 }
 
-/// The path as a shell takes it.
+/// Quotes a path for a shell if it needs quotes.
 pub fn quoted_path(path: &Path) -> String {
     quoted(&path.to_string_lossy())
 }

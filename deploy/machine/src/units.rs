@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-/// A time in two units at most, such as `17 min 23 s`.
+/// Formats a time in at most two units, such as `17 min 23 s`.
 pub fn duration(time: Duration) -> String {
     let seconds = time.as_secs();
     match seconds {
@@ -13,7 +13,7 @@ pub fn duration(time: Duration) -> String {
     }
 }
 
-/// A time in one unit, for what is known roughly, such as `25 min`.
+/// Formats a rough time in one unit, such as `25 min`.
 pub fn rough_duration(seconds: f64) -> String {
     if seconds < 99.5 {
         format!("{seconds:.0} s")
@@ -24,18 +24,18 @@ pub fn rough_duration(seconds: f64) -> String {
     }
 }
 
-/// A size in GiB, with one decimal.
+/// Formats a size in GiB, with one decimal.
 pub fn gib(bytes: u64) -> String {
     format!("{:.1} GiB", bytes as f64 / f64::from(1 << 30))
 }
 
-/// The number of KiB that stands behind `name` in one of the kernel's tables.
+/// Reads the number of KiB after `name` in one of the kernel's tables, such as `/proc/meminfo`.
 pub fn kib(table: &str, name: &str) -> Option<u64> {
     let line = table.lines().find_map(|line| line.strip_prefix(name))?;
     line.trim().strip_suffix("kB")?.trim().parse().ok()
 }
 
-/// A number with three digits that matter, and all those before the point.
+/// Formats a number with three significant digits, but with all digits before the point and at most three decimals.
 pub fn number(value: f64) -> String {
     match value.abs() {
         size if size >= 99.95 => format!("{value:.0}"),

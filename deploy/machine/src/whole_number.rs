@@ -1,12 +1,12 @@
 //! Whole numbers as people write them: `1000000`, `1_000_000`, `1e6`, `2.5e5`.
-//! It does not round: non-integers are rejected.
+//! Non-integers are rejected, not rounded.
 
 use std::ops::RangeInclusive;
 
 /// Reads a whole number.
 ///
 /// # Errors
-/// A text that is none, or one of 2^64 and more; what to write, for a person.
+/// The text is not a whole number, or is 2^64 or more. The message says what to write.
 pub fn read(text: &str) -> Result<u64, String> {
     let none = || format!("{text:?} is not a whole number; write one as 1000000, 1_000_000 or 1e6");
     let plain = text.replace('_', "");
@@ -19,7 +19,7 @@ pub fn read(text: &str) -> Result<u64, String> {
     }
     let exponent: usize = exponent.parse().map_err(|_| none())?;
     let zeros = exponent.checked_sub(part.len()).ok_or_else(none)?;
-    // No number of 64 bits has more digits.
+    // No 64-bit number has more than 20 digits.
     let zeros = match digits.bytes().all(|it| it == b'0') {
         true => 0,
         false => zeros.min(20),
@@ -29,7 +29,7 @@ pub fn read(text: &str) -> Result<u64, String> {
     number.map_err(|_| format!("{text} is more than {}", u64::MAX))
 }
 
-/// A flag's parser of whole numbers in `range`.
+/// Returns a parser for a flag whose value is a whole number in `range`.
 pub fn within(
     range: RangeInclusive<u64>,
 ) -> impl Fn(&str) -> Result<u64, String> + Clone + Send + Sync + 'static {

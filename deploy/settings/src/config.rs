@@ -1,5 +1,5 @@
-//! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
-//! It fills in no number: `flags` does.
+//! The resolved settings of a run: one TOML file with a table for each component, checked as a whole.
+//! No number is filled in here; `flags` does that.
 
 use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
@@ -16,7 +16,7 @@ use toml::{Table, Value};
 
 use crate::derived;
 
-/// How many processes the launcher starts, and with what.
+/// The processes that the launcher starts, and their resources.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LocalConfig {
@@ -24,43 +24,43 @@ pub struct LocalConfig {
     pub actors: u32,
     /// Threads of the learner.
     pub learner_threads: u32,
-    /// What the learner computes on.
+    /// The device on which the learner computes.
     pub learner_device: DeviceName,
-    /// Whether the replay is kept on disk, in the run folder: a replay server that died is started again with it, and a resumed
-    /// run continues with it.
+    /// Whether the replay is kept on disk, in the run folder. Then a replay server that died restarts with its replay, and a resumed run
+    /// continues with it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub durable: bool,
     /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tensorboard: bool,
-    /// Whether the weights of a finished run are played, beside a random policy; in lockstep never.
+    /// Whether the weights of a finished run play episodes, beside a random policy. Runs in lockstep never do.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub play: bool,
-    /// When checkpoints are played during the run; none if they are not.
+    /// When checkpoints play episodes during the run; `None` if they do not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluation: Option<EvaluationConfig>,
 }
 
-/// Whole episodes with checkpoints during a run.
+/// Evaluation during a run: whole episodes with checkpoints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationConfig {
-    /// Updates from one to the next; if that is less than one takes, some are left out. A multiple of
-    /// `learner.checkpoint_period_updates`.
+    /// Updates from one evaluation to the next, a multiple of `learner.checkpoint_period_updates`. If an evaluation takes longer than this
+    /// period, some are skipped.
     pub every_updates: u64,
-    /// Episodes of each, 1 to 1,000,000.
+    /// Episodes of each evaluation, 1 to 1,000,000.
     pub episodes: u32,
 }
 
-/// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
+/// The resolved settings of a run. They are read from TOML and sent as TOML; the code uses this form alone.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// What all processes of the run agree on.
+    /// The values on which all processes of the run agree.
     pub run: RunSpec,
     /// The world and its own settings.
     pub world: WorldConfig,
-    /// The size to which frames are enlarged.
+    /// The size to which frames are enlarged for the network.
     pub input: InputSize,
     /// The `[actor]` table.
     pub actor: driml_actor::Config,
@@ -80,19 +80,19 @@ pub struct RunConfig {
 }
 
 impl RunConfig {
-    /// Bytes of a version of the weights as the learner publishes it.
+    /// Bytes of one version of the weights as the learner publishes them.
     pub fn weights_bytes(&self) -> driml_model::Result<usize> {
         let published = self.model.without_dim();
         published.weights_bytes(self.learner.publish_dtype)
     }
 
-    /// Reads every table as the part that uses it will; what follows from others is there.
+    /// Reads every table into its component's Config. The derived settings must be in `table`.
     pub(crate) fn read(table: Table) -> Result<Self, Usage> {
         let read = Value::Table(table).try_into();
         read.map_err(|e| usage!("in the settings: {}", describe(&e)))
     }
 
-    /// [`Self::read`] of a table in which what follows from others is first filled in.
+    /// Like [`Self::read`], after filling in the derived settings.
     pub(crate) fn derived(mut table: Table) -> Result<Self, Usage> {
         derived::derive(&mut table)?;
         Self::read(table)
@@ -105,25 +105,25 @@ impl RunConfig {
         checked.map_err(|e| usage!("{name}: {e}"))
     }
 
-    /// The settings as every process reads them, sorted by name.
+    /// Returns the TOML that every process reads, sorted by name.
     pub fn to_toml(&self) -> String {
         toml::to_string(&self.to_table()).expect("a table of plain values is TOML")
     }
 
     pub(crate) fn to_table(&self) -> Table {
-        // As text, a number of 32 bits has the digits that were set; as a value of 64 it would have more.
+        // As text, an f32 keeps the digits that were set; converted to an f64, it would have more.
         let text = toml::to_string(self).expect("a struct of plain values is TOML");
         text.parse().expect("it was just written")
     }
 
-    /// The same settings with frames that are recorded and sent whole, as those of earlier versions: what is computed is the same.
+    /// Returns the same settings with frames recorded and sent whole, as in earlier versions. The computed values stay the same.
     pub fn with_whole_frames(&self) -> Result<Self, Usage> {
         let mut whole = self.clone();
         whole.input.frame = None;
         Self::derived(whole.to_table())?.checked()
     }
 
-    /// The names of the run's actions; an action is a place in this list.
+    /// The names of the run's actions, in the order of the action numbers.
     pub fn action_names(&self) -> Vec<String> {
         let actions = self.world.actions(self.actor.actions).into_iter();
         let names = self.world.action_names();
@@ -136,8 +136,8 @@ impl RunConfig {
         self.replay.transitions_max.unwrap_or(u64::MAX)
     }
 
-    /// Updates of the whole run, at the replay ratio: those done before it was resumed with other settings, and those that the rest of
-    /// its transitions allow.
+    /// Updates of the whole run: those made before it was resumed with other settings, and those that the rest of its transitions allow at
+    /// the replay ratio.
     pub fn updates(&self) -> u64 {
         let start = self.replay.ratio_start();
         let frames = self.frames().saturating_sub(start.transitions);
@@ -145,7 +145,7 @@ impl RunConfig {
         start.updates + (rows / f64::from(self.learner.batch_size)) as u64
     }
 
-    /// These settings, if they pass the checks of each component, then those that span two tables.
+    /// Returns these settings if they pass the checks of each component and those that span two tables.
     pub(crate) fn checked(self) -> Result<Self, Usage> {
         fn said(e: impl std::fmt::Display) -> Usage {
             Usage(e.to_string())
@@ -223,7 +223,7 @@ impl RunConfig {
         }
     }
 
-    /// The replay serves what the auxiliary loss needs and no more.
+    /// Checks that the replay serves as many positives as the auxiliary loss needs and no more.
     fn check_auxiliary_loss(&self) -> Result<(), Usage> {
         let auxiliary_loss = self.learner.update.auxiliary_loss;
         let positives = auxiliary_loss.positives();

@@ -1,5 +1,5 @@
-//! The settings that follow from others: filled in, checked when read back, and known by name, as none is set by hand.
-//! It makes no choice itself.
+//! The derived settings, which follow from others: filled in, checked when read back, and known by name.
+//! The user cannot set those in `FOLLOWS` by hand.
 
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::UpdateSettings;
@@ -11,7 +11,7 @@ use toml::{Table, Value};
 
 use crate::overrides::inline;
 
-/// Settings that follow from others: their paths, and how.
+/// The derived settings: their paths, and from what they follow.
 const FOLLOWS: &str = "\
 run.world world.kind world.game world.command world.library: is chosen by --env
 run.agent: is chosen by --agent
@@ -23,17 +23,17 @@ model.width: follows from input.width and what the torso reads
 model.input_channels: follows from the world and run.frame_stack
 model.dim model.loss_layers: follows from learner.update";
 
-/// Each setting of [`FOLLOWS`] by its path, and how it follows.
+/// Each path in [`FOLLOWS`], and from what it follows.
 fn all_that_follows() -> impl Iterator<Item = (&'static str, &'static str)> {
     let lines = FOLLOWS.lines().filter_map(|line| line.split_once(": "));
     lines.flat_map(|(paths, how)| paths.split(' ').map(move |path| (path, how)))
 }
 
-/// Where a whole frame's size is, if frames are cut to what the network reads. Settings of earlier versions do not have it: what they
-/// say of a run stays true of it.
+/// The path of a whole frame's size, which is set if frames are cut to what the network reads. Settings of earlier versions lack it, and
+/// their runs keep whole frames.
 pub(crate) const FRAME: &str = "input.frame";
 
-/// Asks a world that runs in its own process what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
+/// Asks a world that runs in its own process for its declaration, and fills in its shapes, actions and input size.
 pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
     let limits = ["world.start_timeout_ms", "world.step_timeout_ms"];
     let [start, step] = limits.map(|limit| whole_size(table, limit));
@@ -49,7 +49,7 @@ pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
     Ok(())
 }
 
-/// Chooses a precision that is `auto`: bf16 where the processor multiplies faster in it and does the learning, else f32.
+/// Replaces each precision `auto`: by bf16 if the processor is faster in it and does the computing, else by f32.
 pub(crate) fn precision(table: &mut Table, fast_bf16: bool) {
     let device = find(table, "local.learner_device").and_then(Value::as_str);
     let on_cpu = device.is_none_or(|device| device == "cpu");
@@ -64,7 +64,7 @@ pub(crate) fn precision(table: &mut Table, fast_bf16: bool) {
     }
 }
 
-/// Removes what the presets have for torsos that this network does not have. What `by_hand` set stays, for its check to name.
+/// Removes the presets' settings of torsos other than this network's. Settings in `by_hand` stay, so that their check rejects them.
 pub(crate) fn drop_other_torsos(table: &mut Table, by_hand: &[String]) -> Result<(), Usage> {
     let others = torso(table)?.settings_of_others();
     if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
@@ -81,7 +81,7 @@ fn torso(table: &Table) -> Result<TorsoName, Usage> {
     Ok(optional(table, "model.torso")?.unwrap_or(TorsoName::Nature))
 }
 
-/// The setting that follows from others, which is `path` or a table around it, and how; none where it does not follow.
+/// Returns the derived setting that is `path` or a table around it, and from what it follows; `None` if `path` is not derived.
 pub(crate) fn follows(path: &str) -> Option<(&'static str, &'static str)> {
     let inside = |known: &str| {
         let rest = path.strip_prefix(known);
@@ -110,7 +110,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     if find(table, FRAME).is_some() {
         let (height, width) = (shape.height as u32, shape.width as u32);
         put(table, FRAME, as_toml(FrameSize { height, width })?);
-        // A crop reads the borders too.
+        // Augmentation crops the frame and reads the borders too.
         if find(table, "learner.augment").is_none() {
             let input: InputSize = table_at(table, "input")?;
             let conv: Option<Vec<ConvLayer>> = optional(table, "model.conv")?;
@@ -142,7 +142,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     Ok(())
 }
 
-/// Fills in the auxiliary loss's own layers, if it has any. Where the model or the loss cannot be, the checks that follow say why.
+/// Fills in the layers of the auxiliary loss, if it has any. If the model or the loss is invalid, later checks report why.
 fn loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
     if let Ok(model) = table_at::<ModelConfig>(table, "model")
         && let Ok(loss) = update.auxiliary()
@@ -157,7 +157,7 @@ fn loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> 
     Ok(())
 }
 
-/// Fills in for how many actors the ladder of epsilons is, where there is one and it is not set.
+/// Fills in the number of actors on the epsilon ladder, if there is a ladder and the number is not set.
 fn ladder(table: &mut Table) {
     if find(table, "actor.epsilon_ladder").is_some_and(Value::is_table)
         && let Some(actors) = find(table, "local.actors").cloned()
@@ -166,7 +166,7 @@ fn ladder(table: &mut Table) {
     }
 }
 
-/// Fills in over how many updates beta rises, where rows are drawn by priority and it is not set: those of the whole run.
+/// Fills in the updates over which beta rises, those of the whole run, if rows are drawn by priority and the number is not set.
 fn beta_updates(table: &mut Table) {
     const PATH: &str = "replay.sampling.beta_updates";
     let rule = find(table, "replay.sampling.rule").and_then(Value::as_str);
@@ -179,19 +179,19 @@ fn beta_updates(table: &mut Table) {
         let rows = transitions * number("replay.replay_ratio")?;
         Some(rows / number("learner.batch_size")?)
     };
-    // What is missing, or no number above 0, its own check says.
+    // If a number is missing or not above 0, its own check reports it.
     if let Some(updates) = updates().filter(|updates| updates.is_finite() && *updates > 0.0) {
         put(table, PATH, Value::Integer((updates as i64).max(1)));
     }
 }
 
-/// Fills in what each action amounts to in the world, where that is asked for and not given.
+/// Fills in the visible action to which each action amounts, if the affinity's alphabet is `visible` and the map is not set.
 fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
     if asked && find(table, "learner.affinity.visible").is_none() {
         let map = match set {
             ActionSet::All => world.visible_actions(),
-            // They are told apart already.
+            // These actions differ already.
             ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
         };
         let map: Vec<_> = map.into_iter().map(i64::from).collect();
@@ -199,7 +199,7 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     }
 }
 
-/// Reads the text of a file that driml wrote. What it says of what follows must be what follows.
+/// Reads the text of a file that driml wrote. An error if a derived setting differs from what follows from the others.
 pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
     let read = text.parse::<Table>();
     let read = read.map_err(|e| usage!("{name} is not TOML: {}", e.message()))?;
@@ -229,7 +229,7 @@ pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     }
 }
 
-/// Writes a value, making the tables on the way; what is not a table on the way stays, for its reader to reject.
+/// Writes a value and creates the tables on its path. Another value in place of such a table stays, for its reader to reject.
 pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
     match path.split_once('.') {
         None => {
@@ -245,7 +245,7 @@ pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
     }
 }
 
-/// Writes a value where there is none.
+/// Writes a value if there is none at the path.
 pub(crate) fn put_missing(table: &mut Table, path: &str, value: Value) {
     if find(table, path).is_none() {
         put(table, path, value);
@@ -265,7 +265,7 @@ fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     value.ok_or_else(|| lack(path, "a whole number"))
 }
 
-/// A whole number that is a size; one that cannot be is left to the model's check.
+/// Reads a whole number as a size, which is not negative. Later checks limit its range.
 fn whole_size(table: &Table, path: &str) -> Result<usize, Usage> {
     let size = whole(table, path)?;
     usize::try_from(size).map_err(|_| usage!("{path} = {size}: a size is not below 0"))
@@ -277,7 +277,7 @@ fn table_at<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> 
     })
 }
 
-/// What is set at a dotted path, if anything is.
+/// Reads the value at a dotted path, if there is one.
 pub(crate) fn optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
     let read = find(table, path).cloned().map(Value::try_into).transpose();
     read.map_err(|e| usage!("in the settings' [{path}] table: {}", describe(&e)))

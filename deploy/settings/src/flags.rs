@@ -1,5 +1,5 @@
-//! The flags that choose a run's settings, and how these come of presets or a file, flags and `--set`. Every command that starts a run
-//! takes them. No number is filled in here but those that follow from others and those that the machine decides.
+//! The flags that choose a run's settings, and how presets or a file, flags and `--set` are combined. Every command that starts a run takes
+//! these flags. The only numbers filled in here are derived from others or from the machine.
 
 use std::path::PathBuf;
 
@@ -19,9 +19,9 @@ use crate::{
     presets::{self, Agent, Preset},
 };
 
-/// World where none is given.
+/// The default world.
 pub const ENV: &str = "procgen:coinrun";
-/// Agent where none is given.
+/// The default agent.
 pub const AGENT: &str = "driml-ada";
 
 /// What to train, and with which settings.
@@ -71,7 +71,7 @@ pub struct Flags {
     pub server_alone: bool,
 }
 
-/// The settings that the flags ask for, and where they come from.
+/// Returns the settings that the flags ask for, and the name of their source.
 pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
     let (source, from) = match &args.config {
         Some(path) => {
@@ -92,7 +92,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
     Ok((source.resolve(&args.over, machine)?, from))
 }
 
-/// [`resolve`] of names and `--set`s, for code that has no command line.
+/// Like [`resolve`], from names and `--set` values, for code without a command line.
 pub fn of_names(
     preset: &str,
     world: &str,
@@ -113,7 +113,7 @@ pub fn of_names(
     Ok(resolve(&flags, machine)?.0)
 }
 
-/// Where the settings come from before flags are applied.
+/// The source of the settings before flags are applied.
 #[derive(Clone, Debug)]
 pub enum Source {
     /// Layers: preset, world, agent.
@@ -126,7 +126,7 @@ impl Source {
     /// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
     ///
     /// # Errors
-    /// The first setting that is unknown, of the wrong type, out of range, or at odds with another.
+    /// A setting is unknown, of the wrong type, out of range, or at odds with another. The error names the first such setting.
     pub fn resolve(&self, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
         let mut table = match self {
             Self::Layers(preset, world, agent) => {
@@ -136,7 +136,7 @@ impl Source {
                 derived::put(&mut table, "run.agent", agent.name.into());
                 derived::put(&mut table, derived::FRAME, Table::new().into());
                 if let Some(command) = world.command() {
-                    // How long it is waited for is needed at once.
+                    // The start of the world needs its time-outs now.
                     for text in &flags.sets {
                         let one = Override::parse(text)?;
                         if one.path.starts_with("world.") {
@@ -204,7 +204,7 @@ fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
         }
         let mut tried = table.clone();
         let new = one.apply(&mut tried)?;
-        // A key that was not there may be an optional one. The type of its table decides.
+        // A new key may be an optional setting, which the type of its table knows.
         if new {
             let mut read = tried.clone();
             derived::precision(&mut read, false);

@@ -1,7 +1,7 @@
-//! The settings of a run: presets in layers, flags over them, what the machine decides, and what follows from the rest.
+//! The settings of a run: layers of presets, flags over them, values that depend on the machine, and values derived from others.
 //!
-//! Start with [`flags::resolve`], which makes a [`config::RunConfig`] of a command line, or [`flags::of_names`], which makes one of
-//! names. `presets/*.toml` has every number, each with its source.
+//! Start with [`flags::resolve`], which makes a [`config::RunConfig`] from a command line, or [`flags::of_names`], which makes one from
+//! names. `presets/*.toml` has every number with its source.
 //!
 //! ```
 //! use driml_machine::resources::Machine;

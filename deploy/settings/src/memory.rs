@@ -1,5 +1,5 @@
-//! How large a replay fits into the memory that is free.
-//! What actors and learner take beside it is in `driml_machine::resources`.
+//! Fits the size of the replay to the free memory.
+//! `driml_machine::resources` has the memory that actors and learner take.
 
 use driml_machine::{
     error::{Usage, usage},
@@ -11,17 +11,17 @@ use driml_replay_server::Compression;
 
 use crate::config::RunConfig;
 
-/// Bytes for the replay, all shards together.
+/// Memory for the replay, all shards together.
 struct Room {
-    /// What is free on this machine, in words.
+    /// The free memory of this machine, as text.
     free: String,
-    /// For a replay that the machine sizes.
+    /// Bytes for a replay whose size the machine decides.
     bytes: u64,
-    /// For one whose size was asked for.
+    /// Bytes for a replay whose size the user asked for.
     bytes_max: u64,
 }
 
-/// Makes the replay as small as the memory and notes it, or refuses a size that was asked for and does not fit.
+/// Shrinks the replay to the memory and adds a note, or rejects a size that the user asked for and that does not fit.
 pub(crate) fn fit(
     config: &mut RunConfig,
     capacity_set: bool,
@@ -64,7 +64,7 @@ pub(crate) fn fit(
         return Ok(());
     }
     replay.capacity_transitions = capacity;
-    // A replay that holds the whole run anyway is as good as a larger one.
+    // A replay that holds the whole run needs no note: a larger one would not be better.
     let of_run = replay.transitions_max;
     if of_run.is_none_or(|frames| frames > capacity) {
         config.notes.push(format!(
@@ -74,9 +74,9 @@ pub(crate) fn fit(
     Ok(())
 }
 
-/// Bounds the bytes of a compressed replay, as it is not known beforehand how well its frames compress.
+/// Limits the bytes of a compressed replay, because it is not known beforehand how well its frames compress.
 ///
-/// Half the free memory is taken, or what the settings allow; nothing is bounded where even frames that do not compress fit.
+/// The limit is half the free memory, or the one in the settings. There is none if even incompressible frames fit.
 fn fit_compressed(config: &mut RunConfig, room: &Room) -> Result<(), Usage> {
     let (replay, free) = (&mut config.replay, &room.free);
     let asked = replay.capacity_transitions;
@@ -117,8 +117,7 @@ pub const fn replay_bytes_each(run: &RunSpec) -> u64 {
     run.frame_bytes() as u64 + 32
 }
 
-/// Bytes that the rule by which rows are drawn takes a transition: of a tree of sums, which is as wide as the next power of two, 32 at
-/// most, and 16 at least.
+/// Bytes per transition for the sampling rule: for priorities 16 to 32, as a sum tree is as wide as the next power of two.
 const fn sampling_bytes_each(replay: &driml_replay_server::Config) -> u64 {
     match replay.sampling.is_prioritised() {
         true => 32,
@@ -126,6 +125,6 @@ const fn sampling_bytes_each(replay: &driml_replay_server::Config) -> u64 {
     }
 }
 
-/// Bytes that one transition takes at most in a compressed replay, beside its frame: its small fields, and its share of the
-/// list of blocks if each holds one frame.
+/// Most bytes that one transition takes in a compressed replay, beside its frame: its small fields, and its share of the list of blocks if
+/// each block holds one frame.
 pub const COMPRESSED_FIELDS_BYTES: u64 = 128;

@@ -1,5 +1,5 @@
-//! `driml presets`: what there is to start from, what differs by game, and all settings of one game and agent, each
-//! with the source that its preset file gives. It resolves nothing itself.
+//! The output of `driml presets`: presets, agents and differences by game, and all settings of one game and agent, each with the source in
+//! its preset file. `flags` resolves the settings.
 
 use std::collections::BTreeMap;
 
@@ -13,16 +13,16 @@ use crate::{
     presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, preset_or_default, stack},
 };
 
-/// Where a setting's source begins, if the setting leaves room.
+/// The column at which a setting's source begins, if the setting leaves room.
 const SOURCE_COLUMN: usize = 44;
 const BY_MACHINE: &str =
     "local.actors local.learner_threads local.learner_device actor.envs actor.world_threads";
 
-/// What a world in its own process declares.
+/// Settings that a world in its own process declares.
 const DECLARED: &str =
     "world.height world.width world.channels world.actions input.height input.width";
 
-/// Presets, agents, and what differs by game.
+/// Returns the list of presets, agents and differences by game.
 pub fn menu() -> Result<String, Usage> {
     let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
     let agents = agents();
@@ -69,14 +69,14 @@ fn lambdas(table: &Table) -> String {
     some.map(text).collect::<Vec<_>>().join(", ")
 }
 
-/// The resolved settings, each with its source.
+/// Returns the resolved settings, each with its source.
 pub fn sourced(
     preset: &'static Preset,
     world: WorldName,
     agent: &'static Agent,
 ) -> Result<String, Usage> {
     let source = Source::Layers(preset, world, agent);
-    // What the preset asks for, on any machine; memory that is free at this moment is not a setting.
+    // Shows what the preset asks for on any machine, whatever memory is free at this moment.
     let machine = Machine {
         memory_bytes: u64::MAX,
         ..Machine::this()
@@ -94,13 +94,13 @@ pub fn sourced(
     Ok(text)
 }
 
-/// Writes `table`, which lies at `path`: its values first, then the tables in it.
+/// Writes `table`, whose path is `path`: first its values, then the tables in it.
 fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, out: &mut String) {
     let inner = |key: &str| match path {
         "" => key.to_owned(),
         _ => format!("{path}.{key}"),
     };
-    // A table that a preset writes on one line stays one.
+    // A table that a preset writes on one line stays on one line.
     let is_line = |key: &str, value: &Value| {
         !value.is_table() || sources.contains_key(&inner(key)) || inner(key) == "model.dim"
     };
@@ -111,7 +111,7 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
     for (key, value) in lines {
         let setting = format!("{} = {value}", quoted(key));
-        // Nothing else has one.
+        // Only a world in its own process has this setting.
         let is_process = sources.contains_key("world.start_timeout_ms");
         let source = source_of(&inner(key), sources, is_process);
         out.push_str(&format!("{setting:SOURCE_COLUMN$} # {source}\n"));
@@ -141,7 +141,7 @@ fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: 
     }
 }
 
-/// Adds what a file says about each of its settings; a later file's word replaces an earlier one's.
+/// Adds the comment on each setting of a layer, in place of the comment of an earlier layer.
 fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
     for part in layer.parts().iter().filter(|it| it.is_for(world)) {
         let how = if part.is_everywhere { "" } else { ", by world" };
@@ -152,7 +152,7 @@ fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, Strin
     }
 }
 
-/// The path of each setting in a preset file, or in an `[[only]]` block of one, and the comment beside or above it.
+/// Returns the path of each setting in a preset file, or in an `[[only]]` block of one, and its comment: above, beside or below it.
 pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
     let mut found: Vec<(String, String)> = Vec::new();
     let (mut table, mut above) = (String::new(), String::new());
@@ -225,7 +225,7 @@ mod tests {
         assert_eq!(found.collect::<Vec<_>>(), expected);
     }
 
-    /// Which games look five steps ahead and which augment their states is the paper's choice.
+    /// The paper chooses which games look five steps ahead and which augment their states.
     #[test]
     fn the_menu_shows_what_differs_by_game() {
         expect_file!["../tests/snapshots/menu.txt"].assert_eq(&menu().unwrap());

@@ -1,10 +1,10 @@
 //! `--set key=value`: one value of the settings, by its dotted path.
-//! It knows keys and types by what is already in the settings, and no range: each component checks its own.
+//! Keys and types are checked against the existing settings; each component checks its own ranges.
 
 use driml_machine::error::{Usage, nearest, usage};
 use toml::{Table, Value};
 
-/// Up to here a float is exactly the whole number that was written.
+/// The largest number up to which a float represents every whole number exactly.
 const WHOLE_MAX: f64 = (1u64 << 53) as f64;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -15,7 +15,7 @@ pub(crate) struct Override {
 }
 
 impl Override {
-    /// Reads `key=value`; a value that is not TOML is taken as a word.
+    /// Parses `key=value`; a value that is not TOML becomes a string.
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form = "--set takes table.key=value, such as learner.update.adam.lr=1e-4";
         let parts = text.split_once('=');
@@ -25,7 +25,7 @@ impl Override {
             return Err(usage!("--set {text:?} has no key before '='; {form}"));
         }
         let read = format!("value = {value}").parse::<Table>();
-        // A line break could bring in a second key.
+        // A line break could add a second key.
         let read = read.ok().filter(|table| table.len() == 1);
         let read = read.and_then(|mut table| table.remove("value"));
         Ok(Self {
@@ -34,9 +34,9 @@ impl Override {
         })
     }
 
-    /// Puts the value into `table`; returns whether the key was not there before.
+    /// Puts the value into `table`; returns whether the key is new.
     ///
-    /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
+    /// A new key is accepted in an existing table; the reader of that table decides whether the key is a setting.
     pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
         let unknown = self.unknown(table);
         let (tables, key) = self.path.rsplit_once('.').ok_or_else(|| unknown.clone())?;
@@ -52,11 +52,11 @@ impl Override {
         Ok(inner.insert(key.to_owned(), value).is_none())
     }
 
-    /// The value as the type of the one it replaces.
+    /// Converts the value to the type of `old`, which it replaces.
     fn as_type_of(&self, old: &Value) -> Result<Value, Usage> {
         match (old, &self.value) {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
-            // 1e6 is a number of frames, too. Floats are whole numbers up to 2^53.
+            // A number of frames may be written as 1e6. Floats are exact whole numbers up to 2^53.
             (Value::Integer(_), Value::Float(number))
                 if number.fract() == 0.0 && number.abs() <= WHOLE_MAX =>
             {
@@ -74,7 +74,7 @@ impl Override {
         }
     }
 
-    /// The answer to a key that is not there: what is, and what comes near.
+    /// The error for an unknown key: the keys that exist, and the nearest one.
     pub(crate) fn unknown(&self, table: &Table) -> Usage {
         let mut known = table;
         let mut at = Vec::new();
@@ -85,7 +85,7 @@ impl Override {
             known = inner;
             at.push(name);
         }
-        // The same key in another table is what is meant most often.
+        // Most often, the user means the same key in another table.
         let paths: Vec<_> = leaves(table).into_iter().map(|(path, _)| path).collect();
         let key = |path: &str| path.rsplit('.').next().map(str::to_owned);
         let elsewhere = paths.iter().filter(|path| key(path) == key(&self.path));
@@ -106,7 +106,7 @@ impl Override {
     }
 }
 
-/// All values that are not tables, by their dotted paths.
+/// All values that are not tables, with their dotted paths.
 pub fn leaves(table: &Table) -> Vec<(String, &Value)> {
     let mut found = Vec::new();
     for (key, value) in table {
@@ -133,7 +133,7 @@ fn type_name(value: &Value) -> &'static str {
     }
 }
 
-/// A value on one line, words without quotes.
+/// A value on one line, strings without quotes.
 pub(crate) fn inline(value: &Value) -> String {
     match value {
         Value::String(word) => word.clone(),

@@ -1,5 +1,5 @@
-//! The menu of presets: TOML layers that lie in `presets/`, built into the program and laid over one another.
-//! It checks no value: `config` does, once everything is in place.
+//! The presets: TOML layers in `presets/`, built into the program and laid over one another.
+//! No value is checked here: `config` checks the result.
 
 use std::sync::OnceLock;
 
@@ -28,28 +28,28 @@ const BASE: Layer = layer!("base");
 /// A way to run any agent in a world.
 #[derive(Clone, Debug)]
 pub struct Preset {
-    /// As `--preset` takes it.
+    /// The name, as given to `--preset`.
     pub name: &'static str,
-    /// One line for `driml presets`.
+    /// The description in `driml presets`, one line.
     pub about: &'static str,
-    /// Laid over base and world, under the agent: a preset does not change what makes an agent, such as Rainbow's epsilon of 0.
+    /// Settings over base and world, under the agent: a preset does not change what defines an agent, such as Rainbow's epsilon of 0.
     layer: Option<Layer>,
-    /// The worlds it is made for; none means all.
+    /// The kinds of world for which the preset is made; empty means all.
     families: &'static [&'static str],
-    /// What it gives up for speed, with the largest errors that were measured: lines that a run prints.
+    /// The accuracy that the preset gives up for speed, with the largest measured errors: lines that a run prints.
     pub(crate) price: &'static [&'static str],
 }
 
 const TUNED: &str = "tuned";
 
-/// The preset of this name for a run in `world`. Without a name it is `tuned` on Procgen and `paper` elsewhere.
+/// Returns the preset of this name for a run in `world`. The default is `tuned` on Procgen and `paper` elsewhere.
 pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'static Preset, Usage> {
     let is_game = world.kind() == "procgen";
     preset(name.unwrap_or(if is_game { TUNED } else { PRESETS[0].name }))
 }
 
-/// Makes [`PRESETS`]: a line has a preset's name, which is that of its file in `presets/variant/`, the worlds for which it is made if these
-/// are not all, what it is, and what it gives up.
+/// Makes [`PRESETS`]. A line has the preset's name, which is that of its file in `presets/variant/`, the kind of world if the preset is not
+/// for all, the description, and what the preset gives up.
 macro_rules! presets {
     ($($name:literal $(for $family:literal)?: $about:literal $(, $price:literal)?;)+) => {
         /// Every preset, `paper` first.
@@ -88,14 +88,14 @@ presets! {
 /// An agent: its name and its layer of settings.
 #[derive(Clone, Debug)]
 pub struct Agent {
-    /// As `--agent` takes it.
+    /// The name, as given to `--agent`.
     pub name: &'static str,
-    /// One line for `driml presets`.
+    /// The description in `driml presets`, one line.
     pub(crate) about: &'static str,
     layer: Layer,
 }
 
-/// Makes [`AGENTS`]: a line has an agent's name, which is that of its file in `presets/agent/`, and what it is.
+/// Makes [`AGENTS`]. A line has the agent's name, which is that of its file in `presets/agent/`, and the description.
 macro_rules! agents {
     ($($name:literal: $about:literal;)+) => {
         /// Every agent that `--agent` takes.
@@ -121,7 +121,7 @@ agents! {
 static CUSTOM: OnceLock<Vec<Agent>> = OnceLock::new();
 
 impl Agent {
-    /// An agent that a program adds: `--agent NAME` takes it. `layer` is its settings, TOML as in `presets/agent/`.
+    /// Creates an agent that a program adds, for `--agent NAME`. `layer` has its settings, TOML as in `presets/agent/`.
     pub const fn new(name: &'static str, about: &'static str, layer: &'static str) -> Self {
         Self {
             name,
@@ -131,22 +131,22 @@ impl Agent {
     }
 }
 
-/// Makes agents known, before anything else is done. A name that is known already keeps its agent.
+/// Adds agents, before anything else is done. An existing agent with the same name takes precedence.
 ///
 /// # Panics
-/// If it was called before.
+/// If agents were registered before.
 pub fn register(agents: Vec<Agent>) {
     let first = CUSTOM.set(agents);
     first.expect("a program registers its agents once");
 }
 
-/// Every agent, with those that the program added.
+/// Returns every agent, including those that the program added.
 pub(crate) fn agents() -> Vec<&'static Agent> {
     let custom = CUSTOM.get().into_iter().flatten();
     AGENTS.iter().chain(custom).collect()
 }
 
-/// One for each kind of world in the registry of worlds.
+/// The layer of each kind of world in the registry of worlds.
 const WORLDS: &[Layer] = &[
     layer!("world/procgen"),
     layer!("world/mspacman"),
@@ -166,7 +166,7 @@ fn world_layer(world: WorldName) -> Layer {
     layer.expect("a test checks that each kind has its layers")
 }
 
-/// A world by its name, or by its game's.
+/// Finds a world by its name or its game's name.
 pub fn world(name: &str) -> Result<WorldName, Usage> {
     let game = format!("procgen:{name}");
     let known = name.parse::<WorldName>();
@@ -190,15 +190,15 @@ pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
     })
 }
 
-/// The answer to a name that the flag `kind` does not take: the nearest one, as a question, and all of them.
+/// The error for an unknown name after the flag `kind`: the nearest name, as a question, and all names.
 fn unknown(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> String {
     let all: Vec<_> = all.collect();
     let (near, names) = (nearest(name, all.iter().copied()), all.join(", "));
     format!("there is no {kind} {name:?}{near}; --{kind} takes {names}")
 }
 
-/// Lays base, world, preset and agent over one another, in this order: a later one wins. Of each file first comes what holds everywhere,
-/// then each `[[only]]` block that names the world.
+/// Merges base, world, preset and agent in this order: a later layer wins. In each file, the settings for all worlds come first, then each
+/// `[[only]]` block that names the world.
 pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
     if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
         return Err(usage!(
@@ -217,13 +217,13 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
     Ok(table)
 }
 
-/// The files that are laid over one another, the lowest first.
+/// The layers to be merged, the lowest first.
 pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
     let below = [BASE, world_layer(world)].into_iter();
     below.chain(preset.layer).chain([agent.layer]).collect()
 }
 
-/// What a layer sets everywhere, or an `[[only]]` block of it.
+/// The settings of a layer for all worlds, or one of its `[[only]]` blocks.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Part {
@@ -232,7 +232,7 @@ pub(crate) struct Part {
     worlds: Vec<String>,
     #[serde(default)]
     set: Table,
-    /// As it stands in the file, with its comments.
+    /// The text in the file, with its comments.
     #[serde(skip)]
     pub(crate) text: String,
 }
@@ -244,7 +244,7 @@ impl Part {
 }
 
 impl Layer {
-    /// What holds in every world, then the blocks that hold in some.
+    /// The settings for all worlds, then the blocks for some.
     pub(crate) fn parts(&self) -> Vec<Part> {
         let bad = |e| -> ! {
             panic!(
@@ -270,7 +270,7 @@ impl Layer {
     }
 }
 
-/// Lays `upper` over `lower`, table by table; anything else is replaced.
+/// Merges `upper` over `lower`, table by table; other values are replaced.
 fn merge(lower: &mut Table, upper: Table) {
     for (key, value) in upper {
         match (lower.get_mut(&key), value) {

@@ -5,7 +5,7 @@ use std::{io, path::PathBuf, sync::Arc};
 use anyhow::Context;
 use clap::Args;
 use driml_launch::{endpoint::NAMESPACE, rendezvous, shared_memory};
-use driml_machine::error::Usage;
+use driml_machine::error::{Interrupted, Usage};
 use driml_protocol::{
     Keys, session,
     tls::{Credentials, Role},
@@ -72,9 +72,13 @@ pub(super) fn join<T>(
     listen(flags.exit_with_parent).context("listening for signals")
 }
 
-/// What a process does when it has ended, well or not: nothing of it is left outside the run folder.
-pub(super) fn clean_up_after(ran: anyhow::Result<()>) -> anyhow::Result<()> {
+/// Removes what a process leaves outside the run folder. `ran` is whether its run is over; one that is not fails as [`Interrupted`], so
+/// that a scheduler that stops the process does not count it as complete.
+pub(super) fn clean_up_after(ran: anyhow::Result<bool>) -> anyhow::Result<()> {
     rendezvous::leave();
     shared_memory::remove_own();
-    ran
+    match ran? {
+        true => Ok(()),
+        false => Err(Interrupted.into()),
+    }
 }

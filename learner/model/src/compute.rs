@@ -1,5 +1,5 @@
-//! Where tensors live, and which kernels compute with them.
-//! It computes nothing: what computes is in `kernels`.
+//! The device on which tensors live, and the kernels that compute with them.
+//! The kernels themselves are in `kernels`.
 
 use std::{fmt, str::FromStr};
 
@@ -12,12 +12,12 @@ use crate::kernels::{
     precision::Precision,
 };
 
-/// What the network and the losses are computed with. All give the same up to rounding, gradients included.
+/// The kernels of the network and the losses. All give the same results and gradients up to rounding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kernels {
-    /// This project's kernels, fused and blocked for the CPU, and there alone; products in this precision.
+    /// This project's fused and blocked CPU kernels, with matrix products in this precision. CPU only.
     Fused(Precision),
-    /// Compositions of candle's own operations: any device, several times slower on the CPU.
+    /// Compositions of candle's own operations, on any device. Several times slower than `Fused` on the CPU.
     Candle,
 }
 
@@ -36,7 +36,7 @@ impl Kernels {
         }
     }
 
-    /// Stages of an IMPALA torso, of whose convolutions `layers` has [`STAGE_CONVOLUTIONS`](crate::geometry::STAGE_CONVOLUTIONS) each.
+    /// Runs the stages of an IMPALA torso. `layers` has [`STAGE_CONVOLUTIONS`](crate::geometry::STAGE_CONVOLUTIONS) convolutions a stage.
     pub(crate) fn residual_stages(
         self,
         images: &Tensor,
@@ -55,7 +55,7 @@ impl Kernels {
         }
     }
 
-    /// The layer on maps [B, h, w, c], flattened as PyTorch's weights expect: channel, row, column.
+    /// Applies the layer to maps [B, h, w, c], flattened as PyTorch's weights expect: channel, row, column.
     pub(crate) fn linear_of_maps(
         self,
         maps: &Tensor,
@@ -68,7 +68,7 @@ impl Kernels {
         }
     }
 
-    /// Of the layer on `x` [B, in] the outputs [B, out] of one group a row, of `w` [groups * out, in].
+    /// Computes the outputs [B, out] of one group a row, of the layer `w` [groups * out, in] on `x` [B, in].
     pub(crate) fn grouped_linear(
         self,
         x: &Tensor,
@@ -83,11 +83,11 @@ impl Kernels {
         }
     }
 
-    /// Dot products [L, B, B] of anchors and candidates, location by location, in f32. `psi` and `phi` are [B, L, R], or [B, R] where
-    /// one vector meets every location of the other.
+    /// Dot products [L, B, B] of anchors and candidates, location by location, in f32. `psi` and `phi` are
+    /// [B, L, R], or [B, R] for one vector that is paired with every location of the other.
     ///
     /// # Errors
-    /// Vectors that do not fit each other.
+    /// The shapes of `psi` and `phi` do not match.
     pub fn dot_products(self, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
         match self {
             Self::Fused(_) => dots::dot_products(psi, phi),
@@ -103,12 +103,12 @@ impl Kernels {
     }
 }
 
-/// A device and the kernels used on it.
+/// A device and the kernels that run on it.
 #[derive(Clone, Debug)]
 pub struct Compute {
-    /// Where parameters, batches and losses live.
+    /// The device of parameters, batches and losses.
     pub device: Device,
-    /// How they are computed there.
+    /// The kernels that run on the device.
     pub kernels: Kernels,
 }
 
@@ -132,19 +132,19 @@ impl Compute {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum DeviceName {
-    /// The processor.
+    /// The CPU.
     Cpu,
-    /// The NVIDIA GPU with this number, as the driver counts them.
+    /// The NVIDIA GPU with this number, in the driver's order.
     Cuda(usize),
 }
 
-/// Why a device cannot be used.
+/// The reason why a device cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum DeviceError {
     #[error("{0:?} is not a device: use cpu, cuda or cuda:N")]
     Name(String),
-    /// Only this project's kernels, which are the CPU's, have another precision than f32.
+    /// Only this project's CPU kernels support another precision than f32.
     #[error(
         "{device} computes in f32 alone: set learner.precision = \"f32\", or compute {precision} on the CPU"
     )]
@@ -160,10 +160,10 @@ pub enum DeviceError {
 }
 
 impl DeviceName {
-    /// Checks that products can be computed in `precision` on such a device, whether or not it is there.
+    /// Checks that a device of this kind supports `precision`, whether or not it is present.
     ///
     /// # Errors
-    /// bf16 on a GPU.
+    /// `precision` is bf16 and the device is a GPU.
     pub fn check(self, precision: Precision) -> Result<(), DeviceError> {
         match (self, precision) {
             (Self::Cuda(_), Precision::Bf16) => Err(DeviceError::Precision {
@@ -174,16 +174,16 @@ impl DeviceName {
         }
     }
 
-    /// The device with the faster kernels that it has, products in `precision`.
+    /// Opens the device with its fastest kernels and products in `precision`.
     ///
     /// # Errors
-    /// A GPU that is not there, or a program that was built without the feature `cuda`; bf16 on a GPU.
+    /// The GPU is absent, the program was built without the feature `cuda`, or `precision` is bf16 on a GPU.
     pub fn open(self, precision: Precision) -> Result<Compute, DeviceError> {
         self.check(precision)?;
         match self {
             Self::Cpu => Ok(Compute::cpu(precision)),
             Self::Cuda(ordinal) => {
-                // One stream for all threads: `Device::new_cuda` gives each its own, unordered with the others'.
+                // All threads share one stream. `Device::new_cuda` gives each thread another stream, without ordering between them.
                 let device = Device::new_cuda_with_stream(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;
                 Ok(Compute {

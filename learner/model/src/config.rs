@@ -1,5 +1,5 @@
-//! Everything that fixes the network's shapes, and the names and shapes of its parameters.
-//! It holds no training setting, and no number has a default: each comes from a preset.
+//! The configuration that fixes the network's shapes, and the names and shapes of its parameters.
+//! It holds no training setting. No number has a default: each comes from a preset.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,12 +15,12 @@ use crate::torso::{TorsoName, TorsoSettings, interface::Torso};
 const DIMENSION_MAX: usize = 1 << 16;
 /// Largest number of scalars in one parameter; a configuration beyond it is rejected.
 const PARAMETER_LEN_MAX: usize = 1 << 28;
-/// Largest end of a support; a configuration beyond it is rejected, as f32 does not hold a sum of such returns over a batch.
+/// Largest absolute return of a support. Beyond it, f32 could overflow in a sum over a batch, so the configuration is rejected.
 const RETURN_MAX: f32 = 1e30;
-/// Actions and their number fit one byte; a configuration beyond it is rejected.
+/// Largest number of actions, because an action and the count each take one byte. A larger configuration is rejected.
 const ACTIONS_MAX: usize = 255;
 
-/// Everything that fixes the network's shapes.
+/// The configuration that fixes every shape of the network.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
@@ -28,65 +28,65 @@ pub struct ModelConfig {
     pub height: usize,
     /// Width of the network's input in pixels.
     pub width: usize,
-    /// Channels of the network's input, after frames were stacked.
+    /// Channels of the network's input, after frame stacking.
     pub input_channels: usize,
     /// Number of actions, 1 to 255.
     pub num_actions: usize,
     /// Atoms of each return distribution, at least 2.
     pub atoms: usize,
-    /// Return at the first atom, within +-1e30. Values are f32: a support far from 0 and much narrower than that has few of them.
+    /// Return at the first atom, within +-1e30. Expected returns are f32: a narrow support far from 0 holds only few distinct values.
     pub v_min: f32,
     /// Return at the last atom, within +-1e30.
     pub v_max: f32,
-    /// Which torso makes f3. Settings of earlier versions do not have it: `nature`.
+    /// The torso that computes f3. Settings of earlier versions lack this field and mean `nature`.
     #[serde(default)]
     pub torso: TorsoName,
-    /// Of `nature`, the convolutions, first to last, each followed by ReLU; at least one. The last one's output is f3.
+    /// For `nature`: the convolutions, first to last, at least one. A ReLU follows each. The last output is f3.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub conv: Vec<ConvLayer>,
-    /// Of `impala` and `impoola`, the channels of each stage, first to last; at least one. The last one's output, after ReLU, is f3.
+    /// For `impala` and `impoola`: the channels of each stage, first to last, at least one. The last stage's output after ReLU is f3.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub channels: Vec<usize>,
-    /// Of `impala` and `impoola`, whether the second convolution of each residual block starts smaller, by the square root of the number
-    /// of blocks; not there: it does not.
+    /// For `impala` and `impoola`: whether the initial weight of each residual block's second convolution is
+    /// divided by the square root of the number of blocks. Absent: no.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub scale_blocks: bool,
     /// Width of the fully connected layer f4.
     pub hidden: usize,
-    /// Width of the space in which DIM scores are dot products, and of its heads' hidden layers.
+    /// Dimension of the vectors whose dot products are DIM scores, and width of the DIM heads' hidden layers.
     pub embedding_dim: usize,
-    /// Width of the embedded action.
+    /// Width of the action embedding.
     pub action_embed: usize,
-    /// Which DIM heads exist.
+    /// The DIM heads that exist.
     pub dim: DimHeads,
-    /// Layers of an auxiliary loss's own, beside those heads.
+    /// Layers that only an auxiliary loss uses, in addition to the DIM heads.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub loss_layers: Vec<LossLayer>,
-    /// How the C51 head is made. Settings of earlier versions do not have it: one linear layer.
+    /// The structure of the C51 head. Settings of earlier versions lack this field and mean one linear layer.
     #[serde(default, skip_serializing_if = "HeadConfig::is_plain")]
     pub head: HeadConfig,
 }
 
-/// A linear layer of an auxiliary loss's own, `dim.NAME` among the parameters. It starts as the C51 head does.
+/// A linear layer that only an auxiliary loss uses, named `dim.NAME` among the parameters. It starts uniform, like the C51 head.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossLayer {
-    /// Its name: lower-case letters, digits and `_`, and none of a DIM head.
+    /// The layer's name: lower-case letters, digits and `_`. Names of DIM heads are taken.
     pub name: String,
-    /// Width of what it takes.
+    /// Width of the input.
     pub inputs: usize,
-    /// Width of what it makes.
+    /// Width of the output.
     pub outputs: usize,
 }
 
 impl LossLayer {
-    /// What the names of its parameters begin with.
+    /// Returns the common prefix of the names of this layer's parameters, without the final dot.
     pub fn layer(&self) -> String {
         format!("dim.{}", self.name)
     }
 }
 
-/// Which DIM heads exist. Nothing is built that no lambda needs.
+/// The DIM heads that exist. A head exists only if a loss weight (lambda) needs it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DimHeads {
@@ -98,12 +98,12 @@ pub struct DimHeads {
     pub psi4: bool,
     /// Phi over f4(s_{t+k}).
     pub phi4: bool,
-    /// Whether Psi sees the embedded action; without a Psi it builds nothing.
+    /// Whether Psi sees the embedded action. Without a Psi no embedding is built.
     pub action: bool,
 }
 
 impl DimHeads {
-    /// No DIM head at all: the C51 agent, target networks and actors.
+    /// No DIM head, as in the plain C51 agent, in target networks and in actors.
     pub const NONE: Self = Self::all(false);
     /// Every head, and Psi sees the action.
     pub const EVERY: Self = Self::all(true);
@@ -118,19 +118,19 @@ impl DimHeads {
         }
     }
 
-    /// Whether the action embedding exists: Psi is conditioned on the action, and there is a Psi.
+    /// Whether the action embedding exists: there is a Psi, and it sees the action.
     pub fn embeds_action(&self) -> bool {
         self.action && (self.psi3 || self.psi4)
     }
 }
 
 impl ModelConfig {
-    /// Checks that such a network can exist.
+    /// Checks that a network can be built from this configuration.
     ///
     /// # Errors
-    /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter
-    /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, a `head.noisy_sigma` out of its range, `v_min` not below `v_max`, one of them beyond 1e30, no
-    /// convolution or stage, a setting of another torso.
+    /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter of more
+    /// than 2^28 scalars, more than 255 actions, fewer than 2 atoms, a `head.noisy_sigma` out of range, `v_min` not below
+    /// `v_max`, either beyond +-1e30, no convolution or stage, a setting of another torso, or an invalid loss layer name.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
         let check = |name: &str, size: usize| match size {
@@ -211,7 +211,7 @@ impl ModelConfig {
         Ok(())
     }
 
-    /// The same network without its DIM heads and a loss's own layers: what target networks and actors hold.
+    /// Returns this configuration without DIM heads and loss layers, as target networks and actors use it.
     pub fn without_dim(&self) -> Self {
         Self {
             dim: DimHeads::NONE,
@@ -228,13 +228,13 @@ impl ModelConfig {
         }
     }
 
-    /// The torso. Of a configuration that is not valid, one that cannot be used.
+    /// Builds the torso. If the configuration is invalid, the torso is unusable.
     pub(crate) fn torso(&self) -> Box<dyn Torso> {
         let input = (self.height, self.width, self.input_channels);
         self.torso.build(input, &self.torso_settings())
     }
 
-    /// Shape of f3: height, width, channels. Meaningful for a valid configuration.
+    /// Returns the height, width and channels of f3. Meaningful for a valid configuration.
     pub fn local_shape(&self) -> (usize, usize, usize) {
         self.torso().local_shape()
     }
@@ -244,28 +244,28 @@ impl ModelConfig {
         self.height * self.width * self.input_channels
     }
 
-    /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1); the last is `v_max` itself.
+    /// Returns the atoms z_i = v_min + i (v_max - v_min) / (atoms - 1). The last atom is exactly `v_max`.
     pub fn atoms_support(&self) -> Vec<f32> {
         let (v_min, v_max) = (f64::from(self.v_min), f64::from(self.v_max));
         let last = self.atoms - 1;
         let step = (v_max - v_min) / last as f64;
-        // Far from 0 not even an f64 has v_min + (v_max - v_min) = v_max.
+        // Far from 0, v_min + (v_max - v_min) differs from v_max even in f64.
         (0..last)
             .map(|i| (v_min + i as f64 * step) as f32)
             .chain([self.v_max])
             .collect()
     }
 
-    /// Names and PyTorch shapes of all parameters: torso first, then head, then the DIM heads that exist, then a loss's own layers.
+    /// Returns names and PyTorch shapes of all parameters: torso, head, the DIM heads that exist, loss layers, in this order.
     ///
-    /// Linear weights are [out, in], convolutions [out, in, k, k], biases [out]. The order is the order in which initial
-    /// weights are drawn, so the torso's and the head's do not depend on which DIM heads exist.
+    /// Linear weights are [out, in], convolutions [out, in, k, k], biases [out]. Initial weights are drawn in
+    /// this order, so those of torso and head do not depend on which DIM heads exist.
     pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
         let layers = self.layers().into_iter();
         layers.flat_map(|layer| layer.parameters()).collect()
     }
 
-    /// Names and outputs of the C51 head's layers, all of which take f4: the value's and the advantage's of a dueling head, else one.
+    /// Returns names and output widths of the C51 head's layers: value and advantage if dueling, else one. All take f4.
     pub(crate) fn head_layers(&self) -> Vec<(&'static str, usize)> {
         let outputs = self.num_actions.saturating_mul(self.atoms);
         if self.head.dueling {
@@ -282,11 +282,11 @@ impl ModelConfig {
         let mut layers = torso.convolutions();
         let fc = [self.hidden, torso.fc_inputs()];
         layers.push(LayerShape::new("torso.fc", &fc, Orthogonal));
-        // The means of noisy layers too, as Fortunato et al. 2018 draw them.
+        // The means of noisy layers are uniform too, as in Fortunato et al. 2018.
         for (name, outputs) in self.head_layers() {
             layers.push(LayerShape {
                 noisy_sigma: self.head.noisy_sigma,
-                // The value's weight is added to the advantage's, and that is applied.
+                // The value stream's weight is added to the advantage stream's, which is then applied to f4.
                 locations: usize::from(name != VALUE),
                 ..LayerShape::new(name, &[outputs, self.hidden], Uniform)
             });
@@ -322,7 +322,7 @@ impl ModelConfig {
 
 #[cfg(test)]
 impl ModelConfig {
-    /// A network for tests: 8 x 8 x 1, a map of 3 x 3 x 4, then 2 x 2 x 5; every DIM head.
+    /// A network for tests: input 8 x 8 x 1, maps of 3 x 3 x 4 and 2 x 2 x 5, every DIM head.
     pub(crate) fn small() -> Self {
         let conv = |out, kernel, stride| ConvLayer::new(out, kernel, stride);
         Self {

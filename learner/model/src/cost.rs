@@ -1,5 +1,5 @@
-//! What a network costs, layer by layer: scalars of parameters, and the arithmetic of one state forward and backward.
-//! It counts matrix products alone: activations and losses are a few operations a scalar, and Adam's step is a dozen a parameter.
+//! The cost of a network, layer by layer: the parameter count, and the FLOPs of one state forward and backward.
+//! Only matrix products count. Activations and losses take a few operations per scalar, Adam about a dozen per parameter.
 
 use safetensors::tensor::TensorView;
 
@@ -7,26 +7,26 @@ use crate::config::ModelConfig;
 use crate::error::Result;
 use crate::stored::StoredAs;
 
-/// What one layer costs. Arithmetic is multiplications and additions, each counted as one.
+/// The cost of one layer. FLOPs are multiplications and additions, each counted as one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LayerCost {
-    /// Its name, such as `torso.conv1`: that of its parameters without `.weight` and `.bias`.
+    /// The layer's name, such as `torso.conv1`: its parameters' names without `.weight` and `.bias`.
     pub name: String,
-    /// Scalars of its weight and bias.
+    /// The number of scalars in the weight and the bias.
     pub parameters: u64,
-    /// One state forward, at every location where the layer is applied.
+    /// FLOPs of one state forward, over all locations to which the layer is applied.
     pub forward: u64,
-    /// One state backward: the weight's gradient, and the input's where a layer before it needs one.
+    /// FLOPs of one state backward: the weight's gradient, and the input's gradient if an earlier layer needs it.
     pub backward: u64,
 }
 
 impl LayerCost {
-    /// One state forward and backward.
+    /// FLOPs of one state forward and backward.
     pub const fn learning(&self) -> u64 {
         self.forward + self.backward
     }
 
-    /// Whether it is of the part of the network with this name, such as `torso` or `dim.psi4`.
+    /// Whether the layer belongs to the part of the network with this name, such as `torso` or `dim.psi4`.
     pub fn is_of(&self, part: &str) -> bool {
         let rest = self.name.strip_prefix(part);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
@@ -34,19 +34,18 @@ impl LayerCost {
 }
 
 impl ModelConfig {
-    /// What each layer that this configuration has costs, in the order of [`ModelConfig::parameter_shapes`]. Meaningful for a valid
-    /// configuration.
+    /// Returns the cost of each layer of a valid configuration, in the order of [`ModelConfig::parameter_shapes`].
     pub fn layer_costs(&self) -> Vec<LayerCost> {
         let layers = self.layers().into_iter().enumerate();
         let costs = layers.map(|(index, layer)| {
             let len = |shape: &[usize]| shape.iter().product::<usize>();
-            // Products of what is joined to all locations of a state, and those of each location.
+            // Products with the joined input run once a state, all others once a location.
             let joined = layer.joined * layer.weight[0];
             let products = joined + layer.locations * (len(&layer.weight) - joined);
             let parameters = layer.parameters();
             let scalars = parameters.iter().map(|(_, shape)| len(shape));
             let is_of = |part: &str| layer.name.starts_with(part);
-            // What is made of bytes, or of an action's number, sends no gradient on.
+            // Bytes and one-hot actions need no gradient.
             let is_first = index == 0 || is_of("dim.action.hidden") || is_of("dim.action.skip");
             let forward = 2 * products as u64;
             LayerCost {
@@ -59,7 +58,7 @@ impl ModelConfig {
         costs.collect()
     }
 
-    /// Bytes of a safetensors file of all parameters that this configuration has, names and shapes included.
+    /// Returns the size in bytes of a safetensors file of all parameters, names and shapes included.
     pub fn weights_bytes(&self, stored: StoredAs) -> Result<usize> {
         let shapes = self.parameter_shapes();
         let scalars = |shape: &[usize]| shape.iter().product::<usize>() * stored.bytes();
@@ -123,7 +122,7 @@ mod tests {
         assert!(counted[3].is_of("head") && !counted[4].is_of("dim.act"));
     }
 
-    /// The value's stream has parameters and no products: it is added to the advantage's weight.
+    /// The value stream has parameters but no products: its weight is added to the advantage stream's weight.
     #[test]
     fn a_dueling_head_has_the_products_of_a_plain_one() {
         let plain = ModelConfig::small();

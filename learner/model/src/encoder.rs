@@ -1,5 +1,5 @@
-//! Torso and Psi_4 alone: what turns states into vectors that are compared with another network's, such as CURL's keys.
-//! It has no C51 head and sees no action.
+//! The torso and Psi_4 alone, which encode states as vectors to compare with another network's, such as CURL's keys.
+//! An encoder has no C51 head and sees no action.
 
 use candle_core::Tensor;
 
@@ -12,7 +12,7 @@ use crate::parameters::Parameters;
 
 /// The part of a network that encodes a state as psi_4(f4).
 ///
-/// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this encoder.
+/// An encoder shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes the encoder.
 #[derive(Debug)]
 pub struct Encoder {
     torso: FeatureLayers,
@@ -20,12 +20,12 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// Whether the network's parameter of this name is one of the encoder's.
+    /// Whether the parameter of this name belongs to the encoder.
     pub fn has(name: &str) -> bool {
         name.starts_with("torso.") || name.starts_with("dim.psi4.")
     }
 
-    /// The encoder of a network of `config`, on `parameters`, which may hold more than it needs.
+    /// Builds the encoder of a network of `config` on `parameters`, which may hold more than the encoder needs.
     pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         Ok(Self {
@@ -34,7 +34,7 @@ impl Encoder {
         })
     }
 
-    /// psi_4(f4) [B, embedding_dim] of `frames` [B, H, W, C] u8, cut off from any graph.
+    /// Computes psi_4(f4) [B, embedding_dim] of `frames` [B, H, W, C] u8, detached from any graph.
     pub fn encode(&self, frames: &Tensor) -> Result<Tensor> {
         let (_, f4) = self.torso.features(frames, false)?;
         Ok(self.psi4.forward(&f4.detach(), None)?.detach())

@@ -1,9 +1,9 @@
-//! What can go wrong in the network: its configuration, its weights, its inputs.
-//! Broken invariants of our own are assertions, not errors.
+//! The errors of this crate: invalid configurations, weights files and inputs.
+//! Violated internal invariants are assertions, not errors.
 
 use thiserror::Error;
 
-/// A fault of a configuration, a weights file or an input, or a failure inside candle.
+/// An invalid configuration, weights file or input, or a failure inside candle.
 #[derive(Debug, Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum ModelError {
@@ -17,7 +17,7 @@ pub enum ModelError {
     Input(String),
     #[error("the network has no {0} head: its configuration leaves it out")]
     NoHead(&'static str),
-    /// No action can be chosen from it; of several such rows this is the first.
+    /// The output holds a NaN or an infinity, so no action can be chosen from this row. `row` is the first such row.
     #[error("the network's output for row {row} of the batch is not finite")]
     NotFinite { row: usize },
     #[error("tensor operation: {0}")]
@@ -33,5 +33,5 @@ impl ModelError {
     }
 }
 
-/// Result of this crate's functions.
+/// The result type of this crate's functions.
 pub type Result<T> = std::result::Result<T, ModelError>;

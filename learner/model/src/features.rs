@@ -1,5 +1,5 @@
-//! Frames to f3 and f4 with gradients: a torso and its parameters.
-//! How f3 is made is the torso's, in `torso`.
+//! From frames to f3 and f4 with gradients: a torso and its parameters.
+//! The torsos themselves are in `torso`.
 
 use candle_core::{DType, Tensor};
 
@@ -35,8 +35,8 @@ impl FeatureLayers {
         })
     }
 
-    /// f4 [B, hidden] before its ReLU, of `frames` [B, H, W, C] u8, which are scaled by 1/255; and f3 [B, h, w, c] after its ReLU, if
-    /// `local` features are wanted.
+    /// Computes f4 [B, hidden] before its ReLU, of `frames` [B, H, W, C] u8 scaled by 1/255. Computes f3
+    /// [B, h, w, c] after its ReLU too, if `local` features are wanted.
     pub(crate) fn features(
         &self,
         frames: &Tensor,

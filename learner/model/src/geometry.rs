@@ -1,5 +1,5 @@
-//! The sizes of a stack of convolutions: what goes into each layer, what comes out, how many scalars its parameters have.
-//! It computes no convolution.
+//! The shapes of a stack of convolutions: each layer's input, output and parameter count.
+//! This module computes no convolution.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ pub struct ConvLayer {
 }
 
 impl ConvLayer {
-    /// In the order of PyTorch's `Conv2d`, without the input's channels.
+    /// Takes the arguments in the order of PyTorch's `Conv2d`, without the input channels.
     pub const fn new(out: usize, kernel: usize, stride: usize) -> Self {
         Self {
             out,
@@ -26,7 +26,7 @@ impl ConvLayer {
     }
 }
 
-/// Sizes of one convolution with a square kernel and without padding; height and width are the input's.
+/// The shape of one convolution with a square kernel and without padding. `height` and `width` are the input's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ConvShape {
     pub(crate) height: usize,
@@ -39,7 +39,7 @@ pub(crate) struct ConvShape {
 }
 
 impl ConvShape {
-    /// The sizes of `layer` on an input of (height, width, channels); `None` if the kernel does not fit or a size is 0.
+    /// Returns the shape of `layer` on an input of (height, width, channels); `None` if the kernel does not fit or a size is 0.
     pub(crate) fn new(
         (height, width, channels_in): (usize, usize, usize),
         layer: ConvLayer,
@@ -61,8 +61,8 @@ impl ConvShape {
         })
     }
 
-    /// The sizes of a convolution of 3 x 3 on an input of (height, width, channels) with a border of zeros, a pixel wide: those of one
-    /// without padding, on the input with its border. The output is as large as the input.
+    /// Returns the shape of a 3 x 3 convolution with padding 1 on an input of (height, width, channels), as one without padding
+    /// on the bordered input. `height` and `width` thus include the border. The output is as large as the unbordered input.
     pub(crate) const fn bordered(
         (height, width, channels_in): (usize, usize, usize),
         channels_out: usize,
@@ -90,7 +90,7 @@ impl ConvShape {
         (self.out_height(), self.out_width(), self.channels_out)
     }
 
-    /// Windows in one image, which are the locations of the output map.
+    /// The number of windows in one image, which is the number of locations in the output map.
     pub(crate) fn locations(&self) -> usize {
         self.out_height() * self.out_width()
     }
@@ -112,18 +112,18 @@ impl ConvShape {
     }
 }
 
-/// Convolutions of a stage of an IMPALA torso: the one before the pool, and two of each residual block.
+/// Convolutions in one stage of an IMPALA torso: one before the pool, then two in each of two residual blocks.
 pub(crate) const STAGE_CONVOLUTIONS: usize = 5;
 
-/// Height, width and channels of what a 3 x 3 max pool of stride 2, with a border that is never the largest, makes of maps.
+/// Returns height, width and channels after a 3 x 3 max pool of stride 2 and padding 1, where the padding is never the largest.
 pub(crate) const fn pooled(
     (height, width, channels): (usize, usize, usize),
 ) -> (usize, usize, usize) {
     (height.div_ceil(2), width.div_ceil(2), channels)
 }
 
-/// The sizes of all convolutions of stages of these widths on an input of (height, width, channels), in the order in which they are
-/// applied, and those of what comes out.
+/// Returns the shapes of all convolutions of stages with these widths on an input of
+/// (height, width, channels), in the order of application, and the shape of the output.
 pub(crate) fn stages(
     input: (usize, usize, usize),
     widths: &[usize],
@@ -138,10 +138,10 @@ pub(crate) fn stages(
     (shapes, maps)
 }
 
-/// Rows and columns, from the upper left corner of an image of (height, width), that windows of the layers of `conv` reach: what
-/// lies beyond them changes no output. `None` if a kernel does not fit.
+/// Returns the rows and columns, from the upper left corner of an image of (height, width), that the windows
+/// of `conv` cover. Pixels beyond change no output. `None` if a kernel does not fit.
 ///
-/// The last layer's whole output is read; a layer that gives n rows reads `stride * (n - 1) + kernel` of its input's.
+/// The last layer's whole output is read. A layer with n output rows reads `stride * (n - 1) + kernel` input rows.
 pub(crate) fn reach(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
     let mut size = (image.0, image.1, 1);
     for layer in conv {
@@ -163,7 +163,7 @@ mod tests {
         all.iter().map(layer).collect()
     }
 
-    /// For every size: the part that is reached gives maps of the same size, and one row or column less does not.
+    /// For every size: the covered part gives maps of the same size, and one row or column less does not.
     #[test]
     fn no_smaller_part_gives_the_same_maps() {
         let maps = |conv: &[ConvLayer], image: (usize, usize)| {

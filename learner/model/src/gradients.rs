@@ -1,8 +1,8 @@
-//! The backward pass of a loss, with the gradients of weights summed where they are made.
-//! It computes no gradient itself and takes no step.
+//! The backward pass of a loss, with a sink in which layers sum the gradients of their weights in place.
+//! This module computes no gradient itself and takes no optimizer step.
 //!
-//! candle adds every gradient, also a weight's only one, to fresh zeros on a single thread. Layers that know this sink add theirs
-//! in place instead, with their products.
+//! candle adds every gradient, even the only one of a weight, to fresh zeros on a single thread. Layers that
+//! use this sink let their matrix products add to the sum in place instead.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -12,14 +12,14 @@ use candle_core::{Result, Tensor, TensorId, Var, backprop::GradStore, bail};
 type Sums = HashMap<TensorId, Vec<f32>>;
 
 thread_local! {
-    /// The sums of the backward pass that runs on this thread, if it is one of [`Backward::of`].
+    /// The gradient sums of the backward pass on this thread, if [`Backward::of`] runs it.
     ///
-    /// A thread of the pool that waits for its products may take up another learner's whole update: a pass that begins here
-    /// therefore puts the sums of the one below it aside and restores them, and the cell is never borrowed while other work may run.
+    /// A pool thread that waits for its products may steal another learner's whole update. A pass that starts here
+    /// therefore sets the outer pass's sums aside and restores them. The cell is never borrowed while other work may run.
     static SUMS: RefCell<Option<Sums>> = const { RefCell::new(None) };
 }
 
-/// Gives the pass below its sums back, also when this one panics.
+/// Restores the outer pass's sums, also if the inner pass panics.
 struct PassBelow(Option<Sums>);
 
 impl Drop for PassBelow {
@@ -28,7 +28,7 @@ impl Drop for PassBelow {
     }
 }
 
-/// The gradients of one loss.
+/// The gradients of a loss.
 #[derive(Debug)]
 pub struct Backward {
     store: GradStore,
@@ -47,11 +47,11 @@ impl Backward {
         })
     }
 
-    /// Takes out the gradient of `var`, in its shape; `None` if the loss does not depend on it.
+    /// Removes and returns the gradient of `var`, in its shape; `None` if the loss does not depend on `var`.
     pub fn remove(&mut self, var: &Var) -> Result<Option<Tensor>> {
         let sum = self.sums.remove(&var.id());
         let sum = sum.map(|sum| Tensor::from_vec(sum, var.shape(), var.device()));
-        // candle leaves some gradients tied to the pass they come from; moments made of them would keep every pass.
+        // candle leaves some gradients attached to their pass. Optimizer moments made of them would keep every pass alive.
         let stored = self.store.remove(var);
         let stored = stored.map(|gradient| gradient.contiguous()).transpose()?;
         match (sum.transpose()?, stored.map(|gradient| gradient.detach())) {
@@ -61,7 +61,7 @@ impl Backward {
     }
 }
 
-/// The gradient of `parameter` that `add` makes; none where it is not wanted or [`add_in_place`] added it to a variable's sum.
+/// Returns the gradient of `parameter` as `add` computes it. `None` if none is wanted, or if [`add_in_place`] added it to a sum.
 pub(crate) fn summed(
     parameter: &Tensor,
     add: impl Fn(Option<Vec<f32>>) -> Vec<f32>,
@@ -70,7 +70,7 @@ pub(crate) fn summed(
     is_wanted.then(|| add(None))
 }
 
-/// Adds to the gradient of a parameter; a parameter that is not a variable has none.
+/// Adds to the gradient of `parameter`. Does nothing if it is not a variable. Fails if [`Backward::of`] does not run this pass.
 pub(crate) fn sum_in_place(
     parameter: &Tensor,
     add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
@@ -81,9 +81,9 @@ pub(crate) fn sum_in_place(
     Ok(())
 }
 
-/// Adds to the gradient of `parameter` in place, if that is a variable and the backward pass is one of [`Backward::of`]; says whether.
+/// Adds to the gradient of `parameter` in place if it is a variable and [`Backward::of`] runs this pass. Returns whether it did.
 ///
-/// `add` gets the sum so far, in the parameter's layout, and gives back the sum with its part.
+/// `add` receives the sum so far, in the parameter's layout, and returns the sum including the new gradient.
 fn add_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> bool {
     if !parameter.is_variable() {
         return false;

@@ -1,28 +1,28 @@
-//! Initial weights and biases, from a seeded generator: orthogonal matrices, or PyTorch's uniform law.
-//! Which layer is drawn in which way is fixed with the layer's shape, in `config`.
+//! Initial weights and biases from a seeded generator: orthogonal matrices, or PyTorch's uniform distribution.
+//! `config` decides how each layer is drawn, together with its shape.
 //!
-//! The source of randomness is passed in and used in a fixed way, so the same seed gives the same weights on the same
-//! machine (the last bits depend on the C library's logarithm and cosine).
+//! The caller passes the generator in. Draws follow a fixed order, so the same seed gives the same weights on
+//! the same machine. The last bits depend on the C library's logarithm and cosine.
 
 use rand_chacha::{ChaCha8Rng, rand_core::RngCore};
 
 /// Gain for layers before a ReLU: sqrt(2).
 const RELU_GAIN: f64 = std::f64::consts::SQRT_2;
 
-/// Partial sums of a dot product; that many are computed side by side.
+/// Partial sums of a dot product, computed side by side.
 const LANES: usize = 8;
 
 /// How the initial weight and bias of a layer are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum InitialLaw {
-    /// The weight orthogonal with gain sqrt(2), a convolution's flattened to [out, in * k * k]; the bias 0.
+    /// Weight orthogonal with gain sqrt(2), where a convolution counts as [out, in * k * k]. Bias 0.
     Orthogonal,
     /// Weight and bias uniform on +-1/sqrt(fan_in), PyTorch's default for a linear layer.
     Uniform,
 }
 
 impl InitialLaw {
-    /// A layer's first weight, row-major, of shape [out, in] or [out, in, k, k].
+    /// Draws a layer's initial weight, row-major, of shape [out, in] or [out, in, k, k].
     pub(crate) fn weight(self, shape: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
         let (rows, fan_in) = (shape[0], fan_in(shape));
         match self {
@@ -31,7 +31,7 @@ impl InitialLaw {
         }
     }
 
-    /// The first bias [out] of a layer whose weight has this shape.
+    /// Draws the initial bias [out] of a layer whose weight has this shape.
     pub(crate) fn bias(self, weight: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
         match self {
             Self::Orthogonal => vec![0.0; weight[0]],
@@ -40,12 +40,12 @@ impl InitialLaw {
     }
 }
 
-/// Inputs that one output of a layer sees.
+/// The number of inputs to one output of a layer.
 fn fan_in(weight: &[usize]) -> usize {
     weight[1..].iter().product()
 }
 
-/// `len` numbers uniform on +-1/sqrt(fan_in).
+/// Draws `len` numbers uniform on +-1/sqrt(fan_in).
 fn uniform_within(fan_in: usize, len: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let bound = 1.0 / (fan_in as f64).sqrt();
     (0..len)
@@ -53,11 +53,11 @@ fn uniform_within(fan_in: usize, len: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
         .collect()
 }
 
-/// A random matrix [rows, cols] whose shorter side's vectors are orthogonal and of length `gain`.
+/// Draws a random matrix [rows, cols] whose rows, or columns if they are fewer, are orthogonal and of length `gain`.
 ///
-/// W W^T = gain^2 I if rows <= cols, else W^T W = gain^2 I, uniformly distributed among such matrices: normal vectors made
-/// orthonormal one after the other, in f64 and twice, as once loses digits. Source: Saxe et al. 2014; PyTorch's
-/// `orthogonal_` gives the same distribution.
+/// W W^T = gain^2 I if rows <= cols, else W^T W = gain^2 I, uniformly distributed among such matrices.
+/// Gram-Schmidt makes normal vectors orthonormal in f64, twice, because one pass loses digits. Source: Saxe
+/// et al. 2014; PyTorch's `orthogonal_` gives the same distribution.
 fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let (count, len) = (rows.min(cols), rows.max(cols));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
@@ -107,7 +107,7 @@ pub(crate) fn normals(len: usize, rng: &mut ChaCha8Rng) -> Vec<f64> {
     pairs.take(len).collect()
 }
 
-/// Two independent standard normal numbers, by Box and Muller's method.
+/// Draws two independent standard normal numbers, by the Box-Muller method.
 fn normal_pair(rng: &mut ChaCha8Rng) -> [f64; 2] {
     // In (0, 1], so that the logarithm is finite.
     let radius = (-2.0 * (1.0 - uniform(rng)).ln()).sqrt();
@@ -115,7 +115,7 @@ fn normal_pair(rng: &mut ChaCha8Rng) -> [f64; 2] {
     [radius * cos, radius * sin]
 }
 
-/// Uniform on [0, 1) with 53 bits.
+/// Draws a number uniform on [0, 1) with 53 bits.
 fn uniform(rng: &mut ChaCha8Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 / (1u64 << 53) as f64
 }

@@ -1,5 +1,5 @@
-//! Frames to the network's input: enlargement by nearest neighbour on plain bytes, of what the network reads.
-//! It does not stack frames and does not convert them to floats.
+//! From frames to the network's input: enlarges the part of a u8 frame that the network reads, by nearest neighbour.
+//! This module does not stack frames or convert them to floats.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +8,7 @@ use crate::error::{ModelError, Result};
 use crate::geometry::ConvLayer;
 use crate::torso::TorsoName;
 
-/// The size at which the network sees a world's frame: the `[input]` table.
+/// The size to which frames are enlarged for the network: the `[input]` table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InputSize {
@@ -16,8 +16,8 @@ pub struct InputSize {
     pub height: u32,
     /// Columns of a whole frame after enlargement.
     pub width: u32,
-    /// A whole frame as the world gives it. Where it is there, what the network does not read is cut before a frame is recorded;
-    /// settings of earlier versions do not have it, and frames are whole.
+    /// The size of a whole frame as the environment gives it. If set, pixels that the network does not read are cut
+    /// off before a frame is recorded. Settings of earlier versions lack this field and record whole frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub frame: Option<FrameSize>,
 }
@@ -32,12 +32,12 @@ pub struct FrameSize {
     pub width: u32,
 }
 
-/// What a network reads, from the upper left corner, (height, width).
+/// The part that a network reads, from the upper left corner, as (height, width).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct InputRead {
-    /// Of the enlarged frame.
+    /// The part of the enlarged frame.
     pub input: (usize, usize),
-    /// Of the frame as the world gives it.
+    /// The part of the frame as the environment gives it.
     pub frame: (usize, usize),
 }
 
@@ -47,14 +47,14 @@ impl InputSize {
         (self.height as usize, self.width as usize)
     }
 
-    /// Rows and columns of a whole frame as the world gives it, where frames of `sent` rows and columns travel.
+    /// Rows and columns of a whole frame as the environment gives it, if frames of `sent` rows and columns are transferred.
     pub fn whole_frame(&self, sent: (usize, usize)) -> (usize, usize) {
         self.frame
             .map_or(sent, |whole| (whole.height as usize, whole.width as usize))
     }
 
-    /// What `torso`, with the layers of `conv` if it is made of them, reads of a frame of (height, width) that is enlarged to this size;
-    /// all of it if they do not fit.
+    /// Returns the part that `torso` (with the layers `conv` if it is `nature`) reads of a frame of
+    /// (height, width) enlarged to this size. Returns the whole if the layers do not fit.
     pub fn read(&self, torso: TorsoName, conv: &[ConvLayer], frame: (usize, usize)) -> InputRead {
         let whole = self.whole_input();
         let reach = torso.reach(conv, whole);
@@ -74,10 +74,10 @@ impl InputSize {
         }
     }
 
-    /// What makes the input of a network of `model` from frames of (height, width) as they travel; `None` where they are it.
+    /// Returns the resize from transferred frames of size `sent`, (height, width), to the input of `model`; `None` if none is needed.
     ///
     /// # Errors
-    /// [`ModelError::Config`] if the network takes what these frames do not have.
+    /// [`ModelError::Config`] if the network reads pixels that these frames lack.
     pub fn enlarge(&self, sent: (usize, usize), model: &ModelConfig) -> Result<Option<Enlarge>> {
         let (frame, whole) = (self.whole_frame(sent), self.whole_input());
         let taken = (model.height, model.width);
@@ -94,15 +94,15 @@ impl InputSize {
     }
 }
 
-/// The source pixel of output pixel `at`, along one side.
+/// Returns the source index of output index `at` along one side.
 const fn source(at: usize, from: usize, to: usize) -> usize {
     (2 * at + 1) * from / (2 * to)
 }
 
 /// Resizes u8 images [n, h, w, c] to another height and width by nearest neighbour.
 ///
-/// Output pixel d takes source pixel floor((d + 1/2) * from / to), in each direction by itself: the source pixel under the
-/// output pixel's centre. Procgen's 64x64 becomes the paper's 104x80, Ms. PacMan's 21x19 its 84x84.
+/// Output pixel d copies source pixel floor((d + 1/2) * from / to), independently in each direction: the
+/// pixel under its centre. Procgen's 64x64 becomes the paper's 104x80, Ms. PacMan's 21x19 its 84x84.
 #[derive(Clone, Debug)]
 pub struct Enlarge {
     from: (usize, usize),
@@ -112,7 +112,7 @@ pub struct Enlarge {
 }
 
 impl Enlarge {
-    /// From and to are (height, width).
+    /// Builds a resize between two sizes, each (height, width).
     ///
     /// # Errors
     /// [`ModelError::Config`] if a size is 0.
@@ -131,10 +131,10 @@ impl Enlarge {
         })
     }
 
-    /// The same for images of which only a part is there, to a part of what they would become; both begin at the upper left corner.
+    /// Restricts the resize to the upper left parts: from the part `from` of a source image to the part `to` of its result.
     ///
     /// # Errors
-    /// [`ModelError::Config`] if that part needs more of the images, or if there is no more of them.
+    /// [`ModelError::Config`] if the part `to` needs pixels outside `from`, or if either part exceeds its image.
     pub fn part(mut self, from: (usize, usize), to: (usize, usize)) -> Result<Self> {
         let whole = (self.from, (self.source_rows.len(), self.source_cols.len()));
         self.source_rows.truncate(to.0);
@@ -237,7 +237,7 @@ mod tests {
         }
     }
 
-    /// The upper left `part` of images [h, w, 1].
+    /// Cuts the upper left `part` out of images [h, w, 1].
     fn cut(images: &[u8], width: usize, part: (usize, usize)) -> Vec<u8> {
         let rows = images.chunks_exact(width).take(part.0);
         rows.flat_map(|row| &row[..part.1]).copied().collect()
@@ -282,7 +282,7 @@ mod tests {
                 None => part.copy_from_slice(&sent),
             }
             assert_eq!(part, cut(&whole, input.1, found.input), "{frame:?}");
-            // One row less does not do.
+            // One row less is too small.
             let less = (found.frame.0 - 1, found.frame.1);
             assert!(size.enlarge(less, &model).is_err(), "{frame:?}");
         }

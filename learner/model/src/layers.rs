@@ -1,5 +1,5 @@
-//! A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
-//! Which layers a network has is `config`'s.
+//! A layer's name, the shapes of its parameters, and their initial distribution.
+//! `config` decides which layers a network has.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -12,23 +12,23 @@ pub(crate) struct Layer<T> {
     pub(crate) bias: T,
 }
 
-/// A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
+/// A layer's name, the shapes of its parameters, and their initial distribution.
 ///
-/// Source of the laws: the paper authors' code. A C51 head that starts orthogonal too gives first Q values twice as large,
-/// and with a target network that moves once in 312 updates these outlive 100,000 frames.
+/// Source of the distributions: the paper authors' code. An orthogonal C51 head would double the initial Q
+/// values, and a target network updated once in 312 updates would keep them beyond 100,000 frames.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct LayerShape {
     pub(crate) name: String,
     pub(crate) weight: Vec<usize>,
     pub(crate) bias: bool,
     pub(crate) initial: InitialLaw,
-    /// What the weight is multiplied by after it is drawn.
+    /// The factor applied to the weight after drawing.
     pub(crate) initial_scale: f32,
-    /// sigma_0 of a noisy layer, which has a mean and a sigma of weight and bias in place of these.
+    /// sigma_0 if the layer is noisy: weight and bias are then a mean and a sigma each.
     pub(crate) noisy_sigma: Option<f64>,
-    /// Places of one state at which it is applied.
+    /// Locations of one state at which the layer is applied.
     pub(crate) locations: usize,
-    /// Columns of the weight for what is joined to all locations, which are applied once.
+    /// Columns of the weight for the joined input, which is the same at all locations and multiplied once.
     pub(crate) joined: usize,
 }
 
@@ -47,8 +47,8 @@ impl LayerShape {
         }
     }
 
-    /// The layers of a residual block on `inputs` features and those of what is `joined`; the skip has no bias, and starts orthogonal
-    /// whatever the law of the two others.
+    /// The layers of a residual block on `inputs` features and `joined` features. The skip layer has no bias
+    /// and starts orthogonal, whatever `initial` says for the other two.
     pub(crate) fn block(
         name: &str,
         locations: usize,
@@ -75,7 +75,7 @@ impl LayerShape {
         ]
     }
 
-    /// Names and shapes of its parameters, in the order in which they are drawn.
+    /// Names and shapes of the layer's parameters, in the order in which they are drawn.
     pub(crate) fn parameters(&self) -> Vec<(String, Vec<usize>)> {
         let name = &self.name;
         let ends: &[&str] = match self.noisy_sigma {
@@ -92,7 +92,7 @@ impl LayerShape {
         weights.chain(biases).collect()
     }
 
-    /// First values of [`LayerShape::parameters`]. A sigma draws nothing: it is sigma_0 / sqrt(fan_in).
+    /// Draws the initial values of [`LayerShape::parameters`]. A sigma is not drawn: it is sigma_0 / sqrt(fan_in).
     ///
     /// Source: Fortunato et al. 2018, section 3.2 (b).
     pub(crate) fn initial_values(&self, rng: &mut ChaCha8Rng) -> Vec<Vec<f32>> {

@@ -1,11 +1,10 @@
-//! The network that actor and learner share: a convolutional torso, one of several, the C51 head and the DIM heads, with their own CPU kernels.
-//! It knows no processes, replay or worlds, and computes no loss.
+//! The network that actor and learner share: a convolutional torso, the C51 head and the DIM heads, with CPU kernels for them.
+//! This crate knows no processes, replay or environments, and computes no loss.
 //!
-//! The learner differentiates through [`Network`]; an actor uses [`PolicyNetwork`], which runs the same kernels without
-//! a graph. The C51 head may be a dueling one, and noisy ([`HeadConfig`]): whatever it is made of, it amounts to one linear
-//! layer, so nothing after it knows. Noise is given from outside ([`HeadNoise`]); without it the means serve.
-//! [`Parameters`] hold the weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every shape, and
-//! at [`Network::features`]:
+//! The learner differentiates through [`Network`]. An actor uses [`PolicyNetwork`], which runs the same kernels without a graph.
+//! The C51 head may be dueling and noisy ([`HeadConfig`]). Every variant reduces to one linear layer, so later code handles them
+//! alike. The caller supplies the noise ([`HeadNoise`]); without noise, noisy layers use their means. [`Parameters`] hold the
+//! weights under PyTorch's names and shapes. Start at [`ModelConfig`], which fixes every shape, and at [`Network::features`]:
 //!
 //! ```
 //! use candle_core::{Device, Tensor};

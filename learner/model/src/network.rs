@@ -1,5 +1,5 @@
-//! The whole network with gradients, as the learner sees it.
-//! It owns no weights (it shares `Parameters`' storage) and computes no loss.
+//! The whole network with gradients, as the learner uses it.
+//! It owns no weights (it shares the storage of `Parameters`) and computes no loss.
 
 use std::collections::BTreeMap;
 
@@ -14,22 +14,22 @@ use crate::heads::dim::{ActionEmbedding, Head};
 use crate::heads::noise::HeadNoise;
 use crate::parameters::Parameters;
 
-/// What the torso makes of a batch of frames.
+/// The torso's output for a batch of frames.
 #[derive(Clone, Debug)]
 pub struct Features {
-    /// The last convolution's output after ReLU, [B, h, w, c], channels last; there if the network has a head that reads it.
+    /// The last convolution's output after ReLU, [B, h, w, c], channels last. `Some` if the network has a head that reads f3.
     pub f3: Option<Tensor>,
     /// The fully connected layer's output before its ReLU, [B, hidden].
     pub f4: Tensor,
 }
 
 impl Features {
-    /// f3.
+    /// Returns f3, or [`ModelError::NoHead`] if no head reads it.
     pub fn local(&self) -> Result<&Tensor> {
         self.f3.as_ref().ok_or(ModelError::NoHead("psi3 or phi3"))
     }
 
-    /// Those of `rows` rows from `first` on.
+    /// Returns the features of the rows `first` to `first + rows - 1`.
     pub fn narrow(&self, first: usize, rows: usize) -> candle_core::Result<Self> {
         let narrowed = |f3: &Tensor| f3.narrow(0, first, rows);
         Ok(Self {
@@ -38,7 +38,7 @@ impl Features {
         })
     }
 
-    /// The features of these rows, each as often as listed. Gradients of a row's copies are summed first to last.
+    /// Returns the features of the listed rows. A row may occur repeatedly; the gradients of its copies are summed in list order.
     pub fn select(&self, rows: &[u32]) -> candle_core::Result<Self> {
         let rows = Tensor::new(rows, self.f4.device())?;
         let selected = |features: &Tensor| features.index_select(&rows, 0);
@@ -49,10 +49,10 @@ impl Features {
     }
 }
 
-/// Torso, C51 head and the DIM heads that the configuration has.
+/// The torso, the C51 head and the DIM heads that the configuration enables.
 ///
-/// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network. Tensors of other
-/// shapes than a method names are errors, and so is a Psi or Phi that the configuration has not ([`ModelError::NoHead`]).
+/// A network shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes the network. Methods return
+/// an error if a tensor has another shape than documented, or if the network lacks the Psi or Phi ([`ModelError::NoHead`]).
 #[derive(Debug)]
 pub struct Network {
     kernels: Kernels,
@@ -63,13 +63,13 @@ pub struct Network {
     phi3: Option<Head>,
     psi4: Option<Head>,
     phi4: Option<Head>,
-    /// Weight and bias of each of a loss's own layers.
+    /// Weight and bias of each loss layer, by name.
     loss_layers: BTreeMap<String, (Tensor, Tensor)>,
 }
 
 impl Network {
-    /// The network of `config` on `parameters`, which may hold more than it needs (a target network's configuration
-    /// with the online network's parameters).
+    /// Builds the network of `config` on `parameters`. `parameters` may hold more than `config` needs, for
+    /// example the online network's parameters with a target network's configuration.
     pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         let head = |exists: bool, name: &str| {
@@ -95,25 +95,25 @@ impl Network {
         })
     }
 
-    /// What it is made of.
+    /// The kernels that this network computes with.
     pub const fn kernels(&self) -> Kernels {
         self.kernels
     }
 
-    /// f4, and f3 if a head reads it, of `frames` [B, H, W, C] u8, which are scaled by 1/255.
+    /// Computes f4, and f3 if a head reads it, of `frames` [B, H, W, C] u8. Frames are scaled by 1/255.
     pub fn features(&self, frames: &Tensor) -> Result<Features> {
         let local = self.psi3.is_some() || self.phi3.is_some();
         let (f3, f4) = self.torso.features(frames, local)?;
         Ok(Features { f3, f4 })
     }
 
-    /// Logits [B, A, atoms] of `f4` [B, hidden] as [`Features`] has it, before its ReLU, with the noise of the head's noisy layers; without
-    /// noise their means serve.
+    /// Computes the logits [B, A, atoms] of `f4` [B, hidden], which is before its ReLU as in [`Features`].
+    /// `noise` perturbs the head's noisy layers; without noise they use their means.
     pub fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         self.head.logits(f4, noise)
     }
 
-    /// The rows [B, atoms] of [`Network::logits`] of the actions [B] that were taken, each below the number of actions.
+    /// Computes the rows [B, atoms] of [`Network::logits`] for the taken actions [B], each below the number of actions.
     pub fn taken_logits(
         &self,
         f4: &Tensor,
@@ -123,36 +123,36 @@ impl Network {
         self.head.taken_logits(f4, actions, noise)
     }
 
-    /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them. On the CPU they are right to
-    /// [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) of the support's width beside their own last place.
+    /// Computes the expected returns [B, A] of `logits` [B, A, atoms], without a gradient. On the CPU their error beyond
+    /// f32 rounding is at most [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) times the support's width.
     pub fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         self.head.q_values(logits)
     }
 
-    /// Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers; ignored if Psi does not see the action).
+    /// Computes Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers, ignored if Psi does not see the action).
     pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = there(self.psi3.as_ref(), "psi3")?;
         by_location(head.forward(f3, self.embedded(actions)?.as_ref())?)
     }
 
-    /// Phi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c].
+    /// Computes Phi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c].
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
         let head = there(self.phi3.as_ref(), "phi3")?;
         by_location(head.forward(f3, None)?)
     }
 
-    /// Psi_4 [B, embedding_dim] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
+    /// Computes Psi_4 [B, embedding_dim] of `f4` [B, hidden] and `actions` [B] (integers, ignored if Psi does not see the action).
     pub fn psi4(&self, f4: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = there(self.psi4.as_ref(), "psi4")?;
         head.forward(f4, self.embedded(actions)?.as_ref())
     }
 
-    /// Phi_4 [B, embedding_dim] of `f4` [B, hidden].
+    /// Computes Phi_4 [B, embedding_dim] of `f4` [B, hidden].
     pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
         there(self.phi4.as_ref(), "phi4")?.forward(f4, None)
     }
 
-    /// W x + b [.., outputs] of `x` [.., inputs], by the loss's own layer of this name.
+    /// Computes W x + b [.., outputs] of `x` [.., inputs] with the loss layer of this name.
     pub fn loss_layer(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         let layer = self.loss_layers.get(name);
         let (weight, bias) = layer.ok_or_else(|| {
@@ -171,7 +171,7 @@ fn there<'a>(head: Option<&'a Head>, name: &'static str) -> Result<&'a Head> {
     head.ok_or(ModelError::NoHead(name))
 }
 
-/// [B, h, w, embedding_dim] as [B, h * w, embedding_dim].
+/// Reshapes [B, h, w, embedding_dim] to [B, h * w, embedding_dim].
 fn by_location(maps: Tensor) -> Result<Tensor> {
     Ok(maps.flatten(1, 2)?)
 }

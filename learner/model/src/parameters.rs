@@ -1,5 +1,5 @@
-//! Named parameters: made from a seed, read from and written to safetensors, all checked.
-//! It knows nothing of versions, files or networks between processes.
+//! Named parameters: drawn from a seed, or read from and written to safetensors with every value checked.
+//! This module knows nothing of weight versions, files on disk or the transfer between processes.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -13,16 +13,16 @@ use crate::stored::{self, StoredAs};
 
 /// Parameters by name, as candle variables with PyTorch's names and shapes.
 ///
-/// A clone shares the variables' storage; [`Parameters::copy`] does not.
+/// A clone shares the variables' storage; [`Parameters::copy_part`] does not.
 #[derive(Clone, Debug)]
 pub struct Parameters(BTreeMap<String, Var>);
 
 impl Parameters {
     /// Initial parameters, drawn layer by layer in the order of [`ModelConfig::parameter_shapes`].
     ///
-    /// Orthogonal with gain sqrt(2) and zero bias: torso, action embedding, Psi_3, Phi_3, and the skip matrices of Psi_4 and
-    /// Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head and the other layers of Psi_4 and Phi_4. Of noisy layers the
-    /// means are drawn so, and every sigma is `noisy_sigma` / sqrt(fan_in).
+    /// Orthogonal with gain sqrt(2) and zero bias: torso, action embedding, Psi_3, Phi_3, and the skip matrices of
+    /// Psi_4 and Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head, the other layers of Psi_4 and Phi_4,
+    /// and loss layers. The means of noisy layers are drawn likewise, and every sigma is `noisy_sigma` / sqrt(fan_in).
     pub fn init(config: &ModelConfig, rng: &mut ChaCha8Rng, device: &Device) -> Result<Self> {
         config.validate()?;
         let mut vars = BTreeMap::new();
@@ -35,7 +35,7 @@ impl Parameters {
         Ok(Self(vars))
     }
 
-    /// Parameters from tensors, which are copied.
+    /// Builds parameters from copies of `tensors`.
     ///
     /// # Errors
     /// [`ModelError::Parameter`] for the first parameter that is missing, unknown, not f32, of another shape or not
@@ -48,7 +48,7 @@ impl Parameters {
         Self::part_from_tensors(config, |_| true, tensors, device)
     }
 
-    /// [`Parameters::from_tensors`] for a part of the network: its parameters whose names pass `part`.
+    /// [`Parameters::from_tensors`] for the parameters whose names pass `part`.
     pub fn part_from_tensors(
         config: &ModelConfig,
         part: impl Fn(&str) -> bool,
@@ -64,7 +64,7 @@ impl Parameters {
         Self::load_part(config, part, &file, device)
     }
 
-    /// Parameters from the bytes of a safetensors file that holds exactly this configuration's.
+    /// Loads parameters from the bytes of a safetensors file that holds exactly the parameters of `config`.
     ///
     /// # Errors
     /// Bytes that are not safetensors; otherwise as [`Parameters::from_tensors`].
@@ -72,7 +72,7 @@ impl Parameters {
         Self::load_part(config, |_| true, bytes, device)
     }
 
-    /// [`Parameters::load_safetensors`] for a part of the network: its parameters whose names pass `part`.
+    /// [`Parameters::load_safetensors`] for the parameters whose names pass `part`.
     pub fn load_part(
         config: &ModelConfig,
         part: impl Fn(&str) -> bool,
@@ -86,10 +86,10 @@ impl Parameters {
         Ok(Self(vars))
     }
 
-    /// The parameters whose name passes `filter`, as a safetensors file. Equal parameters give equal bytes.
+    /// Serialises the parameters whose names pass `filter` as a safetensors file. Equal parameters give equal bytes.
     ///
     /// # Errors
-    /// A parameter that is not finite, which no reader would take; a failure to read a variable or to serialise.
+    /// A parameter that is not finite, because every reader rejects it; a failure to read a variable or to serialise.
     pub fn to_safetensors(&self, filter: impl Fn(&str) -> bool) -> Result<Vec<u8>> {
         self.to_safetensors_as(StoredAs::F32, filter)
     }
@@ -97,7 +97,7 @@ impl Parameters {
     /// [`Parameters::to_safetensors`] with scalars of another type.
     ///
     /// # Errors
-    /// As there, and a parameter that is too large for the type.
+    /// As [`Parameters::to_safetensors`], or a parameter that is too large for the type.
     pub fn to_safetensors_as(
         &self,
         stored: StoredAs,
@@ -106,8 +106,8 @@ impl Parameters {
         self.serialized(stored, filter, None)
     }
 
-    /// All parameters as a safetensors file whose metadata has `value` under `key`: for readers that know nothing else of the
-    /// network. One entry, as more would be written in an order of their own each time.
+    /// Serialises all parameters as a safetensors file with the metadata entry `key`: `value`, for readers that
+    /// know only the file. There is one entry, because several would be written in a random order each time.
     pub fn to_described_safetensors(
         &self,
         stored: StoredAs,
@@ -147,22 +147,22 @@ impl Parameters {
         Ok(safetensors::serialize(views, metadata)?)
     }
 
-    /// The parameter of this name, for example `torso.conv1.weight`.
+    /// Returns the parameter of this name, for example `torso.conv1.weight`.
     pub fn get(&self, name: &str) -> Option<&Var> {
         self.0.get(name)
     }
 
-    /// All parameters in the order of their names.
+    /// Iterates over all parameters in the order of their names.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &Var)> {
         self.0.iter().map(|(name, var)| (name.as_str(), var))
     }
 
-    /// A deep copy without the DIM heads: what [`ModelConfig::without_dim`] describes, for a target network.
+    /// Returns a deep copy without DIM heads and loss layers, as [`ModelConfig::without_dim`] describes, for a target network.
     pub fn without_dim(&self) -> Result<Self> {
         self.copy_part(|name| !is_dim(name))
     }
 
-    /// A deep copy, which shares nothing with this one, of the parameters whose names pass `part`.
+    /// Returns a deep copy, which shares no storage, of the parameters whose names pass `part`.
     pub fn copy_part(&self, part: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
         for (name, var) in self.iter().filter(|(name, _)| part(name)) {
@@ -174,7 +174,7 @@ impl Parameters {
         Ok(Self(vars))
     }
 
-    /// The variable `layer.part` as a tensor that shares its storage and its gradient.
+    /// Returns the variable `layer.part` as a tensor that shares its storage and gradient.
     pub(crate) fn tensor(&self, layer: &str, part: &str) -> Result<Tensor> {
         let name = format!("{layer}.{part}");
         let var = self
@@ -187,13 +187,13 @@ impl Parameters {
 /// A tensor's shape and its values, row-major.
 type Shaped = (Vec<usize>, Vec<f32>);
 
-/// Whether a parameter belongs to the DIM heads or a loss's own layers.
+/// Whether the parameter belongs to a DIM head or a loss layer.
 pub fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }
 
-/// Shapes and values of this configuration's parameters that pass `part`, from a safetensors file; names that pass `ignore`
-/// may be there too.
+/// Decodes the shapes and values of the parameters of `config` that pass `part` from a safetensors file. The
+/// file may also hold names that pass `ignore`.
 pub(crate) fn decode(
     config: &ModelConfig,
     part: impl Fn(&str) -> bool,

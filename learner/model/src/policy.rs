@@ -1,8 +1,8 @@
 //! The network as an actor uses it: frames to expected returns and greedy actions, without a graph.
 //! It does not explore, and it holds no DIM head.
 //!
-//! It runs the same kernels as `Network`. The batch is split over the rayon pool once, not layer by layer, so that a
-//! task's maps stay in its core's cache.
+//! This module runs the same kernels as `Network`. It splits the batch over the rayon pool once, not layer by
+//! layer, so that a task's maps stay in its core's cache.
 
 use std::{convert::Infallible, fmt};
 
@@ -20,7 +20,7 @@ use crate::kernels::precision::Precision;
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
 
-/// Frames that go through the network together on one thread.
+/// Frames that one thread passes through the network together.
 const TILE_FRAMES: usize = 32;
 
 /// Torso and C51 head for inference.
@@ -33,8 +33,8 @@ pub struct PolicyNetwork {
 }
 
 impl PolicyNetwork {
-    /// The network of `config` with the weights of a safetensors file; DIM parameters in it are ignored. Its products are
-    /// computed in `precision`.
+    /// Builds the network of `config` from the bytes of a safetensors file, ignoring DIM parameters.
+    /// `precision` is the precision of its matrix products.
     ///
     /// # Errors
     /// An invalid configuration, bytes that are not safetensors, or a parameter that is missing, unknown, of another type
@@ -57,8 +57,8 @@ impl PolicyNetwork {
         Ok(())
     }
 
-    /// Draws new noise for the head's noisy layers and computes with it until the next draw, or until other weights come, from when on
-    /// their means serve, as they do at first. Nothing is drawn where no layer is noisy.
+    /// Draws new noise for the head's noisy layers and uses it until the next draw or [`load`](Self::load). Before
+    /// the first draw, and after a load, the layers use their means. Draws nothing if no layer is noisy.
     pub fn draw_noise(&mut self, rng: &mut ChaCha8Rng) {
         let noise = HeadNoise::draw(&self.config, rng);
         if noise.is_some() {
@@ -66,7 +66,7 @@ impl PolicyNetwork {
         }
     }
 
-    /// Computes with this noise of the head's noisy layers from now on, or with their means.
+    /// Uses this noise in the head's noisy layers from now on. `None` means the layers' means.
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         let weights = &mut self.weights;
         if let Some(noisy) = &weights.noisy {
@@ -74,7 +74,7 @@ impl PolicyNetwork {
         }
     }
 
-    /// Expected returns `values` [B, A] of `frames` [B, H, W, C].
+    /// Computes the expected returns `values` [B, A] of `frames` [B, H, W, C].
     ///
     /// # Errors
     /// [`ModelError::Input`] if the lengths do not match; [`ModelError::NotFinite`] if a value is not finite.
@@ -115,8 +115,7 @@ impl PolicyNetwork {
         }
     }
 
-    /// Writes the action of largest expected return, the lowest on a tie, for each of `frames` [B, H, W, C] to
-    /// `actions` [B].
+    /// Writes the greedy action of each frame in `frames` [B, H, W, C] to `actions` [B]. On a tie the lowest action wins.
     pub fn greedy_actions(&mut self, frames: &[u8], actions: &mut [u8]) -> Result<()> {
         let count = self.config.num_actions;
         let mut values = std::mem::take(&mut self.values);
@@ -140,7 +139,7 @@ impl fmt::Debug for PolicyNetwork {
     }
 }
 
-/// The action of largest value, the lowest on a tie, of `values` [A] as a valid configuration has them.
+/// Returns the action of the largest of `values` [A]. On a tie the lowest action wins.
 ///
 /// # Panics
 /// If an action beyond 255 is best.
@@ -150,16 +149,16 @@ pub fn greedy(values: &[f32]) -> u8 {
     u8::try_from(best).expect("a valid configuration has at most 255 actions")
 }
 
-/// Weights for the fastest instruction set of this processor.
+/// Weights laid out for the fastest instruction set of this processor.
 struct Weights {
     torso: Box<dyn ActingTorso>,
     head: Box<dyn ActiveLayer>,
-    /// What `head` is made of, with every noise anew; there if it is noisy.
+    /// The layers that `head` is merged from, kept to merge them with new noise. `Some` if the head is noisy.
     noisy: Option<Vec<HeadLayer<Vec<f32>>>>,
 }
 
 impl Weights {
-    /// Those in a safetensors file.
+    /// Decodes the weights in the bytes of a safetensors file.
     fn decode(config: &ModelConfig, safetensors: &[u8], precision: Precision) -> Result<Self> {
         let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
         let mut take = |layer: &str, part: &str| {

@@ -1,5 +1,5 @@
-//! The scalars of a weights file: f32, or half of it for weights that travel often.
-//! It knows no parameter by name.
+//! The scalar types of a weights file: f32, or 2-byte types for weights that are sent often.
+//! This module knows no parameter by name.
 
 use std::fmt;
 
@@ -7,21 +7,21 @@ use half::{bf16, f16};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
-/// What the scalars of a weights file are stored as. Rounding is to nearest, ties to even.
+/// The type of the scalars in a weights file. Rounding is to nearest, ties to even.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StoredAs {
-    /// As they are, 4 bytes each.
+    /// f32, unchanged, 4 bytes each.
     #[default]
     F32,
-    /// 11 bits of significand, up to 65,504, 2 bytes each.
+    /// IEEE half precision: 11 bits of significand, up to 65,504, 2 bytes each.
     F16,
-    /// 8 bits of significand, up to 3.4e38, 2 bytes each.
+    /// bfloat16: 8 bits of significand, up to 3.4e38, 2 bytes each.
     Bf16,
 }
 
 impl fmt::Display for StoredAs {
-    /// As settings have it.
+    /// Writes the name that settings use.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::F32 => "f32",
@@ -32,7 +32,7 @@ impl fmt::Display for StoredAs {
 }
 
 impl StoredAs {
-    /// Largest error of a stored scalar, as a share of it, or of the least normal number of the type if that is larger.
+    /// Largest error of a stored scalar, relative to the scalar or to [`StoredAs::least_normal`], whichever is larger.
     pub const fn error(self) -> f64 {
         match self {
             Self::F32 => 0.0,
@@ -42,7 +42,7 @@ impl StoredAs {
         }
     }
 
-    /// The least number that keeps all of its digits. Below it there are steps of a fixed size: twice [`StoredAs::error`] of it.
+    /// The smallest normal number. Smaller numbers have a fixed spacing: 2 * [`StoredAs::error`] * `least_normal`.
     pub const fn least_normal(self) -> f32 {
         match self {
             Self::F32 | Self::Bf16 => f32::MIN_POSITIVE,
@@ -51,7 +51,7 @@ impl StoredAs {
         }
     }
 
-    /// The largest number; one that is larger is refused, though it might round to it.
+    /// The largest number. A larger one is rejected, even if it would round to this one.
     pub const fn largest(self) -> f32 {
         match self {
             Self::F32 => f32::MAX,
@@ -78,7 +78,7 @@ impl StoredAs {
         }
     }
 
-    /// Little-endian bytes of `values`; the index of the first that is too large for the type, which would be infinite.
+    /// Encodes `values` as little-endian bytes. Returns the index of the first value that is too large for the type.
     pub(crate) fn encode(self, values: &[f32]) -> Result<Vec<u8>, usize> {
         let largest = self.largest();
         if let Some(at) = values.iter().position(|value| value.abs() > largest) {
@@ -101,7 +101,7 @@ impl StoredAs {
     }
 }
 
-/// The scalars of a tensor of this type; `None` if it is none of [`StoredAs`].
+/// Decodes the scalars of a tensor; `None` if `dtype` is not one of [`StoredAs`].
 pub(crate) fn decode(dtype: Dtype, bytes: &[u8]) -> Option<Vec<f32>> {
     let halves = |value: fn([u8; 2]) -> f32| {
         let (halves, _) = bytes.as_chunks::<2>();
@@ -123,7 +123,7 @@ pub(crate) fn decode(dtype: Dtype, bytes: &[u8]) -> Option<Vec<f32>> {
 mod tests {
     use super::*;
 
-    /// What is read back is the nearest number, as the table of properties of `driml experiment stability` says of all of them.
+    /// Decoded values are the nearest numbers; the property table of `driml experiment stability` covers that for all types.
     #[test]
     fn the_limits_are_the_types_own() {
         assert_eq!(StoredAs::F16.largest(), f16::MAX.to_f32());

@@ -1,11 +1,11 @@
 //! The alphabet of A: which raw actions count as one visible action.
-//! It does not know games; the tables come from presets.
+//! It knows no games; presets give the tables.
 
 use serde::{Deserialize, Serialize};
 
 use super::arrays::AffinityError;
 
-/// A map from raw to visible actions, and the visible ones numbered without gaps.
+/// A map from raw actions to visible actions, which are numbered without gaps.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Alphabet {
     /// Dense index of each raw action's visible action [n], below `len`.
@@ -14,10 +14,10 @@ pub struct Alphabet {
 }
 
 impl Alphabet {
-    /// The alphabet of a table raw -> visible.
+    /// Creates the alphabet from a table raw action -> visible action.
     ///
     /// # Errors
-    /// A table that is empty, longer than 255, or maps to an action that does not stand for itself.
+    /// A table that is empty, longer than 255, or maps to an action that does not map to itself.
     pub fn new(map: &[u8]) -> Result<Self, AffinityError> {
         let count = map.len();
         if !(1..=255).contains(&count) {
@@ -33,7 +33,7 @@ impl Alphabet {
         let mut visible = map.to_vec();
         visible.sort_unstable();
         visible.dedup();
-        // At most 255 of them, so an index fits a byte.
+        // There are at most 255 visible actions, so an index fits a byte.
         let index = |v: &u8| visible.partition_point(|known| known < v) as u8;
         Ok(Self {
             index: map.iter().map(index).collect(),
@@ -41,10 +41,10 @@ impl Alphabet {
         })
     }
 
-    /// The alphabet in which each of `num_actions` actions stands for itself.
+    /// Creates the alphabet in which each of `num_actions` actions is visible.
     ///
     /// # Errors
-    /// None or more than 255 actions.
+    /// No actions, or more than 255.
     pub fn raw(num_actions: usize) -> Result<Self, AffinityError> {
         let map = (0..num_actions.min(256)).map(|action| action as u8);
         Self::new(&map.collect::<Vec<_>>())
@@ -61,7 +61,7 @@ impl Alphabet {
         self.index.len()
     }
 
-    /// Checks what holds of every alphabet that [`Alphabet::new`] makes; a saved one may be anything.
+    /// Checks the invariants of [`Alphabet::new`]. An alphabet that was read from a file may violate them.
     pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
         let mut used = self.index.clone();
         used.sort_unstable();
@@ -76,7 +76,7 @@ impl Alphabet {
         )))
     }
 
-    /// Pairs of raw actions as pairs of dense indices.
+    /// Maps pairs of raw actions to pairs of dense indices.
     pub(super) fn map_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
         let index = |action: u8| {
             let index = self.index.get(usize::from(action)).copied();
@@ -87,7 +87,7 @@ impl Alphabet {
         pairs.map(|&(i, j)| Ok((index(i)?, index(j)?))).collect()
     }
 
-    /// A matrix [m, m] by dense indices as one [n, n] by raw actions.
+    /// Expands a matrix [m, m] by dense indices to one [n, n] by raw actions.
     pub(super) fn expand(&self, matrix: &[f64]) -> Vec<f32> {
         let entry = |&i: &u8, &j: &u8| matrix[usize::from(i) * self.len + usize::from(j)] as f32;
         let row = |i| self.index.iter().map(move |j| entry(i, j));

@@ -1,4 +1,4 @@
-//! Checks of settings and saved arrays that both estimates have.
+//! Checks of settings and saved arrays that both estimators use.
 
 use std::ops::RangeInclusive;
 
@@ -16,7 +16,7 @@ pub(super) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(
     why.map_or(Ok(()), |why| Err(AffinityError(why)))
 }
 
-/// Checks the length of an array by name, and that its numbers are finite.
+/// Checks the length of an array, and that its numbers are finite. Errors contain `name`.
 pub(super) fn check_array(name: &str, array: &[f64], len: usize) -> Result<(), AffinityError> {
     if array.len() != len {
         let found = array.len();
@@ -30,7 +30,7 @@ pub(super) fn check_array(name: &str, array: &[f64], len: usize) -> Result<(), A
     }
 }
 
-/// [`check_array`], and that every number is a probability.
+/// Like [`check_array`], and checks that every number is a probability.
 pub(super) fn check_probabilities(
     name: &str,
     array: &[f64],

@@ -1,5 +1,5 @@
 //! Affinity in closed form, from exponentially decayed counts of action pairs.
-//! It trains nothing; it is what the learned estimate must converge to, where pairs were seen often as where they never were.
+//! It trains nothing. The learned estimate must converge to this one, both for frequent pairs and for pairs that were never seen.
 
 use std::ops::RangeInclusive;
 
@@ -16,16 +16,16 @@ use super::{
 pub struct ExactSettings {
     /// Factor on all counts at each update, 1e-300 to 1.
     pub decay: f64,
-    /// Pairs added to each pair's count and to the count that it would have if actions did not depend on each other, from 1e-100
-    /// to 1e100: how much evidence a ratio other than 1 takes.
+    /// Number of pairs added to each pair's count and to its expected count for independent actions, from 1e-100 to 1e100. A larger
+    /// value demands more evidence for a ratio other than 1.
     pub smoothing: f64,
 }
 
-/// Largest error of an entry of A, as a share of it: an f32's last place, while the counts stay below 1e300. Rows sum to 1 within
-/// 1e-6.
+/// Largest relative error of an entry of A, while the counts stay below 1e300: half a unit in the last place of an f32. Rows sum to 1
+/// within 1e-6.
 pub const ENTRY_ERROR: f64 = 6.1e-8;
 
-/// Bounds of the smoothing, far within f64's, so that ratios of counts are finite and above 0.
+/// Range of the smoothing, far inside the range of f64, so that ratios of counts are finite and above 0.
 const SMOOTHING: RangeInclusive<f64> = 1e-100..=1e100;
 
 /// Decayed pair counts c and A = row softmax of `ln p(j | i) / p(j)`.
@@ -33,7 +33,7 @@ const SMOOTHING: RangeInclusive<f64> = 1e-100..=1e100;
 pub struct ExactAffinity {
     pub(super) alphabet: Alphabet,
     pub(super) settings: ExactSettings,
-    /// [m, m] by dense visible indices.
+    /// Decayed counts [m, m] by dense index.
     counts: Vec<f64>,
 }
 
@@ -47,7 +47,7 @@ impl ExactSettings {
 }
 
 impl ExactAffinity {
-    /// No counts yet: A is uniform over the alphabet.
+    /// Creates an estimate without counts: A is uniform over the alphabet.
     ///
     /// # Errors
     /// A setting out of its range.
@@ -91,11 +91,11 @@ impl ExactAffinity {
         Ok(())
     }
 
-    /// With the counts e_ij = sum_j c_ij * sum_i c_ij / sum c that independent actions would have, and smoothing s:
-    /// A_ij = q_ij / sum_j q_ij with q_ij = (c_ij + s) / (e_ij + s), the softmax of ln q.
+    /// Computes A_ij = q_ij / sum_j q_ij, the row softmax of ln q, with q_ij = (c_ij + s) / (e_ij + s) and smoothing s. The count that
+    /// independent actions would have is e_ij = sum_j c_ij * sum_i c_ij / sum c.
     ///
-    /// q is p(j | i) / p(j) where a pair was seen often, and 1 where nothing is known: in the row or column of an action that was
-    /// never taken, and for the only action that ever was. Adding s to c alone would bias the ratio there.
+    /// q is p(j | i) / p(j) for frequent pairs, and 1 if nothing is known: in the row or column of an action that was never taken, and if
+    /// only one action was ever taken. Adding s to c alone would bias the ratio there.
     /// Source of the form: DuMouchel 1999, the shrinking of a ratio of counts towards 1.
     fn ratios(&self) -> Vec<f64> {
         let m = self.alphabet.len();
@@ -106,7 +106,7 @@ impl ExactAffinity {
         let total: f64 = rows.iter().sum();
         let smoothing = self.settings.smoothing;
         let ratio = |at: usize| {
-            // A share first: the product of two counts could leave the finite numbers.
+            // The division comes first: the product of two counts could overflow.
             let share = if total > 0.0 {
                 rows[at / m] / total
             } else {
@@ -132,14 +132,14 @@ mod tests {
         ExactAffinity::new(Alphabet::raw(15).unwrap(), EXACT).unwrap()
     }
 
-    /// What the learned estimate comes to as well: pairs that were never seen say nothing about how one action follows another.
+    /// The same holds for the learned estimate: pairs that were never seen say nothing about how one action follows another.
     #[test]
     fn actions_that_tell_nothing_leave_a_uniform() {
         let uniform = |row: &[f32]| row.iter().all(|a| (a * 15.0 - 1.0).abs() < 1e-4);
         let (mut always_1, mut odd_ones) = (of_15(), of_15());
         for _ in 0..100 {
             always_1.observe(&[(1, 1); 64]).unwrap();
-            // Independent of each other; the even ones never.
+            // Actions 1 and 3 are independent of each other; the even actions never occur.
             odd_ones
                 .observe(&[(1, 1), (1, 3), (3, 1), (3, 3)].repeat(64))
                 .unwrap();

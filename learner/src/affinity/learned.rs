@@ -1,5 +1,5 @@
 //! Affinity as the paper learns it: a small network on action pairs, trained with the Jensen-Shannon bound.
-//! It has no tensors: there are at most 255^2 distinct inputs, so loops over the pairs' counts are all it takes.
+//! It uses no tensors: with at most 255^2 distinct inputs, loops over the pairs are enough.
 
 use rand::{Rng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -16,19 +16,19 @@ use super::{
 pub struct LearnedSettings {
     /// Hidden units, 1 to 4,096.
     pub hidden: usize,
-    /// Adam's learning rate, from 1e-30 to 1e38: with it parameters and their products are finite in f64 for as long as a run lasts.
+    /// Adam's learning rate, from 1e-30 to 1e38: in this range, parameters and their products stay finite in f64 for the length of a run.
     pub lr: f64,
     /// Adam's decay of the first moment, 0 to 0.999999.
     pub beta1: f64,
     /// Adam's decay of the second moment, 0 to 0.999999.
     pub beta2: f64,
-    /// Adam's addend outside the root, from 1e-30 to 1e30.
+    /// Adam's epsilon, added outside the root, from 1e-30 to 1e30.
     pub eps: f64,
     /// Share of the old A that each update keeps, 0 to 0.999999: A <- keep * A + (1 - keep) * row softmax of q.
     pub keep: f64,
 }
 
-/// q(i, j) = out . relu(w_from[i] + w_to[j] + b) + c on one-hot pairs, its Adam, and the smoothed A.
+/// The network q(i, j) = out . relu(w_from[i] + w_to[j] + b) + c on one-hot pairs, its Adam state, and the smoothed A.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LearnedAffinity {
     pub(super) alphabet: Alphabet,
@@ -38,11 +38,11 @@ pub struct LearnedAffinity {
     first_moments: Vec<f64>,
     second_moments: Vec<f64>,
     updates: u64,
-    /// [m, m] by dense visible indices.
+    /// Smoothed A [m, m] by dense index.
     smoothed: Vec<f64>,
 }
 
-/// Most hidden units; settings beyond it are refused.
+/// Largest number of hidden units; larger settings are rejected.
 const HIDDEN_MAX: f64 = 4096.0;
 
 impl LearnedSettings {
@@ -68,7 +68,7 @@ impl LearnedSettings {
 }
 
 impl LearnedAffinity {
-    /// A network drawn from `rng` with q = 0 everywhere: A is uniform over the alphabet.
+    /// Creates a network with weights drawn from `rng` and q = 0 everywhere, so that A is uniform over the alphabet.
     ///
     /// # Errors
     /// A setting out of its range.
@@ -81,7 +81,7 @@ impl LearnedAffinity {
         let hidden = settings.hidden;
         let m = alphabet.len();
         let mut parameters = vec![0.0; parameter_count(m, hidden)];
-        // The first layer as PyTorch draws it, U(+-1/sqrt(inputs)); the last one stays 0, so that q starts at 0.
+        // The first layer is drawn as in PyTorch, U(+-1/sqrt(inputs)). The last layer stays 0, so that q starts at 0.
         let bound = 1.0 / ((2 * m) as f64).sqrt();
         for p in &mut parameters[..(2 * m + 1) * hidden] {
             *p = rng.random_range(-bound..bound);
@@ -119,8 +119,8 @@ impl LearnedAffinity {
         self.alphabet.expand(&self.smoothed)
     }
 
-    /// One Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
-    /// `ln p(i, j) / (p(i) p(j))`. Joint: the batch's pairs. Marginal: their second halves shuffled by `rng`.
+    /// Takes one Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
+    /// `ln p(i, j) / (p(i) p(j))`. The joint pairs are the batch's; the marginal pairs have their second actions shuffled by `rng`.
     /// Then A moves towards the new row softmax. Source: Mazoure et al. 2020, section 4; Hjelm et al. 2019, equation 4.
     pub(super) fn observe(
         &mut self,
@@ -154,7 +154,7 @@ impl LearnedAffinity {
         Ok(())
     }
 
-    /// Offsets of w_to, b, out and c.
+    /// Offsets of w_to, b, out and c in `parameters`.
     const fn offsets(&self) -> [usize; 4] {
         let (m, hidden) = (self.alphabet.len(), self.settings.hidden);
         [
@@ -184,7 +184,7 @@ impl LearnedAffinity {
         (0..m * m).map(|at| q(at / m, at % m)).collect()
     }
 
-    /// Derivative by the parameters, given that by q.
+    /// Derivative of the loss by the parameters, given its derivative by q.
     fn gradient(&self, by_q: &[f64]) -> Vec<f64> {
         let (m, hidden, [to, b, out, c]) =
             (self.alphabet.len(), self.settings.hidden, self.offsets());
@@ -226,7 +226,7 @@ impl LearnedAffinity {
     }
 }
 
-/// Parameters of the network over m visible actions.
+/// The number of parameters of the network over m visible actions.
 const fn parameter_count(m: usize, hidden: usize) -> usize {
     (2 * m + 2) * hidden + 1
 }
@@ -286,7 +286,7 @@ mod tests {
         }
     }
 
-    /// By 2^24 updates 0.999^t is 0 beside 1, and bias corrections are 1 from there on.
+    /// After 2^24 updates, 0.999^t vanishes beside 1, so that bias corrections stay 1.
     #[test]
     fn updates_beyond_32_bits_are_counted() {
         let after = |updates| {

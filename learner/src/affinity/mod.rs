@@ -1,4 +1,4 @@
-//! Action affinity: how likely action j follows action i, against how likely j is at all, as a matrix A for the sampler.
+//! Action affinity: how likely action j is after action i, compared with how likely j is overall, as a matrix A for the sampler.
 //! It does not draw k (the replay server does) and does not send A.
 
 pub mod alphabet;
@@ -14,22 +14,22 @@ pub use arrays::AffinityError;
 pub use exact::{ExactAffinity, ExactSettings};
 pub use learned::{LearnedAffinity, LearnedSettings};
 
-/// A way to estimate A from the pairs (a_t, a_{t+1}) of the learner's batches; its whole state can be saved.
+/// An estimator of A from the pairs (a_t, a_{t+1}) of the learner's batches, with all of its state, which checkpoints save.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "estimator", rename_all = "kebab-case")]
 pub enum AffinityEstimator {
-    /// The paper's: a small network trained with the Jensen-Shannon bound.
+    /// The paper's estimator: a small network trained with the Jensen-Shannon bound.
     Learned(LearnedAffinity),
-    /// Closed form from decayed pair counts.
+    /// A closed form from decayed pair counts.
     Exact(ExactAffinity),
 }
 
 impl AffinityEstimator {
-    /// Learns from one batch's pairs of raw actions, none of which crosses an episode's end. No pairs: no change.
+    /// Learns from one batch's pairs of raw actions, none of which crosses the end of an episode. Without pairs, nothing changes.
     ///
     /// # Errors
-    /// An action that the alphabet does not have: nothing has then changed. Numbers that are no longer finite: the estimate is
-    /// then good for nothing.
+    /// An action that the alphabet does not have: nothing has then changed. Numbers that are no longer finite: the estimate is then
+    /// unusable.
     pub fn observe(
         &mut self,
         pairs: &[(u8, u8)],
@@ -42,7 +42,7 @@ impl AffinityEstimator {
         self.check_valid()
     }
 
-    /// Checks what holds of every estimate that came from [`AffinityEstimator::observe`]; a saved one may be anything.
+    /// Checks the invariants that [`AffinityEstimator::observe`] keeps. An estimate that was read from a file may violate them.
     ///
     /// # Errors
     /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
@@ -54,8 +54,8 @@ impl AffinityEstimator {
         }
     }
 
-    /// A by raw actions [n, n], `matrix[i * n + j] = A[visible(i), visible(j)]`: looked up without the alphabet.
-    /// Over one representative of each visible action a row sums to 1.
+    /// A by raw actions [n, n], `matrix[i * n + j] = A[visible(i), visible(j)]`, so that a reader does not need the alphabet.
+    /// A row sums to 1 over one representative of each visible action.
     pub fn matrix(&self) -> Vec<f32> {
         match self {
             Self::Learned(learned) => learned.matrix(),
@@ -63,7 +63,7 @@ impl AffinityEstimator {
         }
     }
 
-    /// In which way it estimates, and over which actions, however far it has come.
+    /// The alphabet and the settings of the estimator, without its state.
     pub(crate) fn settings(&self) -> (&Alphabet, Option<LearnedSettings>, Option<ExactSettings>) {
         match self {
             Self::Learned(learned) => (&learned.alphabet, Some(learned.settings), None),
@@ -71,7 +71,7 @@ impl AffinityEstimator {
         }
     }
 
-    /// Raw actions n, the side of the matrix.
+    /// The number of raw actions n, the side of the matrix.
     pub fn num_actions(&self) -> usize {
         self.settings().0.num_actions()
     }
@@ -83,7 +83,7 @@ mod tests {
 
     use super::*;
 
-    /// The preset's numbers (`deploy/settings/presets/agent/driml-ada.toml`) on a source as skewed as a game's.
+    /// The settings of the preset `deploy/settings/presets/agent/driml-ada.toml`.
     pub(super) const PRESET: LearnedSettings = LearnedSettings {
         hidden: 32,
         lr: 2e-3,
@@ -99,8 +99,8 @@ mod tests {
     const ACTIONS: usize = 15;
     const K_MAX: usize = 5;
 
-    /// A source that repeats its action with probability 0.3, and else draws action j with a probability in proportion to
-    /// 0.7^j: from the one of them to the 15th a factor of 150.
+    /// A source of actions as skewed as a game's. It repeats its action with probability 0.3, and otherwise draws action j with a
+    /// probability proportional to 0.7^j, which differs by a factor of 150 between the first and the 15th action.
     struct Skewed {
         marginal: Vec<f64>,
     }
@@ -121,7 +121,7 @@ mod tests {
             repeats + (1.0 - Self::REPEATS) * self.marginal[to]
         }
 
-        /// A of the source itself: each row of p(j | i) / p(j), over its sum.
+        /// A of the source itself: each row of p(j | i) / p(j), divided by its sum.
         fn matrix(&self) -> Vec<f32> {
             let mut matrix = Vec::new();
             for from in 0..ACTIONS {
@@ -141,7 +141,7 @@ mod tests {
             drawn.unwrap_or(ACTIONS - 1)
         }
 
-        /// Pairs as a batch has them, each from another place in the replay.
+        /// Pairs as in a batch, each from another position in the replay.
         fn pairs(&self, count: usize, rng: &mut ChaCha8Rng) -> Vec<(u8, u8)> {
             let mut pair = || {
                 let from = self.draw(rng);
@@ -152,7 +152,7 @@ mod tests {
             (0..count).map(|_| pair()).collect()
         }
 
-        /// P(k > i) for i = 1, .., K_MAX - 1 with this A, over the source's own sequences of actions.
+        /// P(k > i) for i = 1, .., K_MAX - 1 if k follows `matrix`, over the source's sequences of actions.
         fn beyond(&self, matrix: &[f32]) -> Vec<f64> {
             let mut alive = self.marginal.clone();
             let step = |alive: &[f64], to: usize| -> f64 {
@@ -170,7 +170,7 @@ mod tests {
         }
     }
 
-    /// Total variation between the laws of k of which these are the tails.
+    /// Total variation distance between two distributions of k, given their tails.
     fn distance(a: &[f64], b: &[f64]) -> f64 {
         let law = |tails: &[f64]| -> Vec<f64> {
             let from = [&[1.0], tails].concat();
@@ -181,8 +181,8 @@ mod tests {
         each.map(|(a, b)| (a - b).abs()).sum::<f64>() / 2.0
     }
 
-    /// The learned estimate starts uniform, where k is hardly ever above 1, and is slow: what k does within the first 1,500
-    /// updates says nothing of the agent.
+    /// The learned estimate starts uniform, with k hardly ever above 1, and converges slowly: the values of k within the first 1,500
+    /// updates say nothing about the agent.
     #[test]
     fn with_the_preset_s_numbers_learned_and_exact_come_to_the_source_s_law_of_k() {
         let source = Skewed::new();

@@ -1,4 +1,4 @@
-//! CPC: one InfoNCE for each offset 1, .., P, on the heads that DIM has, which all offsets share.
+//! CPC: one InfoNCE for each offset 1, .., P, with DIM's heads, which all offsets share.
 //! It holds no parameters, and has no recurrent context: s_t, with its stack of frames, is the context.
 
 use std::ops::Range;
@@ -18,7 +18,7 @@ use crate::{
     losses::{info_nce::info_nce_loss, scores::Dots},
 };
 
-/// Its line of the menu.
+/// The menu item of CPC.
 pub const CPC: MenuItem = MenuItem {
     name: "cpc",
     positives: Positives::Several,
@@ -31,13 +31,13 @@ pub const CPC: MenuItem = MenuItem {
     },
 };
 
-/// What each pair's loss is reported as, in the order of `settings::PAIRS`.
+/// The name under which each pair's loss is reported, in the order of `settings::PAIRS`.
 const NAMES: [&str; 4] = ["cpc_3t3", "cpc_3t4", "cpc_4t3", "cpc_4t4"];
 
-/// The CPC loss's settings: those of the pairs of levels.
+/// The CPC loss's settings, which are DIM's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Cpc {
-    /// Weights of the pairs, and how dot products become scores.
+    /// Weights of the pairs, and the clip of their scores.
     pairs: Dim,
 }
 
@@ -50,14 +50,14 @@ impl AuxiliaryLoss for Cpc {
         Passes::of_pairs(self.pairs.lambda, positives, augmented)
     }
 
-    /// Those that exist, offset by offset: nothing is computed for the others.
+    /// The positives that exist, offset by offset; nothing is computed for missing ones.
     fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
         let states = batch.positive_states(state_bytes);
         states.into_iter().filter(Option::is_some).collect()
     }
 
-    /// For each pair with a weight above 0 the mean over the P offsets of the InfoNCE of the rows that have a positive there, 0
-    /// where fewer than two have. A mean, so that lambda weighs as much as DIM's.
+    /// Computes, for each pair with a weight above 0, the mean over the P offsets of the InfoNCE of the rows that have a positive there.
+    /// An offset with fewer than two such rows counts as 0. It is a mean so that a lambda weighs as much as in DIM.
     ///
     /// Source: van den Oord et al. 2018, section 2.3, with the heads of Mazoure et al. 2020 ("exactly the same networks
     /// for measuring similarity").
@@ -89,7 +89,7 @@ impl AuxiliaryLoss for Cpc {
 }
 
 impl Cpc {
-    /// Of each offset at which two rows or more have a positive, the dot products of those rows, pair by pair.
+    /// The dot products, by pair of levels, for each offset at which two rows or more have a positive; only these rows take part.
     fn dots_of_offsets(
         &self,
         inputs: &LossInputs<'_>,

@@ -1,8 +1,8 @@
 //! CURL: InfoNCE between two views of the same state, the second one encoded by a moving average of the network.
-//! It makes no view: `augment` does.
+//! It makes no views: `augment` does.
 //!
 //! The query is psi_4(f4) of the online network, the key psi_4(f4) of the key encoder. No gradient reaches the key. The key
-//! encoder is apart from C51's target network, which is the same for every agent and would move once in hundreds of updates.
+//! encoder is separate from C51's target network, which works alike for all agents and would move once in hundreds of updates.
 //! Source: Srinivas et al. 2020 and He et al. 2020 for the two views and the momentum encoder; Mazoure et al. 2020, appendix:
 //! "exactly the same networks for measuring similarity (i.e. one residual block for CURL and CPC)", hence no bilinear
 //! product and no second head.
@@ -22,7 +22,7 @@ use crate::{
     ranges::{TAU, check_range},
 };
 
-/// Its line of the menu.
+/// The menu item of CURL.
 pub const CURL: MenuItem = MenuItem {
     name: "curl",
     positives: Positives::OtherView,
@@ -30,12 +30,12 @@ pub const CURL: MenuItem = MenuItem {
     make,
 };
 
-/// Its own table, `[learner.update.curl]`.
+/// CURL's own table, `[learner.update.curl]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurlSettings {
-    /// Share of the online network in the key encoder's move after each update, from 1e-5 to 1; what f32 leaves of a small one
-    /// stands at `target_tau`.
+    /// Share of the online network in the key encoder's move after each update, from 1e-5 to 1. `target_tau` describes the limits of
+    /// f32 for small values.
     pub key_tau: f64,
 }
 
@@ -72,7 +72,7 @@ struct Curl {
 }
 
 impl AuxiliaryLoss for Curl {
-    /// One head, of which the key encoder has its copy.
+    /// One head, psi_4, of which the key encoder has a copy.
     fn heads(&self, _action: bool) -> DimHeads {
         DimHeads {
             psi4: true,
@@ -95,8 +95,8 @@ impl AuxiliaryLoss for Curl {
         }
     }
 
-    /// InfoNCE of the online network's vectors of one view with the key encoder's of the other. All rows take part: a state
-    /// needs no successor here.
+    /// Computes the InfoNCE of the online network's vectors of one view with the key encoder's vectors of the other view. All rows take
+    /// part, as no later state is needed.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let keys = inputs.keys()?;
         let anchors = &inputs.features.anchors;

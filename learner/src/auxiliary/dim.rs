@@ -1,5 +1,5 @@
 //! Deep InfoMax: InfoNCE between features of (s_t, a_t) and of s_{t+k}, for up to four pairs of levels.
-//! It holds no parameters (the model does) and does not mask beyond `positive_valid`.
+//! It holds no parameters (the model does) and masks rows only by `positive_valid`.
 
 use candle_core::Tensor;
 use driml_model::{DimHeads, Features, Kernels, Network};
@@ -16,7 +16,7 @@ use crate::{
     losses::{info_nce::info_nce_loss, scores::Dots},
 };
 
-/// Its line of the menu.
+/// The menu item of DIM.
 pub const DIM: MenuItem = MenuItem {
     name: "dim",
     positives: Positives::One,
@@ -28,7 +28,7 @@ pub const DIM: MenuItem = MenuItem {
     },
 };
 
-/// What each pair's loss is reported as, in the order of `settings::PAIRS`.
+/// The name under which each pair's loss is reported, in the order of `settings::PAIRS`.
 const NAMES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
 /// The DIM loss's settings.
@@ -41,7 +41,7 @@ pub struct Dim {
 }
 
 impl Dim {
-    /// The auxiliary loss of these settings.
+    /// Creates the loss from settings.
     pub const fn new(settings: &AuxiliarySettings<'_>) -> Self {
         Self {
             lambda: settings.lambda,
@@ -49,7 +49,7 @@ impl Dim {
         }
     }
 
-    /// Losses of the pairs with a weight above 0.
+    /// Computes the losses of the pairs with a weight above 0.
     ///
     /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
     /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `losses::info_nce`'s.
@@ -88,7 +88,7 @@ impl AuxiliaryLoss for Dim {
         Passes::of_pairs(self.lambda, positives, augmented)
     }
 
-    /// A row without a positive keeps its place, so that row meets row; what the blank state gives is masked.
+    /// A row without a positive keeps its place with a blank state, so that anchors and candidates stay aligned. Its results are masked.
     fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
         batch.positive_states(state_bytes)
     }
@@ -107,11 +107,11 @@ impl AuxiliaryLoss for Dim {
     }
 }
 
-/// What the heads make of anchors (psi) and candidates (phi), each of local features, [B, L, R], and of global ones, [B, R]; there
-/// if they are compared.
+/// The heads' vectors of anchors (psi) and candidates (phi), from local features [B, L, R] and from global features [B, R]; `None` if
+/// they are not compared.
 #[derive(Clone, Debug)]
 pub struct Vectors {
-    /// What multiplies them.
+    /// The kernels that multiply the vectors.
     pub kernels: Kernels,
     /// Psi_3 and Psi_4 of the anchors.
     pub psi: [Option<Tensor>; 2],
@@ -120,7 +120,7 @@ pub struct Vectors {
 }
 
 impl Vectors {
-    /// The vectors that the `wanted` pairs need, of heads that `network` has.
+    /// Computes the vectors that the `wanted` pairs need; `network` has their heads.
     pub fn new(
         network: &Network,
         features_t: &Features,
@@ -142,9 +142,9 @@ impl Vectors {
         })
     }
 
-    /// Dot products for the `wanted` pairs whose vectors are there, in the order of `settings::PAIRS`; as many anchors as candidates.
+    /// Dot products for the `wanted` pairs whose vectors exist, in the order of `settings::PAIRS`. Anchors and candidates are equally many.
     ///
-    /// Local features meet local ones at the same location; a global feature meets every location.
+    /// Local features are compared with local features of the same location, a global feature with every location.
     pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
         let mut dots = [const { None }; 4];
         for pair in (0..4).filter(|&pair| wanted[pair]) {
@@ -156,7 +156,7 @@ impl Vectors {
     }
 }
 
-/// Dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
+/// Computes the dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
 pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
     Ok(Dots {
         dots: kernels.dot_products(psi, phi)?,

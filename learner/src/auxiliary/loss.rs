@@ -1,4 +1,4 @@
-//! What every auxiliary loss is: the trait that a file of this folder implements, what it is given, and what it gives back.
+//! The interface of auxiliary losses: the trait that a file of this folder implements, its inputs and its results.
 //! It names no loss; the menu is in `super`.
 
 use std::{fmt, ops::Range};
@@ -21,58 +21,58 @@ use crate::{
 /// An item of the menu: what is known of a loss before its settings are read.
 #[derive(Debug)]
 pub struct MenuItem {
-    /// Its name, as `learner.update.auxiliary_loss` has it.
+    /// The loss's name, a value of `learner.update.auxiliary_loss`.
     pub name: &'static str,
-    /// What it compares s_t with.
+    /// What the loss compares s_t with.
     pub positives: Positives,
-    /// The names of all losses that it may report, as the columns of a run's metrics have them.
+    /// The names of all losses that may be reported, which are columns of a run's metrics.
     pub loss_names: &'static [&'static str],
-    /// Makes it from settings; refuses those that are at odds with each other.
+    /// Creates the loss from settings; rejects settings that contradict each other.
     pub make: fn(&AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError>,
 }
 
 /// What an agent learns beside the return.
 pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
-    /// Those of DIM's heads that the online network needs, if any; `action` says whether Psi is given a_t.
+    /// The heads of DIM that the online network needs, if any; `action` says whether Psi receives a_t.
     fn heads(&self, _action: bool) -> DimHeads {
         DimHeads::NONE
     }
 
-    /// Extra linear layers, which the online network builds and [`Network::loss_layer`] applies. `model` has the sizes of all
-    /// else: `hidden` is the width of f4.
+    /// Extra linear layers, which the online network builds and [`Network::loss_layer`] applies. `model` has all other sizes, such as
+    /// `hidden`, the width of f4.
     fn layers(&self, _model: &ModelConfig) -> Vec<LossLayer> {
         Vec::new()
     }
 
-    /// For a loss with a key encoder (a moving average of torso and Psi_4): the online network's share in its move after each
-    /// update, in (0, 1].
+    /// For a loss with a key encoder, which is a moving average of torso and Psi_4: the online network's share in the key encoder's move
+    /// after each update, in (0, 1].
     fn key_tau(&self) -> Option<f64> {
         None
     }
 
-    /// What an update costs beyond C51's, where a row has `positives` later states; as `cost` counts it.
+    /// The passes of an update beyond those of C51, if a row has `positives` later states; `cost` counts them.
     fn passes(&self, positives: usize, augmented: bool) -> Passes;
 
-    /// The later states, each of so many bytes, that the loss needs the online network's features of, if any. They pass through it
-    /// together with s_t, a blank one where there is none.
+    /// The later states, of `state_bytes` bytes each, whose online features the loss needs, if any. They pass through the network together
+    /// with s_t; `None` stands for a blank state.
     fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
         Vec::new()
     }
 
-    /// The losses of one batch, with their graphs.
+    /// Computes the losses of one batch, with their graphs.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError>;
 }
 
-/// What passes through parts of the networks beyond what C51 needs, for each row of a batch.
+/// The passes through parts of the networks beyond those of C51, per row of a batch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Passes {
     /// States beyond s_t through the torso, forward and backward.
     pub states: u64,
     /// States through the key encoder, torso and Psi_4, forward alone.
     pub keys: u64,
-    /// Vectors of every Psi that there is, forward and backward.
+    /// Vectors of each existing Psi, forward and backward.
     pub psi: u64,
-    /// Vectors of every Phi that there is, forward and backward.
+    /// Vectors of each existing Phi, forward and backward.
     pub phi: u64,
     /// Matrices of dot products [B, B] at each location of f3.
     pub local_scores: u64,
@@ -81,7 +81,7 @@ pub struct Passes {
 }
 
 impl Passes {
-    /// Those of InfoNCE between levels of (s_t, a_t) and of each of `positives` later states: each state forward and backward.
+    /// The passes of InfoNCE between levels of (s_t, a_t) and of each of `positives` later states; all states pass forward and backward.
     pub fn of_pairs(lambda: Lambda, positives: usize, augmented: bool) -> Self {
         let [local @ .., global] = lambda.wanted();
         let positives = positives as u64;
@@ -99,31 +99,31 @@ impl Passes {
 /// One loss of a batch.
 #[derive(Debug)]
 pub struct WeightedLoss {
-    /// One of [`MenuItem::losses`].
+    /// One of [`MenuItem::loss_names`].
     pub name: &'static str,
-    /// Its weight in the total.
+    /// The loss's weight in the total.
     pub weight: f64,
-    /// A scalar, before its weight.
+    /// The loss as a scalar, before its weight.
     pub loss: Tensor,
-    /// The dot products of which it is made, if it is an InfoNCE: the parity check looks whether their scores saturate.
+    /// The dot products of an InfoNCE loss, else empty. The parity check tests whether their scores saturate.
     pub dots: Vec<Dots>,
 }
 
-/// The online network's features of all states that an update needs with a graph, of one pass through it.
+/// The online network's features of all states that an update needs with a graph, from one pass through the network.
 ///
-/// One pass, as every pass packs the weights again and makes another gradient of each.
+/// A second pass would pack the weights again and make another gradient of each.
 #[derive(Debug)]
 pub struct OnlineFeatures {
-    /// Of s_t without augmentation.
+    /// Features of s_t without augmentation.
     pub now: Features,
-    /// Of s_t as the loss sees it: augmented, if the batch is.
+    /// Features of s_t as the loss sees it: augmented, if the batch is.
     pub anchors: Features,
-    /// Of the loss's [`AuxiliaryLoss::later_states`]; none if there are none.
+    /// Features of the loss's [`AuxiliaryLoss::later_states`]; `None` if it has none.
     pub later: Option<Features>,
 }
 
 impl OnlineFeatures {
-    /// Passes what `loss` needs of `batch` through `network`; augmented states count as distinct, as each is drawn separately.
+    /// Passes the states of `batch` that `loss` needs through `network`. It does not deduplicate augmented batches: each state has a draw.
     pub fn new(
         network: &Network,
         model: &ModelConfig,
@@ -157,25 +157,25 @@ impl OnlineFeatures {
     }
 }
 
-/// What a loss may look at.
+/// The inputs of an auxiliary loss.
 pub struct LossInputs<'a> {
     /// The network that learns.
     pub online: &'a Network,
     /// Sizes of the online network.
     pub model: &'a ModelConfig,
-    /// The rows that are learned from, checked.
+    /// The batch to learn from, already checked.
     pub batch: &'a Batch<'a>,
     /// The online network's features of the batch's states.
     pub features: &'a OnlineFeatures,
     /// The key encoder of a loss with a [`AuxiliaryLoss::key_tau`].
     pub key: Option<&'a Encoder>,
-    /// Where the states go.
+    /// The device of the networks, to which states are copied.
     pub device: &'a Device,
 }
 
 impl LossInputs<'_> {
-    /// The key encoder's vectors [P * B, embedding_dim] of the batch's positives, without a gradient; of a blank state where a row has
-    /// none.
+    /// Computes the key encoder's vectors [P * B, embedding_dim] of the batch's positives, without a gradient. A missing
+    /// positive is a blank state.
     ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
@@ -187,7 +187,7 @@ impl LossInputs<'_> {
         Ok(key.encode(&states(self.model, bytes, self.device)?)?)
     }
 
-    /// a_t [B], on the CPU, where the network looks at them.
+    /// a_t [B], on the CPU, where the network reads it.
     pub fn action(&self) -> Result<Tensor, UpdateError> {
         let action = self.batch.action;
         Ok(Tensor::from_slice(action, action.len(), &Device::Cpu)?)

@@ -1,8 +1,8 @@
 //! The menu of auxiliary losses: what an agent learns beside the return.
 //!
-//! Each loss is a file of this folder that implements [`AuxiliaryLoss`], and a line of [`MENU`]. Nothing
-//! outside this folder asks which loss it is: what the rest must know (heads, positives, names of what is reported) the
-//! loss defines itself. Your own program [`register`]s one without a change here.
+//! Each loss is a file of this folder that implements [`AuxiliaryLoss`], and a line of [`MENU`]. An update does not depend on which
+//! loss it computes: the loss itself defines its heads, its positives and the names under which it is reported. A program that uses
+//! this crate adds a loss with [`register`], without a change here.
 
 pub mod cpc;
 pub mod curl;
@@ -21,16 +21,16 @@ use settings::AuxiliarySettings;
 
 use crate::error::UpdateError;
 
-/// Every auxiliary loss; a new one gets its line here.
+/// All auxiliary losses of this crate; a new one adds a line here.
 pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
 
-/// Those that the program added.
+/// The losses that the program registered.
 static CUSTOM: OnceLock<Vec<&'static MenuItem>> = OnceLock::new();
 
-/// Adds losses to the menu, before anything else is done: `learner.update.auxiliary_loss` takes their names from then on.
+/// Adds losses to the menu; a program calls this first. `learner.update.auxiliary_loss` accepts their names from then on.
 ///
 /// # Panics
-/// If it was called before, or two losses of the menu would have the same name.
+/// If the function was called before, or two losses of the menu would have the same name.
 pub fn register(items: Vec<&'static MenuItem>) {
     for (at, MenuItem { name, .. }) in items.iter().enumerate() {
         let is_known = |known: &&MenuItem| known.name == *name;
@@ -43,14 +43,14 @@ pub fn register(items: Vec<&'static MenuItem>) {
     first.expect("a program registers its losses once");
 }
 
-/// The menu, with what the program added.
+/// All items: the menu and the registered losses.
 fn all() -> impl Iterator<Item = &'static MenuItem> {
     MENU.iter()
         .chain(CUSTOM.get().into_iter().flatten())
         .copied()
 }
 
-/// The auxiliary loss of an agent: an item of the [`MENU`] or one that was [`register`]ed, by its name in settings.
+/// The auxiliary loss of an agent, from the [`MENU`] or [`register`]ed. Settings refer to it by its name.
 #[derive(Clone, Copy, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "&'static str")]
 pub struct AuxiliaryKind(&'static MenuItem);
@@ -64,7 +64,7 @@ impl AuxiliaryKind {
         Self(item)
     }
 
-    /// Its name in settings, such as `dim`.
+    /// The loss's name in settings, such as `dim`.
     pub const fn name(self) -> &'static str {
         self.0.name
     }
@@ -79,7 +79,7 @@ impl AuxiliaryKind {
         self.0.loss_names
     }
 
-    /// Makes the loss from settings.
+    /// Creates the loss from settings.
     pub fn loss(
         self,
         settings: &AuxiliarySettings<'_>,

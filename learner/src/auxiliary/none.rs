@@ -7,7 +7,7 @@ use super::{
 };
 use crate::error::UpdateError;
 
-/// Its line of the menu.
+/// The menu item for no auxiliary loss.
 pub const NONE: MenuItem = MenuItem {
     name: "none",
     positives: Positives::None,

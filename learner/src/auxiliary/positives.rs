@@ -1,23 +1,23 @@
-//! What an auxiliary loss compares a state with: later states, as many as it can use, or another view of the state itself.
-//! How a batch, the replay's horizon and the augmentation must be follows from it.
+//! What an auxiliary loss compares a state with: none, one or several later states, or another view of the state itself.
+//! This decides what batches, the replay's horizon and the augmentation have to be.
 
 use std::ops::RangeInclusive;
 
 /// What an auxiliary loss compares s_t with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Positives {
-    /// Nothing: no state beyond those of C51 is looked at.
+    /// Nothing: the update uses no states beyond those of C51.
     None,
-    /// One later state a row, s_{t+k}.
+    /// One later state per row, s_{t+k}.
     One,
-    /// One or more later states a row.
+    /// One or more later states per row.
     Several,
     /// Another augmentation of s_t; no later state is served.
     OtherView,
 }
 
 impl Positives {
-    /// Later states a row that the replay server may serve.
+    /// The numbers of later states per row that the replay server may serve.
     pub const fn served(self) -> RangeInclusive<usize> {
         match self {
             Self::None | Self::OtherView => 0..=0,
@@ -35,7 +35,7 @@ impl Positives {
         }
     }
 
-    /// A `run.horizon` that serves as many, as settings have it.
+    /// A value of `run.horizon` that serves such a number, as TOML.
     pub const fn horizon(self) -> &'static str {
         match self {
             Self::None | Self::OtherView => r#"{rule="none"}"#,
@@ -44,7 +44,7 @@ impl Positives {
         }
     }
 
-    /// Whether a batch with `count` positives a row will do; `views` says whether it holds s_t as the loss sees it.
+    /// Whether a batch with `count` positives per row fits; `views` says whether the batch contains augmented s_t.
     pub const fn fit(self, count: usize, views: bool) -> bool {
         match self {
             Self::None => true,
@@ -54,7 +54,7 @@ impl Positives {
         }
     }
 
-    /// What [`Positives::fit`] asks of a batch, in words.
+    /// The requirement of [`Positives::fit`] in words.
     pub const fn describe_wanted(self) -> &'static str {
         match self {
             Self::None => "any number",

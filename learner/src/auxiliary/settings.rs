@@ -1,12 +1,12 @@
-//! What auxiliary losses take from the settings: weights, the scores' clip, and a table of each loss's own numbers.
-//! Which loss there is stands in `super`.
+//! The settings that auxiliary losses use: weights, the scores' clip, and a table of each loss's own settings.
+//! The menu of losses is in `super`.
 
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::error::UpdateError;
 
-/// The pairs NtM in the order of every array of four here: features N of (s_t, a_t) against features M of s_{t+k}.
+/// The pairs NtM, in the order of every array of four here: features N of (s_t, a_t) are compared with features M of s_{t+k}.
 pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
 
 /// Weight of each pair's loss in the total, 0 or above; a pair at 0 is not computed.
@@ -34,7 +34,7 @@ impl Lambda {
     /// No pair: every weight is 0.
     pub const NONE: Self = Self::of([0.0; 4]);
 
-    /// Weights in the order of [`PAIRS`].
+    /// Creates weights from values in the order of [`PAIRS`].
     pub const fn of([l3t3, l3t4, l4t3, l4t4]: [f64; 4]) -> Self {
         Self {
             l3t3,
@@ -44,7 +44,7 @@ impl Lambda {
         }
     }
 
-    /// In the order of [`PAIRS`].
+    /// The weights in the order of [`PAIRS`].
     pub const fn values(&self) -> [f64; 4] {
         [self.l3t3, self.l3t4, self.l4t3, self.l4t4]
     }
@@ -73,7 +73,7 @@ impl Lambda {
         }
     }
 
-    /// Checks that every weight is a number of 0 or above.
+    /// Checks that every weight is finite and not negative.
     pub fn validate(&self) -> Result<(), UpdateError> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
             if !(value >= 0.0 && value.is_finite()) {
@@ -84,23 +84,23 @@ impl Lambda {
     }
 }
 
-/// The settings from which a loss is made.
+/// The settings from which a loss is created.
 #[derive(Clone, Copy, Debug)]
 pub struct AuxiliarySettings<'a> {
     /// The loss's name in the menu.
     pub auxiliary_loss: &'static str,
     /// Weights of the losses between pairs of levels.
     pub lambda: Lambda,
-    /// Whether Psi is given a_t.
+    /// Whether Psi receives a_t.
     pub condition_on_action: bool,
     /// Bound c of the scores' soft clip `c * tanh(x / c)`.
     pub tanh_clip: f64,
-    /// Tables of losses' own numbers, by the loss's name: `[learner.update.<name>]`.
+    /// Tables of the losses' own settings, by the loss's name: `[learner.update.<name>]`.
     pub own: &'a toml::Table,
 }
 
 impl AuxiliarySettings<'_> {
-    /// The loss's own table; `None` if it is not there.
+    /// Reads the loss's own table; `None` if it is absent.
     pub fn own<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
         let Some(table) = self.own.get(self.auxiliary_loss) else {
             return Ok(None);
@@ -112,7 +112,7 @@ impl AuxiliarySettings<'_> {
         })
     }
 
-    /// Checks that a loss that has no numbers of its own is given none.
+    /// Rejects a table for a loss that has no own settings.
     pub fn check_no_own(&self) -> Result<(), UpdateError> {
         let name = self.auxiliary_loss;
         if !self.own.contains_key(name) {
@@ -123,7 +123,7 @@ impl AuxiliarySettings<'_> {
         )))
     }
 
-    /// Checks that a loss that is weighed by lambda has a weight.
+    /// Checks that at least one lambda is above 0, for a loss that lambda weights.
     pub fn check_weighted(&self) -> Result<(), UpdateError> {
         if self.lambda.wanted().contains(&true) {
             return Ok(());

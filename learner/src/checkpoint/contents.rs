@@ -16,18 +16,18 @@ use crate::{
 pub(super) const FORMAT: u32 = 4;
 pub(super) const ONLINE: &str = "online.safetensors";
 pub(super) const TARGET: &str = "target.safetensors";
-/// CURL's key encoder; there for that auxiliary loss alone.
+/// The key encoder; present only for an auxiliary loss that has one, as CURL does.
 pub(super) const KEY: &str = "key.safetensors";
-/// The averaged network; there if the settings ask for one.
+/// The averaged network; present only with `average_tau`.
 pub const AVERAGE: &str = "average.safetensors";
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
-/// The companion that the caller keeps with the checkpoint, if any.
+/// The caller's companion, if any.
 pub(super) const COMPANION: &str = "lockstep.bin";
 pub(super) const STATE: &str = "state.json";
-/// The SHA-256 of [`STATE`], which has those of the other files.
+/// The SHA-256 of [`STATE`], which contains the SHA-256 of the other files.
 pub(super) const STATE_SUM: &str = "state.json.sha256";
 
-/// All that a learner changes while it learns.
+/// Everything that a learner changes while it learns.
 #[derive(Debug)]
 pub struct LearnerState {
     /// Networks, optimiser, count of updates.
@@ -38,7 +38,7 @@ pub struct LearnerState {
     pub rng: ChaCha8Rng,
     /// Newest version of the weights that was published.
     pub weights_version: u64,
-    /// What the run has done.
+    /// The run's other counts.
     pub progress: Progress,
 }
 
@@ -58,7 +58,7 @@ pub(super) struct StateFile {
     pub(super) sha256: BTreeMap<String, String>,
 }
 
-/// What every version of `state.json` has.
+/// The fields that every version of `state.json` has.
 #[derive(Deserialize)]
 struct Version {
     format: u32,
@@ -70,9 +70,9 @@ pub fn check_state(text: &[u8]) -> Result<(), CheckpointError> {
 }
 
 impl StateFile {
-    /// Reads the text of the file in `folder` and checks what it holds.
+    /// Parses the text of `state.json` in `folder` and checks its values.
     pub(super) fn read(folder: &Path, text: &[u8]) -> Result<Self, CheckpointError> {
-        // Before its other fields, of which another version has others.
+        // The format comes first, as another version has other fields.
         if let Ok(Version { format }) = serde_json::from_slice(text)
             && format != FORMAT
         {
@@ -87,7 +87,7 @@ impl StateFile {
         checked.map_err(|why| damaged(folder, STATE, why))
     }
 
-    /// Checks what its types do not hold: a file may be right by its sum and still not be one that a learner wrote.
+    /// Checks what the types do not: a file with the right checksum need not be one that a learner wrote.
     fn check_valid(&self) -> Result<(), String> {
         for (name, count) in [
             ("updates", self.updates),

@@ -1,5 +1,5 @@
-//! What a checkpoint's networks say of themselves in safetensors' metadata, so that a file alone can be loaded elsewhere.
-//! This program reads it to say which setting of a checkpoint differs; one without it is as good.
+//! The description of a checkpoint's networks in safetensors' metadata, so that another program can load a single file.
+//! This program reads it only to report which setting of a checkpoint differs. A checkpoint without a description loads too.
 
 use driml_model::{InputSize, ModelConfig, TorsoName};
 use driml_protocol::RunSpec;
@@ -7,16 +7,16 @@ use safetensors::{SafeTensorError, SafeTensors};
 use serde::Serialize;
 use serde_json::Value;
 
-/// The metadata's one key.
+/// The only key in the metadata.
 pub const KEY: &str = "driml";
-/// 1: the tables of the settings that a reader needs, under their names there.
+/// 1: the tables of the settings that a reader needs, under their names in the settings.
 const FORMAT: u32 = 1;
 /// For a reader who has nothing but the file. More: `deploy/docs/src/reference/weights.md`.
 const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [model], divided by 255; channels are the newest frame_stack \
     frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k]TORSO; HEAD. \
     Atoms: v_min to v_max, evenly. Value of an action: sum of softmax(logits) * atoms.";
 
-/// What the torso does, in [`CONVENTIONS`].
+/// The text about the torso in [`CONVENTIONS`].
 fn torso(model: &ModelConfig) -> String {
     let read = match model.torso {
         TorsoName::Nature => {
@@ -31,7 +31,7 @@ fn torso(model: &ModelConfig) -> String {
     )
 }
 
-/// What the C51 head does, in [`CONVENTIONS`].
+/// The text about the C51 head in [`CONVENTIONS`].
 const fn head(model: &ModelConfig) -> &'static str {
     match (model.head.dueling, model.head.noisy_sigma.is_some()) {
         (false, false) => "head takes ReLU of that and gives [actions, atoms] logits",
@@ -57,7 +57,7 @@ struct Description<'a> {
     run: &'a RunSpec,
 }
 
-/// The description of a run's networks, JSON.
+/// Returns the description of a run's networks as JSON.
 pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String {
     let description = Description {
         format: FORMAT,
@@ -71,17 +71,17 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
     serde_json::to_string(&description).expect("plain values are JSON")
 }
 
-/// The description in a safetensors file; none if it has none.
+/// Reads the description in a safetensors file; `None` if the file has none.
 ///
 /// # Errors
-/// Not a whole safetensors file.
+/// The bytes are not a whole safetensors file.
 pub fn described(safetensors: &[u8]) -> Result<Option<Value>, SafeTensorError> {
     let (_, header) = SafeTensors::read_metadata(safetensors)?;
     let text = header.metadata().as_ref().and_then(|it| it.get(KEY));
     Ok(text.and_then(|it| serde_json::from_str(it).ok()))
 }
 
-/// The path of the first value that differs, under `name`, and both values.
+/// Finds the first value that differs. Returns its path, which starts with `name`, and both values.
 pub(super) fn difference(
     name: &str,
     one: &Value,

@@ -50,7 +50,7 @@ pub enum CheckpointError {
         found: String,
         expected: String,
     },
-    /// A learner cannot be restored from this state.
+    /// No learner could be restored from the state, for example because a weight is not finite.
     #[error("nothing is saved, and the newest checkpoint stays the newest: {0}")]
     Unsound(UpdateError),
     /// The state does not fit the network or the settings.
@@ -62,7 +62,7 @@ pub enum CheckpointError {
     KeepNone,
 }
 
-/// The error of `what`, such as "read", done to `path`.
+/// Makes the error of an operation `what`, such as "read", on `path`.
 pub(super) fn io_error<'a>(
     what: &'static str,
     path: &'a Path,

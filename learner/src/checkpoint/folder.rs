@@ -1,5 +1,5 @@
-//! The folder that holds a run's checkpoints: which there are, who may save there, and files that survive a crash.
-//! It does not know what is in a checkpoint.
+//! The folder of a run's checkpoints: lists and locks it, and writes files that survive a crash.
+//! It does not know the contents of a checkpoint.
 
 use std::{
     fs::{self, File},
@@ -11,18 +11,18 @@ use driml_protocol::lock_file;
 
 use super::error::{CheckpointError, io_error};
 
-/// The folder in a run's folder in which its checkpoints lie.
+/// The name of the checkpoints' folder in a run's folder.
 pub const FOLDER: &str = "checkpoints";
-/// What the name of a checkpoint begins with; the number of its update follows.
+/// Start of a checkpoint's name; the number of its update follows.
 pub(super) const PREFIX: &str = "checkpoint-";
 const LOCK: &str = ".lock";
-/// What follows the name of a checkpoint while one of the same update takes its place.
+/// End of a checkpoint's name while another checkpoint of the same update replaces it.
 const REPLACED: &str = ".replaced.tmp";
 
-/// Keeps other learners from saving in `folder`, which is made, as long as the file is held.
+/// Creates `folder`, and keeps other learners from saving in it as long as the returned file is open.
 ///
 /// # Errors
-/// Another learner saves there, or the file system refuses.
+/// Another learner saves there, or the file system fails.
 pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
     let path = folder.join(LOCK);
@@ -45,7 +45,7 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
         let Some(rest) = name.and_then(|name| name.strip_prefix(PREFIX)) else {
             continue;
         };
-        // One that is being replaced counts as long as the new one does not have its name.
+        // A checkpoint that is being replaced counts until the new one has its name.
         let replaced = rest.strip_suffix(REPLACED).map(|rest| {
             let is_replaced = folder.join(format!("{PREFIX}{rest}")).exists();
             (rest, is_replaced)
@@ -62,8 +62,8 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     Ok(all)
 }
 
-/// Gives a whole checkpoint its name. One of the same update, as at a stop right after a periodic save, gives way to it: between
-/// the two renames it is known by its other name.
+/// Renames the complete checkpoint `aside` to `path`. If `path` exists, as at a stop right after a periodic save, it is replaced: it
+/// first moves to another name, under which [`list`] finds it between the two renames.
 pub(super) fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     let older = with_end(path, REPLACED);
@@ -76,7 +76,7 @@ pub(super) fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointEr
     Ok(())
 }
 
-/// Removes what saves that were cut off have left, and gives a checkpoint that was to be replaced its name back.
+/// Removes what interrupted saves have left, and gives a checkpoint whose replacement was interrupted its name back.
 pub(super) fn tidy(folder: &Path) -> Result<(), CheckpointError> {
     for entry in fs::read_dir(folder).map_err(io_error("read", folder))? {
         let path = entry.map_err(io_error("read", folder))?.path();
@@ -114,14 +114,14 @@ pub(super) fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointE
         .map_err(io_error("write", path))
 }
 
-/// Flushes a folder's own entries to disk.
+/// Flushes a folder's entries to disk.
 pub(super) fn sync(folder: &Path) -> Result<(), CheckpointError> {
     File::open(folder)
         .and_then(|folder| folder.sync_all())
         .map_err(io_error("flush", folder))
 }
 
-/// Removes a whole checkpoint, under another name: what is left if that is cut off must not pass for one.
+/// Renames a checkpoint and removes it: what an interrupted removal leaves must not look like a checkpoint.
 pub(super) fn prune(path: &Path) {
     let aside = with_end(path, ".tmp");
     match fs::rename(path, &aside) {
@@ -136,7 +136,7 @@ fn with_end(path: &Path, end: &str) -> PathBuf {
     name.into()
 }
 
-/// Removes a folder, if it is there, whose removal decides nothing: what is saved, or is not, stays so.
+/// Removes a folder, if it exists. A failure is only logged, as it does not affect what is saved.
 pub(super) fn remove_or_warn(folder: &Path) {
     match fs::remove_dir_all(folder) {
         Err(why) if why.kind() != io::ErrorKind::NotFound => {

@@ -1,4 +1,4 @@
-//! Reading a checkpoint back, whole or not at all.
+//! Loads a checkpoint, completely or not at all.
 
 use std::path::Path;
 
@@ -22,7 +22,7 @@ use crate::{
     settings::UpdateSettings,
 };
 
-/// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
+/// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there are none. A damaged one is an error, not skipped.
 pub fn load_latest(
     folder: &Path,
     model: &ModelConfig,
@@ -36,10 +36,10 @@ pub fn load_latest(
     }
 }
 
-/// Loads one checkpoint onto the device of `compute`, whichever it was saved from.
+/// Loads one checkpoint onto the device of `compute`, whichever device it was saved from.
 ///
 /// # Errors
-/// A file that is missing or is not what was written, a run of another specification, a network of other sizes.
+/// A missing or damaged file, a run of another specification, or a network of other sizes.
 pub fn load(
     path: &Path,
     model: &ModelConfig,
@@ -79,7 +79,7 @@ pub fn load(
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     let (model, settings) = (model.clone(), settings.clone());
     let mut agent = Agent::from_parameters(model, settings, compute, networks)?;
-    // A run that asks for it only now averages from here.
+    // Without a saved average, a run that has `average_tau` starts averaging with its next update.
     if let Some(average) = average {
         agent.restore_average(average);
     }
@@ -95,16 +95,16 @@ pub fn load(
     })
 }
 
-/// Checks that the network `online` of the checkpoint at `path` has the sizes of `model`, as far as its description says.
+/// Checks that the network `online` of the checkpoint at `path` has the sizes of `model`, if the checkpoint describes them.
 fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), CheckpointError> {
     let described = description::described(online).ok().flatten();
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };
-    // Through text, as the description went: as a value, a number of 32 bits would have more digits.
+    // Through text, as for the saved description: converted directly, a 32-bit number would have more digits.
     let ours = serde_json::to_string(model).and_then(|text| serde_json::from_str(&text));
     let ours: Value = ours.unwrap_or_default();
-    // What follows from another torso is not worth a word beside it.
+    // If the torso differs, only that is reported: other differences follow from it.
     let torso = description::difference("model.torso", &saved["torso"], &ours["torso"]);
     match torso.or_else(|| description::difference("model", saved, &ours)) {
         None => Ok(()),
@@ -117,27 +117,27 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
     }
 }
 
-/// Updates of the checkpoint at `path`, and what the run had done by then; no tensor is read.
+/// Reads the number of updates and the run's other counts from the checkpoint at `path`, without its tensors.
 ///
 /// # Errors
-/// A file that is missing or is not what was written.
+/// A missing or damaged file.
 pub fn progress(path: &Path) -> Result<(u64, Progress), CheckpointError> {
     let state = read_state(path)?;
     Ok((state.updates, state.progress))
 }
 
-/// The action affinity of the checkpoint at `path`; none of an agent that learns none.
+/// Reads the affinity estimate from the checkpoint at `path`; `None` if the run has none.
 ///
 /// # Errors
-/// A file that is missing or is not what was written.
+/// A missing or damaged file.
 pub fn affinity(path: &Path) -> Result<Option<AffinityEstimator>, CheckpointError> {
     Ok(read_state(path)?.affinity)
 }
 
-/// The caller's companion of the checkpoint at `path`, if any.
+/// Reads the caller's companion from the checkpoint at `path`, if any.
 ///
 /// # Errors
-/// A file that is missing or is not what was written.
+/// A missing or damaged file.
 pub fn companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
     let state = read_state(path)?;
     let there = state.sha256.contains_key(COMPANION);
@@ -159,7 +159,7 @@ fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {
     StateFile::read(path, &text)
 }
 
-/// The bytes of one of its other files.
+/// Reads the checkpoint's file `name` and checks its SHA-256.
 fn read_file(path: &Path, state: &StateFile, name: &str) -> Result<Vec<u8>, CheckpointError> {
     let bytes = read(&path.join(name))?;
     if state.sha256.get(name) == Some(&sha256_of(&bytes)) {

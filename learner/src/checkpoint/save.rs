@@ -1,4 +1,4 @@
-//! Writing a checkpoint: each file whole, then the folder, then its name.
+//! Saves a checkpoint: writes and flushes each file, flushes the folder, and then renames the folder.
 
 use std::{
     collections::BTreeMap,
@@ -19,16 +19,16 @@ use super::{
 };
 use crate::{agent::Agent, error::UpdateError};
 
-/// What a checkpoint has beside the learner's state.
+/// The contents of a checkpoint in addition to the learner's state.
 #[derive(Clone, Copy, Debug)]
 pub struct Label<'a> {
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
-    /// What [`describe`](super::describe) says of the online network, for its metadata.
+    /// The description of the online network, from [`describe`](super::describe), for the metadata.
     pub description: &'a str,
-    /// The same of a network without the auxiliary loss's heads, for the target's and the average's.
+    /// The description of a network without the auxiliary loss's heads, for the target and the averaged network.
     pub without_heads: &'a str,
-    /// The caller's companion of the checkpoint.
+    /// Bytes that the caller keeps with the checkpoint.
     pub companion: Option<&'a [u8]>,
 }
 
@@ -38,8 +38,8 @@ pub struct Label<'a> {
 /// checkpoints whole and at most a `.tmp` folder, which the next save removes.
 ///
 /// # Errors
-/// A state that is not finite, or a failing file system, such as a full disk; nothing older has then been removed, and nothing
-/// of the new one is left.
+/// A state that is not finite, or a failing file system, such as a full disk. Older checkpoints are then kept, and nothing of the new
+/// one is left.
 pub fn save(
     folder: &Path,
     state: &LearnerState,
@@ -55,7 +55,7 @@ pub fn save(
     let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
     let saved = write(&aside, state, label).and_then(|()| put_in_place(&aside, &path));
     if let Err(error) = saved {
-        // It would keep a full disk full.
+        // The unfinished checkpoint would keep a full disk full.
         remove_or_warn(&aside);
         return Err(error);
     }
@@ -66,7 +66,7 @@ pub fn save(
     Ok(path)
 }
 
-/// Writes a checkpoint's files into the folder `aside`, which is made.
+/// Creates the folder `aside` and writes a checkpoint's files into it.
 fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), CheckpointError> {
     let agent = &state.agent;
     let mut files = tensor_files(agent, label).map_err(CheckpointError::Unsound)?;
@@ -94,7 +94,7 @@ fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), Che
         why: why.into(),
     })?;
     write_durably(&aside.join(STATE), &text)?;
-    // As `sha256sum --check` reads it.
+    // In the format of `sha256sum --check`.
     write_durably(
         &aside.join(STATE_SUM),
         format!("{}  {STATE}\n", sha256_of(&text)).as_bytes(),
@@ -102,7 +102,7 @@ fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), Che
     sync(aside)
 }
 
-/// The files of tensors and their names, all finite.
+/// Serialises the networks and the moments, all of which must be finite, into files with their names.
 fn tensor_files(
     agent: &Agent,
     label: Label<'_>,

@@ -1,29 +1,29 @@
 //! The C51 loss: KL divergence of the prediction for the taken action from a projected target.
-//! It does not make the target (`projection` does) and sends no gradient into it.
+//! It does not compute the target (`projection` does), and the target gets no gradient.
 
 use candle_core::{Result, Tensor, bail};
 use driml_model::Kernels;
 
 use super::{candle, scalar_op::scalar_op};
 
-/// Largest error of a probability or of a slope of the loss, as a share of it: an f32's last place. Below 1.2e-38, the least normal
-/// number, it is that share of 1.2e-38.
+/// Largest relative error of a probability or of a derivative of the loss: half a unit in the last place of an f32. Below 1.2e-38,
+/// the least normal number, the error is relative to 1.2e-38.
 pub const ENTRY_ERROR: f64 = 6.1e-8;
-/// Largest error of a slope beside [`ENTRY_ERROR`], where probability and target cancel in f64.
+/// Largest error of a derivative in addition to [`ENTRY_ERROR`], if probability and target cancel in f64.
 pub const SLOPE_ERROR: f64 = 1e-15;
-/// Largest error of a row's divergence, as a share of `10 + sum_i target_i (max logit - logit_i)`.
+/// Largest error of a row's divergence, relative to `10 + sum_i target_i (max logit - logit_i)`.
 pub const KL_ERROR: f64 = 1e-14;
 
-/// Mean over rows of `KL(target || softmax(logits))`, each times its weight, and its gradient.
+/// Computes the mean over rows of `KL(target || softmax(logits))`, each times its weight, and the gradient of that mean.
 ///
-/// `logits` [B, N], those of the action that each row took; `target` [B, N], rows sum to 1; N is `atoms`; `weights` [B], finite and
-/// not negative, or none for 1.
+/// `logits` [B, N] of the action that each row took; `target` [B, N], rows sum to 1; N is `atoms`; `weights` [B], finite and
+/// not negative, or `None` for 1.
 /// Loss: `1/B * sum_b weight sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
-/// `gradient` [B, N] is overwritten with the derivative by the logits: `weight (softmax - target) / B`. The arithmetic is f64 and shifts by
-/// the largest logit, so any finite logits are fine: the loss is right to [`KL_ERROR`], its slopes to [`ENTRY_ERROR`] and
-/// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is
-/// not finite, or a target that is NaN, gives a loss that is not finite, which the update refuses; a logit of -inf under a target
-/// of 0 adds nothing to the loss, as `0 ln 0` does, and has a slope of 0.
+/// `gradient` [B, N] is overwritten with the derivative by the logits: `weight (softmax - target) / B`. The arithmetic is f64 and
+/// subtracts the largest logit, so that any finite logits work: the loss is accurate to [`KL_ERROR`], its derivatives to
+/// [`ENTRY_ERROR`] and [`SLOPE_ERROR`]. The loss is beyond the finite f32 only if logits differ by more than 1e38. A logit that is not
+/// finite, or a target that is NaN, gives a loss that is not finite, which the update rejects. The exception is a logit of -inf with
+/// a target of 0: it adds nothing to the loss, as `0 ln 0 = 0`, and its derivative is 0.
 /// Sources: Bellemare et al. 2017, equation 7; Schaul et al. 2016, Prioritized Experience Replay, algorithm 1, line 12.
 ///
 /// # Panics
@@ -62,7 +62,7 @@ pub fn kl(
         let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
         for ((&logit, &t), gradient) in logits.iter().zip(target).zip(gradient) {
             let (log_p, t) = (log_p.at(logit), f64::from(t));
-            // Not t > 0, which would leave a NaN out of the loss.
+            // Not t > 0, which would ignore a NaN.
             if t != 0.0 {
                 total += weight * t * (t.ln() - log_p);
             }
@@ -72,7 +72,7 @@ pub fn kl(
     total / rows as f64
 }
 
-/// [`kl`] of each row by itself: `KL(target || softmax(logits))` [B], in nats, right to [`KL_ERROR`]. What is below 0 by rounding is 0.
+/// Computes `KL(target || softmax(logits))` of each row [B], in nats, accurate to [`KL_ERROR`]. A result below 0 by rounding is 0.
 ///
 /// # Panics
 /// As [`kl`].
@@ -84,8 +84,8 @@ pub fn row_kls(logits: &[f32], target: &[f32], atoms: usize) -> Vec<f64> {
 
 /// `ln softmax` of a row that is not empty, in f64.
 ///
-/// The largest logit and the logarithm of the sum stay apart: their sum would lose the smaller of the two, and with it the law,
-/// where all logits are large.
+/// The largest logit and the logarithm of the sum are stored separately: if all logits are large, their sum would lose the
+/// logarithm to rounding.
 struct LogSoftmax {
     max: f64,
     /// `ln(sum_i exp(x_i - max))`, from 0 to `ln N`.
@@ -102,13 +102,13 @@ impl LogSoftmax {
         }
     }
 
-    /// `ln` of the probability of an entry `x` of the row.
+    /// The logarithm of the probability of the row's entry `x`.
     fn at(&self, x: f32) -> f64 {
         (f64::from(x) - self.max) - self.log_sum
     }
 }
 
-/// Writes softmax of `row` to `out`, both of one length. Finite logits of any size give a law whose entries are right to
+/// Writes the softmax of `row` to `out`, which has the same length. For any finite logits, the probabilities are accurate to
 /// [`ENTRY_ERROR`].
 pub fn softmax(row: &[f32], out: &mut [f32]) {
     let log_p = LogSoftmax::of(row);
@@ -120,7 +120,7 @@ pub fn softmax(row: &[f32], out: &mut [f32]) {
 /// [`kl`] as a candle operation: `logits` [B, N] to a scalar.
 ///
 /// # Errors
-/// Logits that are not [B, N] f32 of as many values as `target`, or not of as many rows as there are weights.
+/// Logits that are not f32 [B, N] with as many values as `target` and as many rows as `weights`.
 pub fn kl_loss(
     logits: &Tensor,
     target: Vec<f32>,
@@ -157,7 +157,7 @@ mod tests {
     const LOGITS: [f32; 6] = [2.0, 0.1, -0.4, 1.5, 1.4, -2.0];
     const TARGET: [f32; 6] = [0.2, 0.5, 0.3, 0.0, 0.0, 1.0];
 
-    /// Loss and slopes of the function are in the table of properties of `driml experiment stability`.
+    /// `driml experiment stability` checks the loss and the gradient of the function itself.
     #[test]
     fn the_operations_give_the_function_and_its_slopes() -> Result<()> {
         for (scale, weights) in [(1.0, None), (1.0, Some(vec![0.25, 1.0])), (1e4, None)] {
@@ -207,7 +207,7 @@ mod tests {
         Ok(())
     }
 
-    /// As a float its own slope, 5.5e-42, has three digits.
+    /// Without its weight the derivative is 5.5e-42, of which an f32 holds three digits.
     #[test]
     fn a_weight_does_not_magnify_what_rounding_lost() {
         let mut gradient = [0f32; 2];

@@ -24,7 +24,7 @@ pub(super) fn kl_loss(
     entries.sum_all()?.affine(1.0 / rows as f64, 0.0)
 }
 
-/// As [`super::info_nce::info_nce_loss`]. Beyond about 8 times the clip the slope of a score is 0 here: `1 - tanh^2` in f32.
+/// As [`super::info_nce::info_nce_loss`], but scores beyond about 8 times the clip have derivative 0, which is `1 - tanh^2` in f32.
 pub(super) fn info_nce_loss(dots: &Tensor, valid: &[u8], scores: Scores) -> Result<Tensor> {
     let device = dots.device();
     let rows = (0..).zip(valid);

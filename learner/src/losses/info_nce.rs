@@ -1,5 +1,5 @@
-//! The InfoNCE loss over a matrix of scores, with the soft clip of the scores folded in.
-//! It does not compute the scores, and does not know which features they compare.
+//! The InfoNCE loss over a matrix of dot products, which it scales and softly clips to scores.
+//! It does not compute the dot products, and does not know which features they compare.
 
 use candle_core::{Result, Tensor, bail};
 use driml_model::{Kernels, exp_below, soft_clip};
@@ -11,22 +11,22 @@ use super::{
     scores::{Dots, Scores},
 };
 
-/// Largest error of the loss, as a share of 10 plus the largest score, in nats.
+/// Largest error of the loss in nats, relative to 10 plus the largest score.
 pub const LOSS_ERROR: f64 = 2e-14;
 
-/// Largest error of a slope: 1e-7 of itself, an f32's last place, and what the rounding of scores up to `largest` leaves open of a
-/// probability. `weight` is 1 / (L valid rows).
+/// Largest error of a derivative: 1e-7 of it, about a unit in the last place of an f32, plus the error of a probability from the
+/// rounding of scores up to `largest`. `weight` is 1 / (L valid rows).
 pub fn slope_error(slope: f64, weight: f64, scores: Scores, largest: f64) -> f64 {
     1e-7 * slope.abs() + weight * scores.scale * (1e-14 * largest).min(1.0) + 1e-15
 }
 
-/// InfoNCE of every valid row against every valid row of its batch, at each location, and its gradient.
+/// Computes the InfoNCE of every valid row against all valid rows of the batch, at each location, and its gradient.
 ///
 /// `dots` [L, B, B]: `dots[l, i, j]` is anchor i's dot product with candidate j at location l; the pair (i, i) is the
 /// positive. `valid` [B]: a row with 0 is neither anchor nor candidate. With `s = clip(dots)` the loss is the mean over
 /// l and valid i of `ln sum_{valid j} exp(s_lij) - s_lii`, in nats: 0 if fewer than two rows are valid.
 /// `gradient` [L, B, B] is overwritten with the derivative by `dots`, 0 in the rows and columns that are not valid.
-/// Every finite input gives a finite result. It is computed in f64: the loss is right to [`LOSS_ERROR`], its slopes to
+/// Every finite input gives a finite result. The arithmetic is f64: the loss is accurate to [`LOSS_ERROR`], its derivatives to
 /// [`slope_error`].
 /// Source: van den Oord et al. 2018, equation 4; the clip is Bachman et al. 2019, section 3.
 ///
@@ -66,11 +66,11 @@ pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]
             },
         )
         .collect();
-    // Summed in order, so that two runs give the same bits whatever the threads did.
+    // Summed in order, so that the result has the same bits whatever the threads did.
     losses.iter().sum::<f64>() * weight
 }
 
-/// Room for one anchor's numbers, one a candidate.
+/// Buffers for one anchor, with an entry per candidate.
 struct Scratch {
     dots: Vec<f32>,
     /// First the scores, then their exponentials.
@@ -88,7 +88,7 @@ impl Scratch {
     }
 }
 
-/// One anchor's `ln sum exp(s) - s_positive`; its `gradient` row, times `weight`.
+/// Returns one anchor's `ln sum exp(s) - s_positive`; writes the derivative, times `weight`, to its row `gradient`.
 fn anchor_loss(
     dots: &[f32],
     anchor: usize,
@@ -118,7 +118,7 @@ fn anchor_loss(
     sum.ln() + max - positive
 }
 
-/// [`info_nce`] as a candle operation: `dots` [L, B, B], whose scores are clipped to `tanh_clip`, to a scalar.
+/// [`info_nce`] as a candle operation: `dots` [L, B, B] to a scalar, with scores clipped to `tanh_clip`.
 ///
 /// # Errors
 /// Dots that are not [L, B, B] f32 with the B of `valid`.
@@ -155,8 +155,7 @@ mod tests {
     const ROWS: usize = 3;
     const WIDTH: usize = 16;
 
-    /// Also at the bounds that the clip's setting may have. The function's loss and slopes are in the table of properties of
-    /// `driml experiment stability`.
+    /// Includes the bounds of the clip's range. `driml experiment stability` checks the loss and the gradient of the function itself.
     #[test]
     fn the_operations_give_the_function_and_its_slopes() -> Result<()> {
         let dot = |i: usize| ((i * 37 % 19) as f32 - 9.0) * 3.0;

@@ -1,5 +1,5 @@
-//! The losses: each a pure function on slices that gives value and gradient, and the candle operation around it.
-//! They do not know networks, batches or which of them a run uses.
+//! The losses: each is a pure function on slices that computes value and gradient, with a candle operation around it.
+//! They know neither networks nor batches, nor which of them a run uses.
 
 pub mod c51;
 mod candle;

@@ -1,12 +1,12 @@
-//! The C51 projection: one Bellman step of a return distribution, put back onto the atoms.
+//! The C51 projection: one Bellman step of a return distribution, projected back onto the atoms.
 //! It does not choose the action, and it does not check for NaN: its callers do.
 
-/// Largest difference between the mass of a row before and after its projection: half of an f32's last place of each probability,
-/// all of one sign.
+/// Largest difference between the sums of a row before and after its projection: half a unit in the last place of each probability,
+/// if all these errors have the same sign.
 pub const MASS_ERROR: f64 = 6.1e-8;
 
-/// Largest error of a projected probability over this support: 1e-7, and what f64 leaves open of the place of a return where the
-/// support lies far from 0 beside its width.
+/// Largest error of a projected probability on this support: 1e-7, plus the f64 rounding of a return's position. The rounding matters
+/// if the support is far from 0 compared with its width.
 pub fn entry_error(atoms: usize, v_min: f32, v_max: f32) -> f64 {
     let (v_min, v_max) = (f64::from(v_min), f64::from(v_max));
     let far = v_min.abs().max(v_max.abs()) / (v_max - v_min);
@@ -17,11 +17,11 @@ pub fn entry_error(atoms: usize, v_min: f32, v_max: f32) -> f64 {
 ///
 /// With atoms `z_i = v_min + i * (v_max - v_min) / (N - 1)`, atom i of a row moves to
 /// `b = (clamp(reward + discount * z_i, v_min, v_max) - v_min) / (z_1 - z_0)` atoms, and its probability is split
-/// between `floor(b)` and the next atom in proportion to nearness; where `b` is an atom that atom gets all of it.
+/// between `floor(b)` and the next atom in proportion to nearness. If `b` is a whole number, atom `b` gets all of it.
 ///
 /// `probs` [B, N], rows sum to 1; `reward` [B], in units of return; `discount` [B], 0 where the episode ended.
-/// `out` [B, N] is overwritten; its rows sum to what the rows of `probs` sum to, within [`MASS_ERROR`], and no entry is negative.
-/// Positions are computed in f64: an entry is right to [`entry_error`] for finite and infinite rewards.
+/// `out` [B, N] is overwritten; its rows have the same sums as those of `probs`, within [`MASS_ERROR`], and no entry is negative.
+/// Positions are computed in f64: an entry is accurate to [`entry_error`] for finite and infinite rewards.
 /// Source: Bellemare et al. 2017, algorithm 1.
 ///
 /// # Panics
@@ -57,7 +57,7 @@ pub fn project(
         row_out.fill(0.0);
         for (i, &p) in row_in.iter().enumerate() {
             let moved = reward + discount * (v_min + i as f64 * spacing);
-            // A position on an atom must not lose its mass to rounding beyond the last one.
+            // Rounding must not move a position beyond the last atom.
             let b = ((moved.clamp(v_min, v_max) - v_min) / spacing).clamp(0.0, last);
             let low = b.floor();
             let (index, above) = (low as usize, b - low);

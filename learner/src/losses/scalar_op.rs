@@ -1,5 +1,5 @@
-//! A loss as a candle operation: the forward pass computes value and gradient at once, the backward pass hands the gradient out.
-//! It is for the CPU, and for one backward pass.
+//! A loss as a candle operation: the forward pass computes value and gradient together, the backward pass returns the gradient.
+//! It works on the CPU only, and for one backward pass.
 
 use std::sync::Mutex;
 
@@ -7,9 +7,9 @@ use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use driml_model::floats;
 use driml_protocol::lock;
 
-/// The scalar `loss(input)`, differentiable in `input`.
+/// Computes the scalar `loss(input)`, differentiable in `input`.
 ///
-/// `loss` gets the input's values, row-major, writes their gradient over its second argument, of the same length, and returns
+/// `loss` receives the input's values, row-major, writes their gradient into its second argument, of the same length, and returns
 /// the value.
 pub(super) fn scalar_op<F>(name: &'static str, input: &Tensor, loss: F) -> Result<Tensor>
 where
@@ -26,7 +26,7 @@ where
 struct ScalarOp<F> {
     name: &'static str,
     loss: F,
-    /// Made with the value, taken by the backward pass.
+    /// Computed together with the value; the backward pass takes it.
     gradient: Mutex<Option<Vec<f32>>>,
 }
 
@@ -43,7 +43,7 @@ impl<F: Fn(&[f32], &mut [f32]) -> f64 + Send + Sync> CustomOp1 for ScalarOp<F> {
         Ok((CpuStorage::F32(vec![value as f32]), Shape::from(())))
     }
 
-    /// The stored gradient times the scalar `grad_res`.
+    /// Returns the stored gradient times the scalar `grad_res`.
     fn bwd(&self, arg: &Tensor, _: &Tensor, grad_res: &Tensor) -> Result<Option<Tensor>> {
         let Some(mut gradient) = lock(&self.gradient).take() else {
             bail!("{} has one backward pass", self.name);

@@ -3,14 +3,14 @@
 use candle_core::Tensor;
 use driml_model::soft_clip;
 
-/// Largest error of a clipped score, as a share of it.
+/// Largest relative error of a clipped score.
 pub const CLIP_ERROR: f64 = 2e-15;
 
-/// Slopes below it are as good as 0: what is far enough below is given as 0.
+/// Derivatives below this are as good as 0; far smaller ones are returned as 0.
 pub const LEAST_SLOPE: f64 = 1e-290;
 
-/// Largest error of a clipped score's slope, as a share of it: where the score saturates, the exponent `2 |x| / c` is known to its
-/// own last place only. Below [`LEAST_SLOPE`] it is that share of it.
+/// Largest relative error of a clipped score's derivative. If the score saturates, this is the rounding error of the exponent
+/// `2 |x| / c`. Below [`LEAST_SLOPE`], the error is relative to [`LEAST_SLOPE`].
 pub fn slope_error(score: f64, tanh_clip: f64) -> f64 {
     CLIP_ERROR + 1e-15 * (2.0 * score / tanh_clip).abs()
 }
@@ -20,11 +20,11 @@ pub fn slope_error(score: f64, tanh_clip: f64) -> f64 {
 pub struct Dots {
     /// [L, B, B]: location, anchor, candidate; L = 1 where both features are global.
     pub dots: Tensor,
-    /// Numbers in each vector.
+    /// Length of each vector.
     pub width: usize,
 }
 
-/// How dot products become scores.
+/// The scale and the soft clip that turn dot products into scores.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scores {
     /// Factor on the dot products: `1 / sqrt(width)`.
@@ -34,7 +34,7 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// Scores of dot products of vectors of `width` numbers.
+    /// The scale and the clip for dot products of vectors of length `width`.
     pub fn new(width: usize, tanh_clip: f64) -> Self {
         Self {
             scale: 1.0 / (width as f64).sqrt(),
@@ -47,8 +47,8 @@ impl Scores {
         self.clip(dot).0
     }
 
-    /// The clipped score of a dot product, and its derivative by the dot product, as [`soft_clip`] has them: for scores and bounds
-    /// from 1e-150 to 1e150 the score is right to [`CLIP_ERROR`], its slope to [`slope_error`] of the score before the clip.
+    /// The clipped score of a dot product and its derivative by the dot product, from [`soft_clip`]. For scores and bounds from 1e-150 to
+    /// 1e150, the score is accurate to [`CLIP_ERROR`], and the derivative to [`slope_error`] of the score before the clip.
     pub fn clip(&self, dot: f32) -> (f64, f64) {
         let (mut score, mut slope) = ([0.0], [0.0]);
         soft_clip(&[dot], self.scale, self.tanh_clip, &mut score, &mut slope);

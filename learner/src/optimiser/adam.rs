@@ -1,5 +1,5 @@
-//! Adam: one fused pass over parameters, gradients and moments, in place; elsewhere than on the CPU, candle's operations.
-//! It has no weight decay, no schedule of the learning rate, and no default for any of its numbers.
+//! Adam: on the CPU, one fused pass over parameters, gradients and moments, in place; on other devices, candle's operations.
+//! It has no weight decay, no schedule of the learning rate, and no default for any of its settings.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -14,48 +14,48 @@ use serde::{Deserialize, Serialize};
 use super::gradients::Gradients;
 use crate::{error::UpdateError, ranges::check_range, tensors::change};
 
-/// Elements a thread takes at a time.
+/// Elements that a thread takes at a time.
 const CHUNK: usize = 1 << 14;
 
-/// Steps from one flushing of subnormal moments to the next: in every step it would cost a quarter of the step's time.
+/// Steps from one flush of subnormal moments to the next. A flush in every step would cost a quarter of the step's time.
 const FLUSH_PERIOD: u64 = 32;
 
 const LR: RangeInclusive<f64> = 1e-30..=1e38;
-/// Decays of a moment; beyond the largest `1 - beta` is off by more than 0.2% in f32.
+/// Range of a moment's decay. Above it, `1 - beta` is off by more than 0.2% in f32.
 const BETA: RangeInclusive<f64> = 0.0..=0.99999;
-/// The least is 10,000 times the root of the least second moment that f32 holds.
+/// Range of `eps`. Its start is 10,000 times the root of the least second moment that f32 holds.
 const EPS: RangeInclusive<f64> = 1e-15..=1e30;
 
-/// Largest error of a parameter against the same steps in f64, as a share of the way it went, beside [`step_floor`].
+/// Largest error of a parameter compared with the same steps in f64, relative to the distance it moved, in addition to [`step_floor`].
 pub const STEP_ERROR: f64 = 0.004;
 
-/// Largest error of a moment against f64 while gradients continue, as a share of the decayed mean of their sizes, or of their squares:
-/// `beta` and each product and sum are rounded to f32, and 1 / (1 - beta) steps add up.
+/// Largest error of a moment compared with f64 while gradients continue, relative to the decayed mean of their sizes or squares: `beta`
+/// and each product and sum are rounded to f32, and the errors of 1 / (1 - beta) steps add up.
 pub const fn moment_error(beta: f64) -> f64 {
     2e-7 / (1.0 - beta)
 }
 
-/// What each step may add to the error of a parameter beside [`STEP_ERROR`]: half of the last place of a parameter of size
-/// `parameter`, and what `lr * m` loses below the normal numbers before it is divided.
+/// The error that each step may add to a parameter in addition to [`STEP_ERROR`]: half a unit in the last place of `parameter`, and the
+/// loss of `lr * m` to underflow before its division.
 pub fn step_floor(parameter: f64, eps: f64) -> f64 {
     let least = f64::from(f32::MIN_POSITIVE);
     parameter.abs().max(least) / 2f64.powi(24) + least / eps.min(1.0)
 }
 
-/// Adam's numbers. Source: Kingma and Ba 2015, algorithm 1.
+/// Adam's settings. Source: Kingma and Ba 2015, algorithm 1.
 ///
-/// A step is taken in f32, and the ranges are those in which it is what it would be in f64: the second moments that f32 does not
-/// hold, below 1.2e-38, are of gradients below `1.1e-19 / sqrt(1 - beta2)`, beside which `eps` must be large. At its least
-/// `eps` and `beta2` = 0.999 a step is within [`STEP_ERROR`], 0.4%. Gradients are within 1e15, the largest `max_grad_norm`: the square
-/// of one above 1e19 is not finite.
+/// A step is computed in f32; within these ranges, it agrees with a step in f64. Second moments below 1.2e-38, which f32 does not hold,
+/// come from gradients below `1.1e-19 / sqrt(1 - beta2)`: `eps` must be much larger. At the least `eps` and `beta2` = 0.999, a step is
+/// within [`STEP_ERROR`], 0.4%. Gradients are at most 1e15, the largest `max_grad_norm`: the square of a gradient above 1e19 is not
+/// finite.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdamSettings {
-    /// Learning rate, change of a parameter an update, from 1e-30 to 1e38.
+    /// Learning rate, the change of a parameter per update, from 1e-30 to 1e38.
     pub lr: f64,
-    /// Decay of the first moment an update, in [0, 0.99999].
+    /// Decay of the first moment per update, in [0, 0.99999].
     pub beta1: f64,
-    /// Decay of the second moment an update, in [0, 0.99999].
+    /// Decay of the second moment per update, in [0, 0.99999].
     pub beta2: f64,
     /// Added to the root of the second moment, outside the root, from 1e-15 to 1e30.
     pub eps: f64,
@@ -99,7 +99,7 @@ impl Moments {
         })
     }
 
-    /// m and v on the CPU, in this shape.
+    /// Copies m and v to the CPU, in the given shape.
     fn tensors(&self, shape: &[usize]) -> candle_core::Result<[Tensor; 2]> {
         Ok(match self {
             Self::Fused { m, v } => [
@@ -117,12 +117,12 @@ pub struct Adam {
     settings: AdamSettings,
     step: u64,
     kernels: Kernels,
-    /// By name, with the parameter's shape.
+    /// By the parameter's name, with its shape.
     moments: BTreeMap<String, (Vec<usize>, Moments)>,
 }
 
 impl Adam {
-    /// Moments of zero for each of `parameters`.
+    /// Creates Adam's state before the first step, with moments of zero for each of `parameters`.
     ///
     /// # Errors
     /// Settings out of their ranges; the device has no memory left for the moments.
@@ -159,9 +159,9 @@ impl Adam {
     /// Source: PyTorch's `Adam` without weight decay.
     ///
     /// # Errors
-    /// A gradient whose shape or type is not its parameter's; a step size beyond the finite numbers, before anything has
-    /// changed; [`UpdateError::Diverged`] for a parameter or moment that the step took beyond them. The last is found out on the
-    /// CPU alone, where it costs nothing; on other devices no such parameter passes [`Parameters::to_safetensors`].
+    /// A gradient whose shape or type is not its parameter's; a step size that is not finite, before anything has changed;
+    /// [`UpdateError::Diverged`] for a parameter or moment that is not finite after the step. Only the CPU's fused kernels check that, as
+    /// it costs nothing there; on other devices, [`Parameters::to_safetensors`] rejects such a parameter.
     pub fn step(
         &mut self,
         parameters: &Parameters,
@@ -223,7 +223,7 @@ impl Adam {
         Ok(tensors)
     }
 
-    /// Puts back what [`Adam::to_tensors`] gave after `step` steps, bit for bit, on `device`.
+    /// Restores the moments from [`Adam::to_tensors`], bit for bit, on `device`, and the count of steps.
     ///
     /// # Errors
     /// A moment that is missing, of another shape or type, not finite, or of no parameter of this optimiser.
@@ -254,7 +254,7 @@ impl Adam {
                         )));
                     }
                 };
-                // Of squares there is no negative mean.
+                // A mean of squares is never negative.
                 let least = if which == "v" { 0.0 } else { f32::MIN };
                 if let Some(at) = values.iter().position(|v| !(least..=f32::MAX).contains(v)) {
                     let value = values[at];
@@ -277,7 +277,7 @@ impl Adam {
     }
 }
 
-/// One step's numbers, the same for every element: what [`Adam::step`] does to a stretch of a parameter.
+/// The coefficients of one step of [`Adam::step`], which are the same for every element of every parameter.
 #[derive(Clone, Copy, Debug)]
 pub struct Rule {
     factor: f32,
@@ -293,7 +293,7 @@ pub struct Rule {
 }
 
 impl Rule {
-    /// The numbers of step number `step`, counted from 1, on gradients times `factor`.
+    /// Computes the coefficients of step number `step`, counted from 1, for gradients times `factor`.
     pub fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
         let AdamSettings {
             lr,
@@ -315,11 +315,11 @@ impl Rule {
         }
     }
 
-    /// Takes the step on one stretch of parameters `p`, gradients `g` and moments `m` and `v`, all of one length; says whether its parameters and second moments are finite after it. (So are then the
-    /// first moments, as a mean is no larger than the root of the mean square.)
+    /// Takes the step on slices of parameters `p`, gradients `g` and moments `m` and `v`, all of one length. Returns whether parameters
+    /// and second moments are finite after it; if so, the first moments are too, as a mean is at most the root of the mean square.
     ///
-    /// Once in 32 steps, moments below the normal numbers become 0. Those of a gradient that is gone would else stay
-    /// there for good, as 0.9 times the smallest numbers rounds back to them, and make each later step several times as slow.
+    /// Once in 32 steps, subnormal moments become 0. Otherwise, the moments of a gradient that has become 0 would stay subnormal forever,
+    /// as 0.9 times the smallest numbers rounds back to them, and would make each later step several times as slow.
     #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
     pub fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
         if self.flushes {
@@ -354,7 +354,7 @@ impl Rule {
     }
 }
 
-/// Puts 0 in place of subnormal numbers; all others, NaN included, stay as they are.
+/// Replaces subnormal numbers by 0; all others, including NaN, are unchanged.
 fn flush(values: &mut [f32]) {
     for value in values {
         *value = if value.abs() < f32::MIN_POSITIVE {

@@ -1,4 +1,4 @@
-//! The gradients of one loss: of a backward pass, their global norm, and the clipping that follows from it.
+//! The gradients of one loss: the backward pass, the global norm, and the factor that clips them.
 //! It changes no parameter; `adam` does.
 
 use std::collections::BTreeMap;
@@ -9,11 +9,11 @@ use rayon::prelude::*;
 
 use crate::error::UpdateError;
 
-/// Elements a thread sums at a time.
+/// Elements that a thread sums at a time.
 const CHUNK: usize = 1 << 14;
 
-/// Largest error of the norm of up to ten million gradients, as a share of it: 2,048 additions follow each other within a chunk and
-/// 640 from chunk to chunk, each of which may lose half of an f64's last place the same way; the root halves what they lose.
+/// Largest relative error of the norm of up to ten million gradients. 2,048 additions within a chunk and 640 across chunks may each lose
+/// half a unit in the last place of an f64 in the same direction; the root halves the relative error.
 pub const NORM_ERROR: f64 = 1.5e-13;
 
 /// Gradients of one loss, by parameter name. A parameter that the loss does not touch has none.
@@ -23,7 +23,7 @@ pub struct Gradients {
 }
 
 impl Gradients {
-    /// The gradients of `loss`, a scalar, by `parameters`.
+    /// Computes the gradients of the scalar `loss` by `parameters`.
     pub fn of(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
         let mut backward = Backward::of(loss)?;
         let mut by_name = BTreeMap::new();
@@ -40,7 +40,7 @@ impl Gradients {
         self.by_name.get(name)
     }
 
-    /// Global 2-norm of all gradients together, accumulated in f64: right to [`NORM_ERROR`] for any finite gradients on the CPU.
+    /// Global 2-norm of all gradients together, accumulated in f64: accurate to [`NORM_ERROR`] for any finite gradients on the CPU.
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
@@ -54,7 +54,7 @@ impl Gradients {
                 let squares = |g: &Tensor| g.to_dtype(DType::F64)?.sqr()?.sum_all();
                 let each = self.by_name.values().map(squares);
                 let each = each.collect::<candle_core::Result<Vec<_>>>()?;
-                // One copy to the host, not one a parameter.
+                // One copy to the host, not one per parameter.
                 Tensor::stack(&each, 0)?.to_vec1()?
             }
         };
@@ -70,7 +70,7 @@ impl Gradients {
 fn squares_on_cpu(tensor: &Tensor) -> candle_core::Result<f64> {
     let values = values_of(tensor)?;
     let parts = values.par_chunks(CHUNK).map(sum_of_squares);
-    // Summed in order, whatever the threads did.
+    // Summed in order, so that the result does not depend on the threads.
     Ok(parts.collect::<Vec<f64>>().iter().sum())
 }
 
@@ -88,9 +88,9 @@ fn sum_of_squares(values: &[f32]) -> f64 {
     parts.iter().sum::<f64>() + rest
 }
 
-/// Factor on gradients of global norm `norm` so that their norm stays within `max_norm`.
+/// Computes the factor that limits the norm of gradients of global norm `norm` to `max_norm`.
 ///
-/// `max_norm / (norm + 1e-6)` where that is below 1, else 1. It is used as an f32, whose last place it keeps for norms up to 8e37
+/// The factor is `max_norm / (norm + 1e-6)`, and at most 1. Adam uses it as an f32, which has full precision for norms up to 8e37
 /// times `max_norm`. Source: PyTorch's `clip_grad_norm_`.
 pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
     (max_norm / (norm + 1e-6)).min(1.0)

@@ -1,4 +1,4 @@
-//! From a loss to new parameters: gradients and their clipping, Adam, and the slow copies that follow.
+//! From a loss to new parameters: gradients and their clipping, Adam, and the slow copies of the online network.
 
 pub mod adam;
 pub mod gradients;

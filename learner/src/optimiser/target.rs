@@ -1,15 +1,15 @@
-//! Slow copies of the online network, such as the target network: how they follow it.
-//! When they do is for `agent` to say.
+//! Moves slow copies of the online network, such as the target network, towards it.
+//! `agent` decides when they move.
 
 use driml_model::{Kernels, Parameters};
 
 use crate::{error::UpdateError, tensors::change};
 
-/// Parameters up to this size can be followed: the difference of two is then finite.
+/// Largest size of a parameter for which a copy can follow: the difference of two parameters is then finite.
 pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
 
-/// Largest error of a target against f64 after any number of moves, as a share of the largest that it or the online network ever
-/// was (of 1.2e-38 if that is larger): half of a last place a move, of which 1 / tau add up. 0 for a tau of 1.
+/// Largest error of a target parameter compared with f64 after any number of moves, relative to the largest size that it, or the online
+/// one, ever had (at least 1.2e-38). Each move rounds by half a unit in the last place, and 1 / tau moves add up. 0 for a tau of 1.
 pub fn follow_error(tau: f64) -> f64 {
     if tau >= 1.0 {
         return 0.0;
@@ -19,9 +19,9 @@ pub fn follow_error(tau: f64) -> f64 {
 
 /// Moves `target` towards `online`, in place: `target <- target + tau * (online - target)`.
 ///
-/// `tau` in (0, 1]; at 1 the copy is exact. `1 - tau` is never made, as in f32 it is not what a small tau leaves. Where the online
-/// network stands still, the target comes as near to it as half of a parameter's last place divided by tau: [`follow_error`].
-/// Parameters are within [`FOLLOWED_MAX`]; beyond it a target is infinite, which the next update refuses as the target network's.
+/// `tau` in (0, 1]; at 1 the copy is exact. `1 - tau` is not used, as f32 rounds it for a small tau. If the online network stands still,
+/// the target stops within half a unit in the last place of a parameter divided by tau: [`follow_error`]. Parameters are within
+/// [`FOLLOWED_MAX`]; beyond it, a target is infinite, and the next update rejects the target network's distribution.
 ///
 /// # Errors
 /// A parameter of the target that the online network lacks.

@@ -1,4 +1,4 @@
-//! A parity case as its file gives it: settings, inputs, parameters and expectations, all checked.
+//! Reads a parity case from its file: settings, inputs, parameters and expectations, all checked.
 //! It computes nothing.
 
 use std::{
@@ -35,7 +35,7 @@ pub enum ParityError {
         file: PathBuf,
         why: Box<ParityError>,
     },
-    /// The file is not a whole case, or not one that this check knows.
+    /// The file is not a complete case, or has contents that this check does not know.
     #[error("{0}")]
     Case(String),
     #[error(transparent)]
@@ -61,19 +61,19 @@ struct Config {
     v_min: f32,
     v_max: f32,
     double_dqn: bool,
-    /// Not there: DIM, or none if all lambdas are 0.
+    /// If absent: DIM, or no auxiliary loss if all lambdas are 0.
     #[serde(rename = "objective")]
     auxiliary_loss: Option<AuxiliaryKind>,
-    /// Not there: with the action, where there is DIM.
+    /// If absent: true if there is an auxiliary loss.
     condition_on_action: Option<bool>,
     lambda: Lambda,
     tanh_clip: f64,
     max_grad_norm: f64,
     adam: AdamSettings,
-    /// Pace of the key encoder; not there for an auxiliary loss without one.
+    /// `key_tau` of the auxiliary loss; absent for a loss without a key encoder.
     key_tau: Option<f64>,
     model: Sizes,
-    /// Not there: one linear layer.
+    /// If absent: one linear layer.
     #[serde(default)]
     head: HeadConfig,
 }
@@ -87,7 +87,7 @@ struct Observation {
 
 #[derive(Debug, Deserialize)]
 struct Sizes {
-    /// Not there: `nature`.
+    /// If absent: `nature`.
     #[serde(default)]
     torso: TorsoName,
     #[serde(default)]
@@ -100,13 +100,13 @@ struct Sizes {
     action_embed: usize,
 }
 
-/// One case: a batch, all parameters before the update, and every tensor that must come out.
+/// One case: a batch, all parameters before the update, and every expected tensor.
 pub(super) struct Case {
     config: Config,
     pub(super) settings: UpdateSettings,
     inputs: OwnedBatch,
     tensors: Tensors,
-    /// Names of expectations that were not asked for yet.
+    /// Names of expectations that nothing was compared with yet.
     unused: RefCell<BTreeSet<String>>,
 }
 
@@ -156,7 +156,7 @@ impl Case {
         }
     }
 
-    /// The noise that the case gives for noisy layers, made of its normal numbers.
+    /// The noise of the noisy layers, made from the normal numbers in the case.
     pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise, ParityError> {
         let of = |who: &str| {
             HeadNoise::of_normals(model, |layer, side, len| {
@@ -195,7 +195,7 @@ impl Case {
             .collect()
     }
 
-    /// The values of `expect.<name>`, as f64.
+    /// The values of `expect.<name>`, as f64. Marks the expectation as used.
     pub(super) fn expected(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>, ParityError> {
         let name = format!("expect.{name}");
         let tensor = self.tensors.get(&name)?;
@@ -207,7 +207,7 @@ impl Case {
         Ok(flat_f64(tensor)?)
     }
 
-    /// An expectation that nothing was compared with must not pass as met.
+    /// Checks that every expectation was used: one that nothing was compared with must not pass as met.
     pub(super) fn check_all_expectations_used(&self) -> Result<(), ParityError> {
         match self.unused.borrow().first() {
             Some(name) => Err(ParityError::tensor(
@@ -227,7 +227,7 @@ impl Config {
             AuxiliaryKind::NONE
         };
         let auxiliary_loss = self.auxiliary_loss.unwrap_or(by_lambda);
-        // The one setting that only this loss has.
+        // The loss's own table, of which cases have this one setting.
         let own = self.key_tau.map(|key_tau| {
             let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
             (auxiliary_loss.name().to_owned(), table.into())
@@ -266,7 +266,7 @@ fn inputs(
         anchors = Some(bytes("input.view_query", &state)?);
         (bytes("input.view_key", &state)?, vec![1; rows])
     } else {
-        // [B] where a row has one positive, else [P, B].
+        // [B] if a row has one positive, else [P, B].
         let dims = tensors.get("input.positive_valid")?.dims();
         let several = if dims.len() > 1 { &dims[..1] } else { &[] };
         let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;

@@ -1,5 +1,5 @@
-//! How far an update of any precision, network and weights is from the same in f32 by candle's own operations.
-//! It judges nothing: tolerances are for the cases of the parity check, whose float64 holds both ways of computing.
+//! Measures how far an update of any precision, network and weights is from the same update in f32 by candle's own operations.
+//! It applies no tolerances: the parity check does, which compares both ways of computing with float64.
 
 use candle_core::Device;
 use driml_model::{Compute, Kernels, greedy};
@@ -7,7 +7,7 @@ use driml_protocol::NO_ACTION;
 
 use crate::{agent::Agent, batch::Batch, error::UpdateError, tensors::flat_f64};
 
-/// How a reference computes: with none of this project's kernels.
+/// The reference's way of computing: on the CPU, without this project's kernels.
 pub const REFERENCE: Compute = Compute {
     device: Device::Cpu,
     kernels: Kernels::Candle,
@@ -22,16 +22,16 @@ pub struct ErrorOfUpdate {
     pub reference_loss: f64,
     /// |total - reference| / |reference|.
     pub loss: f64,
-    /// 2-norm of the gradients' difference over that of the reference, all parameters together; 0 where both are 0.
+    /// 2-norm of the difference of the gradients over that of the reference's gradients, all parameters together; 0 if both are 0.
     pub gradient: f64,
     /// 1 - cosine of the angle between the gradients.
     pub angle: f64,
-    /// Share of rows that bootstrap whose greedy action in s_{t+n} is the reference's; 1 if none does.
+    /// Share of rows with the reference's greedy action in s_{t+n}, among the rows that bootstrap; 1 if none does.
     pub same_next_action: f64,
 }
 
 impl ErrorOfUpdate {
-    /// Of `agent` on `batch` against `reference`, an agent of the same parameters on [`REFERENCE`]; with the noise of the first.
+    /// Compares `agent` on `batch` with `reference`, an agent of the same parameters on [`REFERENCE`]. Both use the noise of `agent`.
     pub fn of(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
         let noise = agent.noise();
         let own = agent.evaluate_with(batch, &noise)?;
@@ -85,7 +85,7 @@ pub struct QError {
 }
 
 impl QError {
-    /// Of `got` [B, A] against `expected` [B, A].
+    /// Compares `got` [B, A] with `expected` [B, A].
     pub fn of(got: &[f32], expected: &[f32], num_actions: usize) -> Self {
         let (mut square, mut max) = (0.0, 0f64);
         for (&got, &expected) in got.iter().zip(expected) {

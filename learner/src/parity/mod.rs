@@ -1,5 +1,5 @@
-//! The parity check: the learner's own update on a case computed elsewhere in float64, compared tensor by tensor.
-//! It computes nothing beyond the comparison, and does not print.
+//! The parity check: runs the learner's update on a case that was computed elsewhere in float64, and compares tensor by tensor.
+//! It only compares, and does not print.
 
 mod case;
 pub mod deviation;
@@ -31,10 +31,10 @@ use crate::{
     tensors::flat_f64,
 };
 
-/// One tensor group's comparison.
+/// The comparison of one group of tensors.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ParityLine {
-    /// The group; for groups of several tensors, with the tensor that is nearest to its tolerance.
+    /// The group's name; for a group of several tensors, the name of the tensor that is nearest to its tolerance.
     pub name: String,
     /// Largest error found among the group's numbers.
     pub error: f64,
@@ -49,12 +49,12 @@ impl ParityLine {
     }
 }
 
-/// What came of one case: every group of tensors with its error and its tolerance.
+/// The result of one case: every group of tensors with its error and its tolerance.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ParityReport {
     /// The case's file.
     pub file: PathBuf,
-    /// One line a tensor group.
+    /// One line per group of tensors.
     pub lines: Vec<ParityLine>,
 }
 
@@ -81,7 +81,7 @@ impl fmt::Display for ParityReport {
     }
 }
 
-/// Runs one update on a case file, computed as `compute` says, and compares every tensor it expects.
+/// Runs one update on a case file, computed as `compute` says, and compares every tensor that the case expects.
 ///
 /// # Errors
 /// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are lines of the report.
@@ -135,7 +135,7 @@ impl Check<'_> {
         self.lines.push(line(name, error, tolerance));
     }
 
-    /// Values of s_t, greedy actions in s_{t+n} and projected targets.
+    /// Compares values of s_t, greedy actions in s_{t+n} and projected targets.
     fn targets(&mut self, agent: &Agent, evaluation: &Evaluation) -> Result<(), ParityError> {
         let (case, allowed, model) = (self.case, self.allowed, agent.model());
         let batch = case.batch();
@@ -145,7 +145,7 @@ impl Check<'_> {
         self.add("q_values_t", error, allowed.q_values * width);
 
         let expected = case.expected("next_action", &[batch.rows])?;
-        // Of a row that does not bootstrap no action is chosen.
+        // A row that does not bootstrap has no chosen action.
         let agree = |(&got, wanted): (&u8, &f64)| got == NO_ACTION || f64::from(got) == *wanted;
         let chosen = evaluation.next_greedy_action.iter().zip(&expected);
         let same: Vec<bool> = chosen.map(agree).collect();
@@ -180,7 +180,7 @@ impl Check<'_> {
             // A loss of weight 0 is not in the update: its value comes from the forward pass alone.
             let in_update = found.losses.iter().find(|it| it.0 == alone.name);
             let got = in_update.map_or(alone.value, |it| it.1);
-            // The cases call every loss after the pair of levels that it compares; one without a pair compares global features.
+            // A case names every loss after its pair of levels. A loss without a pair compares global features.
             let pair = alone.name.split_once('_').map_or("4t4", |it| it.1);
             self.loss(&format!("loss.dim.{pair}"), got, alone.saturates)?;
             total_saturates |= alone.saturates && in_update.is_some();
@@ -229,7 +229,7 @@ impl Check<'_> {
         let (mut online, mut keys) = (Worst::default(), Worst::default());
         for (name, tensor) in case.online() {
             let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
-            // What no lambda uses is not built, so it stays as the file gives it.
+            // Parameters that no lambda uses are not built, so they stay as in the file.
             let var = agent.online().get(name);
             let got = flat_f64(var.map_or(tensor, |var| var.as_tensor()))?;
             online.add("updated", name, largest(&got, &expected), tolerance);
@@ -276,15 +276,15 @@ fn key_parameters(
     Ok(Some(key))
 }
 
-/// An auxiliary loss by a forward pass alone.
+/// The value of an auxiliary loss, from a forward pass alone.
 struct Forward {
     name: &'static str,
     value: f32,
-    /// Whether a score is past the clip's bound, where its slope is below 0.42.
+    /// Whether a score is beyond the clip's bound, where the clip's derivative is below 0.42.
     saturates: bool,
 }
 
-/// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda.
+/// Computes the auxiliary losses of all pairs that the case contains, by a forward pass alone and whatever lambda is.
 fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, ParityError> {
     let settings = &case.settings;
     let kind = if settings.auxiliary_loss == AuxiliaryKind::NONE {
@@ -297,9 +297,9 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         lambda: Lambda::EVERY,
         ..settings.auxiliary_settings()
     };
-    // A loss that does not take every pair is used unchanged.
+    // A loss that rejects some of the pairs keeps the case's settings.
     let loss = kind.loss(&every).or_else(|_| settings.auxiliary())?;
-    // The update of C51 alone gives it to nothing.
+    // Read from the case's parameters: if the update is C51's alone, the settings do not say it.
     let gives_action = |(name, _): (&str, _)| name.starts_with("dim.action.");
     let model = case.model(loss.heads(case.online().any(gives_action)));
     let (device, kernels) = (&compute.device, compute.kernels);
@@ -344,7 +344,7 @@ fn line(name: &str, error: f64, tolerance: f64) -> ParityLine {
     }
 }
 
-/// Lines of parameter groups (`torso`, `head`, `dim.psi3`, ..), by group: of each, the tensor nearest to its tolerance.
+/// One line per group of parameters (`torso`, `head`, `dim.psi3`, ..): the tensor nearest to its tolerance.
 #[derive(Default)]
 struct Worst(BTreeMap<String, ParityLine>);
 
@@ -354,7 +354,7 @@ impl Worst {
         let group = name.split('.').take(parts).collect::<Vec<_>>().join(".");
         let new = line(&format!("{what}.{name}"), error, tolerance);
         let worst = self.0.entry(group).or_insert_with(|| new.clone());
-        // A NaN, once there, stays.
+        // An error of NaN is kept.
         let nearer = error * worst.tolerance > worst.error * tolerance;
         if !worst.error.is_nan() && (nearer || error.is_nan()) {
             *worst = new;

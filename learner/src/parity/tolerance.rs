@@ -1,4 +1,4 @@
-//! How far an update may be off the float64 one, by the precision of its products.
+//! The errors that an update may have compared with float64, by the precision of its products.
 //! It compares nothing.
 
 use driml_model::{Kernels, Precision, TorsoName};
@@ -6,23 +6,23 @@ use driml_model::{Kernels, Precision, TorsoName};
 /// The largest errors at which the quantities of an update pass.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tolerances {
-    /// Values of s_t, in units of return, as a share of the support's width.
+    /// Values of s_t, as a share of the support's width.
     pub(super) q_values: f64,
-    /// Share of the rows whose greedy action in s_{t+n} is another: of two values that are nearly the same either may be larger.
+    /// Share of rows with another greedy action in s_{t+n}: of two values that are nearly the same, either may be larger.
     pub(super) next_action_rows: f64,
-    /// Projected target distributions, each probability, of the rows with the same greedy action.
+    /// Each probability of the projected target distributions, in rows with the same greedy action.
     pub(super) projection: f64,
     pub(super) loss: f64,
-    /// Losses, relative, where scores saturate.
+    /// Losses, relative, if scores saturate.
     pub(super) saturated_loss: f64,
     pub(super) least_loss: f64,
-    /// Gradients, as a share of the tensor's own 2-norm, to which that of the global one is added.
+    /// Gradients, as a share of the tensor's own 2-norm; `gradient_of_global` is added.
     pub(super) gradient: f64,
     /// Gradients, as a share of the global 2-norm.
     pub(super) gradient_of_global: f64,
     /// The global 2-norm, as a share of itself.
     pub(super) norm: f64,
-    /// 1 - cosine of a gradient whose 2-norm is at least a tenth of the global one; where that is looked at.
+    /// 1 - cosine of a gradient whose 2-norm is at least a tenth of the global one; `None` if not checked.
     pub(super) angle: Option<f64>,
     /// Parameters after the step, absolute.
     pub(super) updated: f64,
@@ -31,7 +31,7 @@ pub(super) struct Tolerances {
 }
 
 impl Tolerances {
-    /// Derived from f32's unit roundoff, 6e-8, and the lengths of the sums. Found on the open cases, at most: values 6.3e-8 of the
+    /// Derived from f32's unit roundoff, 6e-8, and the lengths of the sums. Largest errors on the open cases: values 6.3e-8 of the
     /// width, probabilities 4.3e-8, losses 5.7e-7, updated parameters 1.4e-7.
     const F32: Self = Self {
         q_values: 1e-5,
@@ -48,10 +48,10 @@ impl Tolerances {
         updated_rates: 0.0,
     };
 
-    /// Derived from bf16's unit roundoff, 2^-8 = 4e-3: half of it for what is a mean over many products (values, probabilities), a few
-    /// for losses, and for gradients the share of ReLUs that open or close. Found on the open cases, at most: values 1.0e-3 of the
-    /// width, probabilities 5.7e-4, losses 4.5e-3, the gradients' norm 2.6e-2, 1 - cosine 1.4e-2. Adam's first step is one learning rate up or down whatever the gradient's size,
-    /// so a gradient near 0 that changes its sign moves a parameter by two.
+    /// Derived from bf16's unit roundoff, 2^-8 = 4e-3: half of it for means over many products (values, probabilities), a few for losses,
+    /// and for gradients the share of ReLUs that open or close. Largest errors on the open cases: values 1.0e-3 of the width,
+    /// probabilities 5.7e-4, losses 4.5e-3, the gradients' norm 2.6e-2, 1 - cosine 1.4e-2. Adam's first step is one learning rate up or
+    /// down for any size of the gradient, so that a gradient near 0 with another sign moves a parameter by two learning rates.
     const BF16: Self = Self {
         q_values: 2e-3,
         next_action_rows: 0.05,
@@ -67,7 +67,7 @@ impl Tolerances {
         updated_rates: 2.0,
     };
 
-    /// Of a loss with this expected value.
+    /// The tolerance of a loss with this expected value.
     pub(super) fn of_loss(&self, expected: f64, is_saturated: bool) -> f64 {
         let relative = if is_saturated {
             self.saturated_loss
@@ -80,12 +80,12 @@ impl Tolerances {
     pub(super) fn of(kernels: Kernels, torso: TorsoName) -> Self {
         match (kernels, torso) {
             (Kernels::Fused(Precision::Bf16), TorsoName::Nature) => Self::BF16,
-            // 15 convolutions round in place of 3, and errors of independent roundings grow as the root of their number.
+            // 15 convolutions round instead of 3, and independent rounding errors grow as the root of their number.
             (Kernels::Fused(Precision::Bf16), TorsoName::Impala | TorsoName::Impoola) => Self {
                 q_values: 5f64.sqrt() * Self::BF16.q_values,
                 projection: 5f64.sqrt() * Self::BF16.projection,
                 gradient: 5f64.sqrt() * Self::BF16.gradient,
-                // The square of an error.
+                // 1 - cosine grows as the square of the error.
                 angle: Self::BF16.angle.map(|angle| 5.0 * angle),
                 ..Self::BF16
             },

@@ -1,5 +1,5 @@
 //! Fetches batches ahead of the update that needs them, several requests in flight, one thread each.
-//! It does not reorder or keep batches: what arrives first is learned from first.
+//! It neither reorders nor keeps batches: the learner learns first from what arrives first.
 
 use std::{
     sync::{Arc, mpsc},
@@ -21,17 +21,17 @@ const THREADS_END_MAX: Duration = Duration::from_secs(2);
 /// The queue of fetched batches.
 pub struct BatchSource {
     fetched: mpsc::Receiver<Fetched>,
-    /// Threads that have not said that they are finished.
+    /// Number of threads that have not reported that they are finished.
     fetching: u32,
     threads: Vec<JoinHandle<()>>,
     shared: Arc<Shared>,
 }
 
-/// What the learner gets when it asks for its next batch.
+/// The result of waiting for the next batch.
 pub enum Next {
     /// A batch to learn from.
     Batch(Box<Served>),
-    /// No batch came within the time given; ask again. The replay server says who waits for whom.
+    /// No batch arrived within the time-out; call again. The replay server reports which side waits for the other.
     NotYet(Waiting),
     /// The run is over: no further batch will come.
     Finished,
@@ -64,16 +64,16 @@ impl BatchSource {
         })
     }
 
-    /// Waits for the threads' end, which the end of the session brings about.
+    /// Waits until the threads have ended, which the end of the session causes.
     pub fn end(self) {
         drop(self.fetched);
         join_within(self.threads, THREADS_END_MAX);
     }
 
-    /// The next batch; batches in flight when the first thread learns of the end still arrive.
+    /// Returns the next batch. Batches in flight when the first thread learns that the run is over still arrive.
     ///
     /// # Errors
-    /// The replay server was out of reach for too long, or refuses.
+    /// The replay server was unreachable for too long, or rejects a request.
     pub fn next(&mut self, timeout: Duration) -> Result<Next, BatchError> {
         let deadline = Instant::now() + timeout;
         while self.fetching > 0 {
@@ -82,13 +82,10 @@ impl BatchSource {
                 Ok(Fetched::Batch(served)) => return Ok(Next::Batch(served)),
                 Ok(Fetched::Finished) => self.fetching -= 1,
                 Ok(Fetched::Failed(e)) => return Err(e),
-                Err(mpsc::RecvTimeoutError::Timeout) => {
-                    return Ok(Next::NotYet(self.shared.waiting()));
-                }
-                Err(mpsc::RecvTimeoutError::Disconnected) if self.shared.shutdown.is_set() => break,
-                Err(mpsc::RecvTimeoutError::Disconnected) => {
+                Err(mpsc::RecvTimeoutError::Disconnected) if !self.shared.shutdown.is_set() => {
                     return Err(BatchError::ThreadsEnded);
                 }
+                Err(_) => return Ok(Next::NotYet(self.shared.waiting())),
             }
         }
         Ok(Next::Finished)

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use driml_protocol::{CodecError, session::SessionError};
 
-/// What keeps a learner from its batches.
+/// Why a learner gets no batches.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum BatchError {
@@ -13,10 +13,10 @@ pub enum BatchError {
         unreachable_max: Duration,
         source: Box<Self>,
     },
-    /// The replay server will not give what is asked for; it would refuse again.
+    /// The replay server rejects the request, and would reject a retry.
     #[error("the replay server refuses: {0}")]
     Refused(String),
-    /// A request that cannot be sent, or an answer that did not come.
+    /// A request could not be sent, or its reply did not arrive.
     #[error(transparent)]
     Session(#[from] SessionError),
     #[error("a shard's status: {0}")]
@@ -25,13 +25,13 @@ pub enum BatchError {
     Damaged(#[from] CodecError),
     #[error("the shards' parts do not fit together")]
     DifferentShards,
-    /// The threads are gone although nothing has stopped them.
+    /// The threads have ended without a shutdown.
     #[error("the threads that fetch batches have ended")]
     ThreadsEnded,
 }
 
 impl BatchError {
-    /// Whether a replay server has said that it reads its replay back from disk: it is there, and will answer.
+    /// Whether a replay server has replied that it recovers its replay from disk. It is reachable, and will serve batches later.
     pub(crate) const fn is_recovering(&self) -> bool {
         matches!(
             self,

@@ -1,4 +1,4 @@
-//! One thread that fetches batches: from one replay server, or each put together from the parts of several shards.
+//! One thread that fetches batches: from one replay server, or assembled from the parts of several shards.
 //! It does not queue them: `batch_source` does.
 
 use std::{
@@ -24,31 +24,31 @@ use super::{
 };
 use crate::progress::{Progress, ServedPart};
 
-/// One request; the replay server answers within a second, if only to say that there is nothing yet.
+/// Time-out of a request. A replay server replies within a second, if only that it has no batch yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
-/// Pause between two tries when the replay server is out of reach.
+/// Pause before a retry when the replay server is unreachable.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 
-/// Pause before shards that hold nothing are asked again.
+/// Pause before empty shards are asked again.
 const LOOK_AGAIN: Duration = Duration::from_millis(50);
-/// How long the last batch is waited for once all transitions are in and no shard fills its memory again.
+/// How long to wait for the last batch once all transitions are stored and no shard refills its memory.
 const LAST_BATCH_MAX: Duration = Duration::from_secs(30);
-/// What is asked for, by whom, and how.
+/// What the threads request, for which learner, and how.
 #[derive(Clone, Copy, Debug)]
 pub struct Requests {
-    /// The learner that has joined the run.
+    /// Identifier of the learner that has joined the run.
     pub learner: u64,
     /// Rows of a batch.
     pub rows: u32,
-    /// Requests on their way at once, and threads that wait for them.
+    /// Number of requests in flight, each with its own thread.
     pub in_flight: u32,
     /// Whether batches may come through shared memory.
     pub shared_memory: bool,
-    /// How long the replay server may be out of reach before the learner gives up.
+    /// How long the replay server may be unreachable before the learner gives up.
     pub unreachable_max: Duration,
 }
 
-/// How far the learner is, which it tells with each request.
+/// The learner's counts, which it sends with each request.
 #[derive(Debug)]
 pub struct Counters {
     /// Updates done in the whole run.
@@ -60,7 +60,7 @@ pub struct Counters {
 }
 
 impl Counters {
-    /// Those of a learner after so many updates, all of which are saved.
+    /// The counters of a learner after `updates` updates, all of which are saved.
     pub fn of(updates: u64, progress: &Progress) -> Arc<Self> {
         let shards = progress.shards.iter();
         Arc::new(Self {
@@ -70,7 +70,7 @@ impl Counters {
         })
     }
 
-    /// Those of a learner that has learned nothing.
+    /// The counters of a learner that has learned nothing.
     pub fn at_start(shards: usize) -> Arc<Self> {
         let mut progress = Progress::default();
         progress.spread_over(shards);
@@ -86,15 +86,15 @@ impl Counters {
     }
 }
 
-/// A batch, and where its rows are from.
+/// A batch, and the shards that its rows come from.
 pub struct Served {
-    /// What the learner learns from next.
+    /// The batch to learn from.
     pub batch: Batch,
-    /// Its rows by shard.
+    /// The batch's rows by shard.
     pub parts: Vec<ServedPart>,
 }
 
-/// What a fetching thread says.
+/// A message from a fetching thread.
 pub(super) enum Fetched {
     Batch(Box<Served>),
     Finished,
@@ -122,7 +122,7 @@ impl Shared {
             clients: clients.to_vec(),
             requests,
             counters: counters.clone(),
-            // A batch a thread, and the one that is learned from.
+            // With one replay server: a batch per thread, and the batch being learned from.
             pool: BufferPool::new(requests.in_flight as usize + clients.len()),
             partial: Mutex::new(PartialBatch::new(clients.len())),
             waiting: Mutex::default(),
@@ -130,7 +130,7 @@ impl Shared {
         })
     }
 
-    /// Which side waits for the other, by the last answer that was no batch.
+    /// Which side waits for the other, according to the last reply without a batch.
     pub(super) fn waiting(&self) -> Waiting {
         *lock(&self.waiting)
     }
@@ -138,7 +138,7 @@ impl Shared {
 
 pub(super) struct Fetcher {
     shared: Arc<Shared>,
-    /// The request for a whole batch that comes next.
+    /// Identifier of the next request for a whole batch.
     id: RequestId,
     rng: ChaCha8Rng,
     /// Whether batches may come through shared memory.
@@ -148,7 +148,7 @@ pub(super) struct Fetcher {
 
 impl Fetcher {
     pub(super) fn new(shared: &Arc<Shared>) -> Self {
-        // Which rows come from which shard follows from the order of answers, so this need not be the run's generator.
+        // The order of replies decides which rows come from which shard, so this need not be the run's generator.
         let mut rng = ChaCha8Rng::from_os_rng();
         Self {
             shared: shared.clone(),
@@ -175,7 +175,10 @@ impl Fetcher {
                     }
                     let unreachable_max = self.shared.requests.unreachable_max;
                     if silence.unanswered() <= unreachable_max {
-                        if let Some(more) = self.said.due() {
+                        // At a shutdown the server may be gone already.
+                        if !self.shared.shutdown.is_set()
+                            && let Some(more) = self.said.due()
+                        {
                             tracing::warn!("asking for a batch again: {e}{more}");
                         }
                         self.shared.shutdown.wait_timeout(RETRY_PAUSE);
@@ -203,7 +206,7 @@ impl Fetcher {
         }
     }
 
-    /// One batch; `None` where the replay has nothing yet.
+    /// Fetches one batch; `None` if the replay has none yet.
     fn fetch(&mut self) -> Result<Option<Fetched>, BatchError> {
         if self.shared.clients.len() > 1 {
             return self.fetch_from_shards();
@@ -223,7 +226,7 @@ impl Fetcher {
         })
     }
 
-    /// Counts what has come from a shard.
+    /// Counts the rows received from a shard.
     fn received(&self, shard: usize, part: &Batch) -> ServedPart {
         let rows = part.header.rows;
         self.shared.counters.received[shard].fetch_add(rows.into(), Ordering::AcqRel);
@@ -234,15 +237,15 @@ impl Fetcher {
         }
     }
 
-    /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
-    /// give, so that their rate limiters decide as one.
+    /// Assembles one batch from the parts of the shards. Only one batch is assembled at a time: each shard is told the counts of the
+    /// others, so that their rate limiters decide as one.
     fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
         let shared = self.shared.clone();
         let mut partial = lock(&shared.partial);
         if partial.parts.is_empty() && partial.is_whole() {
             self.recount(&mut partial, Portion::is_old)?;
             if !partial.begin(self.shared.requests.rows, &mut self.rng) {
-                // A run that had all its updates when it was resumed: nothing comes to be held any more.
+                // The run had all its updates when it was resumed: the shards stay empty.
                 if partial.all_in {
                     return Ok(Some(Fetched::Finished));
                 }
@@ -262,7 +265,7 @@ impl Fetcher {
         }
         let (mut finished, mut failed) = (false, None);
         for (shard, asked) in asked {
-            // A part that did not arrive is requested again, alone.
+            // Only the part that did not arrive is requested again.
             let answer = match self.answer(asked) {
                 Ok(answer) => answer,
                 Err(e) => {
@@ -303,7 +306,7 @@ impl Fetcher {
             return Ok(Some(Fetched::Batch(Box::new(Served { batch, parts }))));
         }
         self.recount(&mut partial, |_, _| true)?;
-        // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
+        // Once a part has come, a shard that reports the end may have been told outdated counts of the other shards.
         let is_over = finished && partial.parts.is_empty();
         let waited = partial.since_whole.unanswered();
         if !is_over && partial.all_in && waited > LAST_BATCH_MAX {
@@ -320,13 +323,13 @@ impl Fetcher {
             return Ok(Some(Fetched::Finished));
         }
         if partial.parts.is_empty() {
-            // Nothing was given, so draw anew: a shard that was not asked may hold back inserts until it hears how far the run is.
+            // No part came, so draw anew: a shard that was not asked may hold back inserts until a request tells it how far the run is.
             partial.withdraw();
         }
         Ok(is_over.then_some(Fetched::Finished))
     }
 
-    /// Asks the shards for which `is_due` says so what they have counted.
+    /// Fetches the counts of the shards for which `is_due` is true.
     fn recount(
         &self,
         partial: &mut PartialBatch,
@@ -369,12 +372,12 @@ impl Fetcher {
         Ok((asked, request.shared_memory))
     }
 
-    /// What a shard answers: a batch, or why there is none.
+    /// Receives a shard's reply: a batch, or why there is none.
     fn answer(
         &mut self,
         (asked, shared_memory): (PendingReply<BatchReply>, bool),
     ) -> Result<Result<Batch, NotReady>, BatchError> {
-        // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
+        // A process that may not map shared memory never receives the reply: the request looks unanswered.
         let (reply, payload) = asked.receive(&self.shared.pool).inspect_err(|e| {
             let unheard = matches!(
                 e,

@@ -1,5 +1,5 @@
-//! The learner as a process of a run: everything that knows zenoh stands here.
-//! What is learned, and how, it does not know: `learner` does.
+//! The learner as a process of a run. All code that uses zenoh is here.
+//! It does not know what is learned, or how: `learner` does.
 
 pub mod batch_source;
 mod error;

@@ -1,6 +1,5 @@
-//! What the learner publishes: each version of its weights and of its affinity to the replay server, priorities of the rows that it was
-//! served, its status on request.
-//! No update waits for any of it.
+//! Publishes a learner's weights, affinity and priorities to the replay servers, and its status on request.
+//! No update waits for any of this.
 
 use std::{
     collections::VecDeque,
@@ -18,20 +17,20 @@ use driml_protocol::{
 };
 use zenoh::query::Queryable;
 
-/// How long affinity or priorities may take to arrive, and how long weights.
+/// Time-out of sending affinity or priorities. Weights have a longer one.
 const TIMEOUT: Duration = Duration::from_secs(5);
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
-/// Updates whose priorities may wait to be sent. More than batches can be on their way: a replay server that answers to the one
-/// answers to the other. Beyond it the oldest are given up: their transitions keep the priorities that they have.
+/// Largest number of updates whose priorities wait to be sent, more than batches can be in flight: a replay server that sends batches
+/// also receives priorities. Beyond this, the oldest are dropped, and their transitions keep the priorities that they have.
 const PRIORITIES_MAX: usize = 128;
-/// Pause between two tries.
+/// Pause before a retry.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// The same while the replay server reads its replay back from disk: weights are megabytes.
+/// Pause before a retry while the replay server recovers its replay from disk; longer, as weights are megabytes.
 const RECOVERY_PAUSE: Duration = Duration::from_secs(2);
-/// How often a thread that has nothing to send looks whether it should end.
+/// How often a thread that has nothing to send checks whether it should end.
 const TICK: Duration = Duration::from_millis(200);
 
-/// The learner's publisher; dropping it ends the answers about its status, a shutdown its threads.
+/// The learner's publisher. Dropping it ends the replies to status requests; a shutdown ends its threads.
 pub(crate) struct Publisher {
     /// The number by which the replay server knows this learner.
     pub(crate) learner: u64,
@@ -39,19 +38,19 @@ pub(crate) struct Publisher {
     fetched: Arc<AtomicBool>,
     weights: Arc<Outbox<Weights>>,
     pub(crate) affinity: Arc<Outbox<AffinityUpdate>>,
-    /// Of an update's rows each, sent in order, each until every shard has said that it has it.
+    /// The priorities of the rows of one update each. They are sent in order, each until every shard has acknowledged it.
     pub(crate) priorities: Arc<Outbox<PriorityUpdate>>,
     _queryables: Vec<Queryable<()>>,
 }
 
-/// A bounded queue of what is sent, the oldest first; in a full one the oldest gives way.
+/// A bounded queue of values to send, oldest first. If it is full, a new value replaces the oldest.
 pub(crate) struct Outbox<T> {
     waiting: Mutex<VecDeque<T>>,
     most: usize,
     filled: Condvar,
-    /// None waits, and none is being sent.
+    /// Whether no value waits or is being sent.
     idle: AtomicBool,
-    /// How many all replay servers have.
+    /// Number of values that all replay servers have acknowledged.
     pub(crate) arrived: AtomicU64,
 }
 
@@ -66,7 +65,7 @@ impl<T> Outbox<T> {
         })
     }
 
-    /// Queues it; in a full queue it replaces the oldest.
+    /// Queues a value. If the queue is full, the oldest value is dropped.
     pub(crate) fn put(&self, value: T) {
         let mut waiting = lock(&self.waiting);
         if waiting.len() == self.most {
@@ -78,7 +77,7 @@ impl<T> Outbox<T> {
         self.filled.notify_one();
     }
 
-    /// Takes the oldest that is there, waiting for one for a while; what was taken before has then been sent.
+    /// Takes the oldest value, and waits for one up to [`TICK`]. A call means that the value taken before has been sent.
     fn take(&self) -> Option<T> {
         let waiting = lock(&self.waiting);
         self.idle.store(waiting.is_empty(), Ordering::Relaxed);
@@ -89,14 +88,14 @@ impl<T> Outbox<T> {
         waiting.pop_front()
     }
 
-    /// Whether the next one that comes takes the place of another.
+    /// Whether the next value would replace the oldest.
     fn is_full(&self) -> bool {
         lock(&self.waiting).len() == self.most
     }
 }
 
 impl Publisher {
-    /// Declares the status in every session, and starts the threads that send weights, affinity and priorities as those of `learner`.
+    /// Declares the status in every session, and starts the threads that send weights, affinity and priorities for `learner`.
     pub(crate) fn open(
         clients: &[RunClient],
         spec_hash: u64,
@@ -157,8 +156,8 @@ impl Publisher {
         Ok(this)
     }
 
-    /// Hands the weights over to the replay server, which announces them and gives them to actors; those that were not sent yet
-    /// are replaced.
+    /// Queues the weights for the replay servers, which announce them and give them to actors. Replaces weights that were not sent
+    /// yet.
     pub(crate) fn publish(&self, weights: Weights) {
         let mut status = lock(&self.status);
         status.weights_version = weights.header.version;
@@ -172,8 +171,8 @@ impl Publisher {
         self.weights.put(weights);
     }
 
-    /// Waits until the status was fetched once after the learner finished and its last weights were sent, or for `wait_max`. After
-    /// `shutdown` nothing more is sent.
+    /// Waits until the status was fetched once after the learner finished and its last weights were sent, for at most `wait_max`. After
+    /// `shutdown`, it waits for the status alone, as nothing more is sent.
     pub(crate) fn wait_until_heard(&self, wait_max: Duration, shutdown: &Shutdown) {
         let started = Instant::now();
         let idle = || shutdown.is_set() || self.weights.idle.load(Ordering::Relaxed);
@@ -187,7 +186,7 @@ impl Publisher {
     }
 }
 
-/// Sends the newest of its kind to all replay servers, again until each has said that it has it or something newer is there.
+/// Sends values of one kind to all replay servers. Retries until each has acknowledged a value, or the queue of newer values is full.
 struct Sender {
     what: &'static str,
     clients: Vec<RunClient>,
@@ -197,7 +196,7 @@ struct Sender {
 }
 
 impl Sender {
-    /// Starts a thread that sends until the shutdown; `message` makes the bytes of what is sent.
+    /// Starts a thread that sends until the shutdown; `message` encodes a value.
     fn start<T: Send + 'static, R: Request<Reply = Ack>>(
         mut self,
         newest: Arc<Outbox<T>>,
@@ -222,7 +221,7 @@ impl Sender {
         Ok(())
     }
 
-    /// Whether all replay servers have it.
+    /// Sends `message` to all replay servers, with retries while `is_old` is false. Returns whether all have acknowledged it.
     fn send_to_all<R: Request<Reply = Ack>>(
         &mut self,
         message: &Sealed<R>,

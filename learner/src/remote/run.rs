@@ -1,5 +1,5 @@
-//! One learner process: join, learn from batch after batch, publish, save, until told to stop.
-//! The learning itself is `learner`, which knows no network.
+//! One learner process: joins the run, learns from batches, publishes weights and saves checkpoints, until told to stop.
+//! The learning itself is in `learner`, which uses no network connections.
 
 use std::{
     path::{Path, PathBuf},
@@ -25,21 +25,21 @@ use crate::{
     learner::{Learner, LearnerError},
 };
 
-/// How long a replay server may take to say what it has stored in the end.
+/// Time-out of the last request for the number of transitions that a replay server has stored.
 const LAST_COUNT_MAX: Duration = Duration::from_secs(1);
-/// How long a learner stays in the end to send its last weights and to be asked for its last status.
+/// How long a learner stays at the end, until its last weights have arrived and its last status was requested.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
 /// How long a batch may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
-/// How often a waiting learner looks whether it should stop.
+/// How often a waiting learner checks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
 
-/// What a learner is told at its start; everything else comes from the replay server.
+/// The arguments of a learner; everything else comes from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
     /// Endpoints of the replay server; one for each shard.
     pub connect: Vec<String>,
-    /// With which certificate it takes part; none without TLS.
+    /// The certificate of this process; `None` without TLS.
     pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
@@ -47,21 +47,22 @@ pub struct RunArgs {
     pub run_dir: PathBuf,
     /// The device on which updates are computed.
     pub device: DeviceName,
-    /// Begin the run again from the first update, where an earlier learner has learned and this one has no checkpoint of it.
+    /// Restart the run from its first update, if an earlier learner made updates of which this one has no checkpoint.
     pub restart: bool,
-    /// Stay when the run is over, to be asked, until `shutdown`.
+    /// Keep running when the run is over, to reply to requests, until `shutdown`.
     pub keep_alive: bool,
 }
 
-/// Runs the learner until the run has no more batches, or `shutdown`. Whatever ends it, it saves what it has learned.
+/// Runs the learner until the run has no more batches, or `shutdown`, and returns whether it was the former. Either way, and after an
+/// error, it saves what it has learned.
 ///
 /// # Errors
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
-pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let credentials = args.credentials.as_ref();
     let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
-        return Ok(());
+        return Ok(false);
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
@@ -106,7 +107,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let progress = (updates, &*progress);
     let joined = shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
     let Some(membership) = joined else {
-        return Ok(());
+        return Ok(false);
     };
     learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
@@ -148,7 +149,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         tracing::info!("ends early, after {} updates", learner.updates());
     }
     activity.begin("saves its last checkpoint");
-    // What was stored since the last batch counts too.
+    // Transitions stored since the last batch count too.
     for (shard, client) in clients.iter().enumerate() {
         match client.fetch::<ReplayStatus>(LAST_COUNT_MAX) {
             Ok(status) => learner
@@ -161,7 +162,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if learned.is_ok() && !learner.publication_is_due() {
         publisher.publish(learner.next_weights()?);
     }
-    learned.and(saved.map_err(Into::into))?;
+    let is_over = learned?;
+    saved?;
     publisher.with_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
     if args.keep_alive {
@@ -173,17 +175,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         let arrived = publisher.priorities.arrived.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
     }
-    if !shutdown.is_set() {
+    if is_over {
         let (updates, who) = (learner.updates(), Participant::Learner(requests.learner));
         reporter::say_finished(&clients, who, updates, shutdown);
     }
     drop(membership);
     let closed = shards.close();
     batches.end();
-    closed
+    closed.map(|()| is_over)
 }
 
-/// Learns from batch after batch, until there are no more or `shutdown`.
+/// Learns from batch after batch until there are no more, which returns true, or until `shutdown`.
 fn learn(
     learner: &mut Learner,
     batches: &mut BatchSource,
@@ -191,7 +193,7 @@ fn learn(
     checkpointer: &mut Checkpointer,
     activity: &Activity,
     shutdown: &Shutdown,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<bool> {
     // A wait is logged after some seconds, then ever more seldom.
     let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
@@ -207,7 +209,7 @@ fn learn(
                 }
                 continue;
             }
-            Next::Finished => break,
+            Next::Finished => return Ok(true),
         };
         activity.begin("learns");
         said_next = SILENT_MAX;
@@ -216,7 +218,7 @@ fn learn(
         learner.progress_mut().note(&parts);
         let counters = &checkpointer.counters;
         counters.updates.store(learner.updates(), Ordering::Release);
-        // Numbered by updates, which no life of the learner counts backwards.
+        // Numbered by updates, which only increase within one learner process.
         let (by, number) = (publisher.learner, learner.updates());
         if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
             publisher.priorities.put(priorities);
@@ -238,17 +240,17 @@ fn learn(
             checkpointer.save(learner);
         }
     }
-    Ok(())
+    Ok(false)
 }
 
-/// Keeps checkpoints of one learner. A disk that refuses does not end the training: the next period tries again, and only what
-/// cannot be saved in the end is an error.
+/// Saves the checkpoints of one learner. A failing disk does not end the training: the next period tries again, and only a failure of
+/// the last save is an error.
 struct Checkpointer {
     folder: PathBuf,
     counters: Arc<Counters>,
-    /// Updates and frames in the newest checkpoint that was saved here.
+    /// Updates and frames in the newest checkpoint that this process saved.
     saved: Option<(u64, u64)>,
-    /// The first failure since then.
+    /// The first failure since that checkpoint.
     failed: Option<LearnerError>,
 }
 
@@ -275,7 +277,7 @@ impl Checkpointer {
         (learner.updates(), learner.progress().frames())
     }
 
-    /// Saves what is not saved yet: updates, and frames that were stored since.
+    /// Saves a last checkpoint, if updates were made or frames stored since the newest one.
     fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
         if self.saved != Some(Self::counts(learner)) {
             self.save(learner);
@@ -284,8 +286,8 @@ impl Checkpointer {
     }
 }
 
-/// Leaves the run's settings beside the checkpoints, for `driml evaluate`, in place of those of an earlier start; a file that begins with
-/// a comment is the launcher's.
+/// Writes the run's settings beside the checkpoints, for `driml evaluate`, and replaces those of an earlier start. A file that begins
+/// with a comment is the launcher's and stays unchanged.
 fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
     let path = run_dir.join("config.toml");
     let there = std::fs::read_to_string(&path).unwrap_or_default();

@@ -1,5 +1,5 @@
-//! The replay's shards as the learner sees them: joining them all, and which rows of a batch come from which.
-//! It fetches nothing: `fetcher` does.
+//! The replay's shards: joins them all, and decides how many rows of a batch come from each.
+//! It fetches no batches: `fetcher` does.
 
 use std::{
     sync::Arc,
@@ -18,17 +18,17 @@ use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use crate::progress::{Progress, ServedPart};
 
-/// Age up to which a shard's counts are used, and that of one that holds nothing.
+/// Largest age at which a shard's counts are used, and the same for an empty shard.
 const AGE_MAX: Duration = Duration::from_millis(500);
 const EMPTY_AGE_MAX: Duration = Duration::from_millis(50);
 
-/// Sessions with all shards of a run, in the order of their numbers, and what the run's settings are.
+/// Sessions with all shards of a run, in the order of their numbers, and the run's settings.
 pub(crate) struct Shards {
     pub(crate) sessions: Vec<Session>,
     pub(crate) config_toml: String,
 }
 
-/// The learner's part in a run, which ends when this is dropped.
+/// The learner's membership in a run, which ends when this value is dropped.
 pub(crate) struct Membership {
     /// Version of the newest weights that any shard has; 0 if none has any.
     pub(crate) weights_version: u64,
@@ -36,7 +36,7 @@ pub(crate) struct Membership {
 }
 
 impl Shards {
-    /// Joins the shard at each endpoint; `None` if told to stop before.
+    /// Joins the shard at each endpoint; `None` if the shutdown comes first.
     pub(crate) fn join(
         connect: &[String],
         keys: &Keys,
@@ -59,7 +59,7 @@ impl Shards {
             run_infos.push(run_info);
         }
         let config_toml = one_run(connect, &run_infos)?.config_toml.clone();
-        // A learner that joins again may have its endpoints in another order.
+        // When a learner joins again, its endpoints may have another order.
         let mut shards: Vec<_> = run_infos.iter().zip(sessions).collect();
         shards.sort_by_key(|(run_info, _)| run_info.shard.0);
         let sessions = shards.into_iter().map(|(_, session)| session);
@@ -75,8 +75,8 @@ impl Shards {
         self.sessions.iter().map(client).collect()
     }
 
-    /// Takes part as the run's one learner, `learner`, which is after `updates` and has counted `progress`; `restart` begins the run
-    /// again. `None` if told to stop before.
+    /// Joins the run as its one learner, `learner`, after `updates` updates and with the counts `progress`. `restart` restarts the run
+    /// from its first update. `None` if the shutdown comes first.
     pub(crate) fn take_part(
         &self,
         clients: &[RunClient],
@@ -90,7 +90,7 @@ impl Shards {
             _alive: Vec::new(),
         };
         for (shard, client) in clients.iter().enumerate() {
-            // Before it joins, so that no other learner can take its place from then on.
+            // Declared before the learner joins, so that no other learner can take its place from then on.
             let alive = client.declare_alive(Alive::learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
             membership._alive.push(alive);
@@ -112,7 +112,7 @@ impl Shards {
         Ok(Some(membership))
     }
 
-    /// Closes all sessions; the first error, if there is one.
+    /// Closes all sessions; returns the first error, if there is one.
     pub(crate) fn close(&self) -> anyhow::Result<()> {
         let mut all = Ok(());
         for session in &self.sessions {
@@ -123,7 +123,7 @@ impl Shards {
     }
 }
 
-/// What the shards say of the one run that they all belong to.
+/// Checks that the endpoints are all shards of one run, and returns the run's information.
 fn one_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&'a RunInfo> {
     let first = run_infos
         .first()
@@ -151,29 +151,29 @@ fn one_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&
     Ok(first)
 }
 
-/// What one shard says of itself, and what it gives to a batch.
+/// One shard's counts, and its part of the current batch.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Portion {
     counts: ShardCounts,
     held: u64,
-    /// When it said so; none before it is asked first.
+    /// When the counts arrived; `None` before the first time.
     last_seen: Option<Instant>,
-    /// Rows that are still to come from it.
+    /// Rows of the batch that the shard has not sent yet.
     pub(super) pending: u32,
-    /// The chance with which each row was given to it.
+    /// The probability with which each row was assigned to the shard.
     pub(super) share: f64,
-    /// The request for a part that it gets next.
+    /// Identifier of the next request for a part.
     pub(super) id: RequestId,
 }
 
 impl Portion {
-    /// Takes what the shard has counted by now, and how many transitions it holds.
+    /// Stores what the shard has counted by now, and how many transitions it holds.
     pub(super) fn note(&mut self, counts: ShardCounts, held: u64) {
         (self.counts, self.held) = (counts, held);
         self.last_seen = Some(Instant::now());
     }
 
-    /// Whether it is to be asked again: others must not decide by what is old, and one that held nothing may hold something now.
+    /// Whether to fetch the counts again: other shards must not decide by old counts, and an empty shard may have received transitions.
     pub(super) fn is_old(&self, now: Instant) -> bool {
         let age_max = if self.held == 0 {
             EMPTY_AGE_MAX
@@ -185,15 +185,15 @@ impl Portion {
     }
 }
 
-/// The one batch that is assembled from the parts of several shards. It outlives a failed try, because a part that was
-/// given is counted as sampled.
+/// The one batch that is assembled from the parts of several shards. It survives a failed try, because a shard counts a part that it
+/// has sent as sampled.
 pub(super) struct PartialBatch {
     pub(super) portions: Vec<Portion>,
     pub(super) parts: Vec<Batch>,
     pub(super) from: Vec<ServedPart>,
-    /// All transitions of the run are in.
+    /// Whether all transitions of the run are stored.
     pub(super) all_in: bool,
-    /// Since the last whole batch, or since the transitions that this one may wait for are in.
+    /// Time since the last whole batch, or since the transitions that this batch may wait for were stored.
     pub(super) since_whole: Silence,
 }
 
@@ -212,7 +212,7 @@ impl PartialBatch {
         }
     }
 
-    /// Takes what shards said: whether all transitions of the run are in.
+    /// Records whether the shards report that all transitions of the run are stored.
     pub(super) fn note_all_in(&mut self, all_in: bool) {
         if all_in && !self.all_in {
             self.all_in = true;
@@ -220,20 +220,20 @@ impl PartialBatch {
         }
     }
 
-    /// Takes why a shard does not give its part yet. It knows what the others have: one that warms up lost its replay and fills it again.
+    /// Records why a shard does not send its part yet. It knows the others' counts: if it warms up, it lost its replay and refills it.
     pub(super) fn note_waiting(&mut self, waiting: Waiting) {
         if matches!(waiting, Waiting::WarmUp { .. }) {
             self.since_whole.answered();
         }
     }
 
-    /// Whether no row is still to come.
+    /// Whether all rows have arrived.
     pub(super) fn is_whole(&self) -> bool {
         self.portions.iter().all(|it| it.pending == 0)
     }
 
-    /// Begins a batch of `rows` rows: each row's shard is drawn in proportion to what the shards hold, so that every transition of
-    /// the whole replay is as likely as any other. Nothing begins, and the result is false, if they hold nothing.
+    /// Begins a batch of `rows` rows. Each row's shard is drawn in proportion to the transitions that the shards hold, so that all
+    /// transitions of the replay are equally likely. Returns false and begins no batch if the shards are empty.
     pub(super) fn begin(&mut self, rows: u32, rng: &mut impl Rng) -> bool {
         let total: u64 = self.portions.iter().map(|it| it.held).sum();
         if total == 0 {
@@ -255,12 +255,12 @@ impl PartialBatch {
         true
     }
 
-    /// Gives up a batch of which no part has come, so that the next one is drawn anew.
+    /// Abandons a batch of which no part has arrived, so that the next one is drawn anew.
     pub(super) fn withdraw(&mut self) {
         self.portions.iter_mut().for_each(|it| it.pending = 0);
     }
 
-    /// What all shards but `this` will have counted once each has given its pending rows.
+    /// The sum of the counts of all shards except `this`, as if each had already sent its pending rows.
     pub(super) fn other_shards(&self, this: usize) -> ShardCounts {
         let others = self.portions.iter().enumerate();
         let others = others.filter(|(shard, _)| *shard != this);

@@ -1,5 +1,5 @@
-//! What holds of agents with an auxiliary loss: too few positives, CPC's offsets, CURL's two views.
-//! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
+//! Agents with an auxiliary loss: too few positives, CPC's offsets, CURL's two views.
+//! `parity` checks the arithmetic; `served` tests a learner of each agent.
 
 use driml_learner::{
     Agent, AuxiliaryKind, Batch, Lambda, OwnedBatch, Positives, UpdateError, UpdateSettings,
@@ -17,14 +17,14 @@ pub(crate) const GLOBAL: Lambda = Lambda {
     ..NO_DIM
 };
 const POSITIVES: usize = 3;
-/// A loss of a program that has keys of later states.
+/// A loss that a program adds, whose keys are later states.
 const KEYS_OF_LATER: AuxiliaryKind = AuxiliaryKind::of(&MenuItem {
     positives: Positives::One,
     ..CURL_ITEM
 });
 const KEY_TAU: f64 = 0.25;
 
-/// The table `curl` with this pace, or nothing.
+/// The table `curl` with this `key_tau`, or an empty table.
 pub(crate) fn curl_table(key_tau: Option<f64>) -> toml::Table {
     let table = key_tau.map(|it| format!("curl.key_tau = {it:?}").to_lowercase());
     table.unwrap_or_default().parse().unwrap()
@@ -33,7 +33,7 @@ pub(crate) fn curl_table(key_tau: Option<f64>) -> toml::Table {
 /// The names and values of auxiliary losses.
 type Losses = Vec<(&'static str, f32)>;
 
-/// The one loss of an agent that has one.
+/// The only loss of an agent that has one.
 fn only(losses: &Losses) -> f32 {
     assert_eq!(losses.len(), 1, "{losses:?}");
     losses[0].1
@@ -58,7 +58,7 @@ fn agent(kind: AuxiliaryKind, lambda: Lambda) -> Agent {
     made(model, settings, &Compute::CPU, 1)
 }
 
-/// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.
+/// A batch of `rows` with `POSITIVES` positives per row.
 fn cpc<'a>(rows: &'a OwnedBatch, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
     Batch {
         positives: POSITIVES,
@@ -80,7 +80,7 @@ fn curl(rows: &OwnedBatch) -> Batch<'_> {
     }
 }
 
-/// `states` without those that are not `there`.
+/// `states` without the ones that are not `there`.
 fn packed(states: &[u8], there: impl ExactSizeIterator<Item = bool>) -> Vec<u8> {
     let states = states.chunks_exact(states.len() / there.len());
     let present = states.zip(there).filter(|(_, there)| *there);
@@ -98,7 +98,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         let mut rows = random_batch(6, 4);
         rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
         rows.positive_valid = vec![0, 1, 0, 1, 1, 1];
-        // What a loss that masks nothing sees of the states that are not there.
+        // A loss that masks nothing sees blank states in place of missing ones.
         let len = rows.states_k.len() / 6;
         for row in [0, 2] {
             rows.states_k[row * len..][..len].fill(0);
@@ -186,7 +186,7 @@ fn curl_compares_its_views_and_not_the_state() {
     let mut other = rows.clone();
     other.states_t.fill(3);
     assert_eq!(loss(&curl(&other)), before, "s_t itself");
-    // No row is masked: the end of an episode matters to neither view.
+    // No row is masked: the end of an episode does not affect either view.
     other.positive_valid.fill(0);
     assert_eq!(loss(&curl(&other)), before, "positive_valid");
     other.states_k.fill(3);
@@ -200,7 +200,7 @@ fn curl_compares_its_views_and_not_the_state() {
     assert_ne!(loss(&batch), before, "the key's view");
 }
 
-/// The part of `values` whose names pass `part`.
+/// The entries of `values` whose names pass `part`.
 fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
     let named = values.iter().filter(|(name, _)| part(name));
     named.map(|(name, v)| (name.clone(), v.clone())).collect()
@@ -215,7 +215,7 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     let start = part_of(&values(agent.online()), encoder);
     assert_eq!(key(&agent), start, "torso and psi_4, and nothing else");
     let mut average = start.clone();
-    // The target network moves once, at the third.
+    // The target network moves once, at the third update.
     for _ in 0..4 {
         agent.update(&curl(&rows)).unwrap();
         let online = values(agent.online());
@@ -234,7 +234,7 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     assert_ne!(average, start);
 }
 
-/// So that a comparison of agents compares the auxiliary loss alone.
+/// Thus a comparison of agents compares the auxiliary loss alone.
 #[test]
 fn c51_s_target_network_is_the_same_for_every_agent() {
     let rows = random_batch(6, 8);

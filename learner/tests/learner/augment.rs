@@ -1,5 +1,5 @@
-//! Augmentation: its law, its bounds, and that at no strength it changes no byte.
-//! What a crop, factors and a turn make of each byte is in the table of properties of `driml experiment stability`.
+//! Augmentation: its distribution, its bounds, and that it changes no byte at strength 0.
+//! `driml experiment stability` checks what a crop, factors and a turn make of each byte.
 
 use driml_learner::{Augment, AugmentSettings, augment::View};
 use rand::{Rng, SeedableRng};
@@ -31,7 +31,7 @@ fn noise(bytes: usize, seed: u64) -> Vec<u8> {
     (0..bytes).map(|_| rng.random()).collect()
 }
 
-/// Chi-square of counts against the uniform law.
+/// Chi-square of counts against the uniform distribution.
 fn chi_square(counts: &[u32]) -> f64 {
     let expected = f64::from(counts.iter().sum::<u32>()) / counts.len() as f64;
     let square = |&count: &u32| (f64::from(count) - expected).powi(2) / expected;
@@ -73,7 +73,7 @@ fn crops_are_of_a_share_of_each_side() {
     }
 }
 
-/// Every place of the crop comes equally often.
+/// Every position of the crop is equally frequent.
 #[test]
 fn crops_are_anywhere_with_equal_chances() {
     let augment = Augment::new(PAPER, (64, 64, 3), 3);
@@ -88,7 +88,7 @@ fn crops_are_anywhere_with_equal_chances() {
         counts[1][left] += 1;
         both[top * places + left] += 1;
     }
-    // Quantiles of 99.9%: 13 and 195 degrees of freedom.
+    // 99.9% quantiles for 13 and 195 degrees of freedom.
     assert!(chi_square(&counts[0]) < 34.5 && chi_square(&counts[1]) < 34.5);
     assert!(chi_square(&both) < 262.0, "{}", chi_square(&both));
 }
@@ -110,7 +110,7 @@ fn jitter_is_uniform_within_its_strength() {
     let mut products = [0.0; 3];
     for _ in 0..draws {
         let view = augment.draw(&mut rng);
-        // Each as a share of its range, from -1 to 1.
+        // Each relative to its range, from -1 to 1.
         let shares = [
             (view.brightness - 1.0) / 0.1,
             (view.contrast - 1.0) / 0.2,

@@ -1,5 +1,5 @@
-//! Checkpoints: which are kept, and what a crash leaves, made up by its files.
-//! Damage is tested in `checkpoint_damage`, and that a resumed run is the same run in `served`.
+//! Checkpoints: which are kept, and what a crash leaves, imitated with files.
+//! `checkpoint_damage` tests damage, and `served` that a resumed run is the same run.
 
 use std::{
     fs,
@@ -24,7 +24,7 @@ use crate::synthetic::{
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
-/// A learner's state at the start of a run that others have begun.
+/// A learner's state before its first update, in a run with earlier learners.
 pub(crate) fn start() -> LearnerState {
     let mut rng = ChaCha8Rng::seed_from_u64(99);
     let alphabet = Alphabet::raw(ACTIONS).unwrap();
@@ -73,7 +73,7 @@ fn resume(folder: &Path) -> LearnerState {
     run
 }
 
-/// The updates of the checkpoints that there are.
+/// The updates of the checkpoints in `folder`.
 fn listed(folder: &Path) -> Vec<u64> {
     let all = list(folder).unwrap();
     all.iter().map(|(updates, _)| *updates).collect()
@@ -95,7 +95,7 @@ pub(crate) fn progress() -> Progress {
     }
 }
 
-/// What the metadata says is for others: here it is any text.
+/// Metadata is for other programs: here it is any text.
 pub(crate) const DESCRIPTION: &str = r#"{"format":1}"#;
 const WITHOUT_HEADS: &str = r#"{"format":1,"model":{"dim":{}}}"#;
 
@@ -108,7 +108,7 @@ pub(crate) fn sha256(bytes: &[u8]) -> String {
     format!("{:x}", Sha256::digest(bytes))
 }
 
-/// Writes state.json with `change` made to it, and its sum.
+/// Applies `change` to state.json and writes it with its checksum.
 pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value)) {
     let file = path.join("state.json");
     let mut state = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
@@ -123,7 +123,7 @@ pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value))
     .unwrap();
 }
 
-/// A network of other sizes is not damage: the setting that differs is named.
+/// A network of other sizes is not reported as damage: the error names the setting that differs.
 #[test]
 fn a_checkpoint_of_another_network_says_which_setting_differs() {
     let folder = tempdir().unwrap();
@@ -161,7 +161,7 @@ fn a_checkpoint_of_another_network_says_which_setting_differs() {
 #[test]
 fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
     const BF16: Compute = Compute::cpu(Precision::Bf16);
-    // Of the total, relative; of parameters, absolute: a learning rate is 1e-3, and bf16 may turn the sign of a small gradient.
+    // Relative for the total, absolute for parameters: a learning rate is 1e-3, and bf16 may turn the sign of a small gradient.
     let (same, rounded) = ((1e-4, 1e-4), (1e-2, 2e-3));
     for (saver, loader, (total, parameter)) in [
         (&Compute::CPU, &CANDLE, same),
@@ -189,7 +189,7 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
             let other = resumed.online().get(name).unwrap();
             let difference = (var.as_tensor() - other.as_tensor()).unwrap().abs();
             let largest = difference.unwrap().max_all().unwrap();
-            // With the moments lost, the step would be of another size altogether.
+            // Without the moments, the step would have quite another size.
             let largest = largest.to_scalar::<f32>().unwrap();
             assert!(largest < parameter, "{name}: {largest}");
         }
@@ -212,11 +212,11 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
     assert_eq!(load(&folder).unwrap().unwrap().agent.updates(), 3);
 }
 
-/// The new one is there: whether an old one can be removed says nothing of it.
+/// A failure to remove an old checkpoint does not concern the new one.
 #[test]
 fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
     let folder = tempdir().unwrap();
-    // What removes a folder does not remove this, but gives it the name of an unfinished save.
+    // The removal works on folders only: this file is renamed like an unfinished save, but not removed.
     let stuck = folder.path().join("checkpoint-000000000000");
     fs::write(&stuck, "").unwrap();
     let mut run = start();
@@ -255,12 +255,12 @@ fn a_checkpoint_is_there_while_it_is_replaced() {
     fs::rename(&path, &replaced).unwrap();
     assert_eq!(listed(folder.path()), [1]);
     assert_eq!(bytes(&resume(folder.path())), bytes(&run));
-    // The next save gives it its name back.
+    // The next save gives the checkpoint its name back.
     learn(&mut run, 1);
     save(&run, folder.path(), 3);
     assert_eq!(listed(folder.path()), [1, 2]);
     assert!(path.exists() && !replaced.exists());
-    // And a crash after them.
+    // A crash after both renames.
     fs::create_dir(&replaced).unwrap();
     assert_eq!(listed(folder.path()), [1, 2]);
     save(&run, folder.path(), 3);
@@ -287,7 +287,7 @@ fn one_learner_saves_in_a_folder() {
     lock(folder.path()).unwrap();
 }
 
-/// Checkpoints of earlier versions say nothing of themselves, and load all the same.
+/// Checkpoints of earlier versions have no description, and load all the same.
 #[test]
 fn the_networks_say_what_they_are_and_need_not() {
     let folder = tempdir().unwrap();
@@ -311,7 +311,7 @@ fn the_networks_say_what_they_are_and_need_not() {
     assert_eq!(bytes(&resume(folder.path())), bytes(&run));
 }
 
-/// Against float64; the average does not affect learning.
+/// Compares the averaged weights with float64. The average does not affect learning.
 #[test]
 fn averaged_weights_follow_and_are_saved_and_played() {
     const TAU: f64 = 0.25;

@@ -1,4 +1,4 @@
-//! Checkpoints that are damaged, or hold what no learner wrote: each is an error that names the file, and none is skipped.
+//! Checkpoints that are damaged, or that no learner wrote: each gives an error that names the file, and none is skipped.
 
 use std::fs;
 
@@ -43,7 +43,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
             fs::write(&file, &whole[..cut]).unwrap();
             reported();
         }
-        // The last digit of a size that the network's description has.
+        // The last digit of a size in the network's description.
         let size = br#"hidden\":16"#;
         let size = whole.windows(size.len()).position(|it| it == size);
         assert_eq!(size.is_some(), name == "online.safetensors");
@@ -70,7 +70,7 @@ fn a_checkpoint_of_another_format_is_rejected() {
     let folder = tempdir().unwrap();
     let path = save(&start(), folder.path(), 1);
     for unknown in [0, 3, 5] {
-        // Whatever fields that one has.
+        // Another format may have any other fields.
         change_state(&path, |state| {
             *state = serde_json::json!({ "format": unknown, "field": 1 });
         });
@@ -139,7 +139,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
             refused(&run, &change(|values| values.truncate(1)), name);
             refused(&run, &change(|values| values.clear()), name);
             refused(&run, &change(|values| values.push(0.into())), name);
-            // As JSON has a number that is not finite.
+            // JSON's form of a number that is not finite.
             refused(&run, &change(|values| values[0] = ().into()), "state.json");
         }
         for (raw, len) in [

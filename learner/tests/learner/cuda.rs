@@ -1,4 +1,4 @@
-//! Updates on an NVIDIA GPU beside those of the CPU. Built with the feature `cuda` alone; run with
+//! Compares updates on an NVIDIA GPU with updates on the CPU. Built only with the feature `cuda`; run with
 //! `cargo test --release --features driml-learner/cuda -p driml-learner --test learner -- --ignored cuda`.
 
 use driml_learner::{Compute, DeviceName, Precision};
@@ -6,8 +6,8 @@ use driml_model::{ModelConfig, TorsoName};
 
 use crate::synthetic::{ALL_DIM, batch_of, made, model, settings};
 
-/// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had a stream, most updates
-/// after the first computed with states that were not there yet. Batches have to be large for that to show.
+/// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had its own stream, most
+/// updates after the first used states that had not arrived yet. Only large batches show this.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn updates_on_a_gpu_follow_those_on_the_cpu() {

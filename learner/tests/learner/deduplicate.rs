@@ -1,4 +1,4 @@
-//! Equal states of a batch that are computed once: what an update gives with it and without.
+//! Equal states of a batch that are computed once: compares the update with and without this.
 
 use candle_core::Tensor;
 use driml_learner::{AuxiliaryKind, Batch, Compute, Lambda, OwnedBatch, Precision};
@@ -11,7 +11,7 @@ use crate::synthetic::{
 
 const ROWS: usize = 40;
 
-/// Losses, logits, next actions and targets of a batch, and the gradients.
+/// Losses, logits, next actions and targets of a batch, and its gradients.
 #[derive(PartialEq)]
 struct Found {
     forward: (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>),
@@ -47,7 +47,7 @@ fn found(
     Found { forward, gradients }
 }
 
-/// Which planes hold states that repeat others.
+/// Which columns hold states that repeat others.
 #[derive(Clone, Copy, PartialEq)]
 enum Repeat {
     Nowhere,
@@ -55,7 +55,7 @@ enum Repeat {
     Everywhere,
 }
 
-/// Random rows; where states repeat, every third is an earlier one of s_t, as where a scene stands still.
+/// Random rows. If states repeat, every third one is an earlier s_t, as when a scene stands still.
 fn rows(repeat: Repeat) -> OwnedBatch {
     let mut rows = random_batch(ROWS, 3);
     let len = rows.states_t.len() / ROWS;
@@ -110,14 +110,14 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
                     "{case}: the same bits forward"
                 );
                 let (each, once) = (each.gradients, once.gradients);
-                // Views of states never count as equal, and a target has no gradient.
+                // Augmented states are never shared, and a target has no gradient.
                 if repeat != Repeat::Everywhere || auxiliary_loss == CURL {
                     assert!(each == once, "{case}: the same bits of gradients");
                     continue;
                 }
                 assert!(each != once, "{case}: nothing was left out");
                 assert_eq!(each.len(), once.len());
-                // A sum of gradients is rounded to bf16 once, not each of them.
+                // The sum of gradients is rounded to bf16 once, instead of each gradient.
                 let tolerance = match precision {
                     Precision::F32 => 1e-6,
                     Precision::Bf16 => 1e-2,

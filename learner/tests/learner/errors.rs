@@ -1,5 +1,5 @@
 //! Errors of an update change nothing.
-//! What a batch from the replay server must be is `served`'s.
+//! `served` checks the requirements on a batch from the replay server.
 
 use candle_core::{Device, Tensor};
 use driml_learner::{Agent, Batch, OwnedBatch, UpdateError};
@@ -12,7 +12,7 @@ use crate::synthetic::{
     settings,
 };
 
-/// What an update says that is refused, after which every weight has the bits that it had.
+/// Makes an update that fails, checks that every weight keeps its bits, and returns the error.
 fn refused(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
     let bits = |agent: &Agent| -> Vec<u32> {
         let all = agent.online().iter();
@@ -26,13 +26,13 @@ fn refused(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
     error
 }
 
-/// Double DQN, where the online network overflows on s_{t+n} and not on s_t, and the target network on neither.
+/// With double DQN, the online network overflows on s_{t+n} but not on s_t, and the target network on neither.
 #[test]
 fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
     let mut settings = settings(NO_DIM);
     settings.double_dqn = true;
     let agent = made(model(NO_DIM), settings, &Compute::CPU, 16);
-    // Black states have features of the biases alone.
+    // The features of black states depend on the biases alone.
     let mut agent = changed(agent, |name, values| {
         if name.starts_with("torso") && name.ends_with("weight") {
             values.iter_mut().for_each(|v| *v = v.abs() * 1e15);
@@ -98,7 +98,7 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
     }
 }
 
-/// A learner whose step size is `lr`.
+/// An agent with the learning rate `lr`.
 fn fast(compute: &Compute, lr: f64) -> Agent {
     let mut settings = settings(ALL_DIM);
     settings.adam.lr = lr;
@@ -115,12 +115,12 @@ fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
     }
 }
 
-/// A learner whose parameter `name` a step has just taken beyond the finite numbers, and what that step said.
+/// An agent whose parameter `name` became infinite in its last step, and the result of that step.
 pub(crate) fn diverged(compute: &Compute, name: &str) -> (Agent, Result<f64, UpdateError>) {
     let mut agent = fast(compute, 3e37);
     let evaluation = agent.evaluate(&random_batch(6, 31).batch()).unwrap();
     let gradient = evaluation.gradients.get(name).unwrap();
-    // As large as numbers get; the next step works again.
+    // The largest finite numbers, so that the next step overflows.
     let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);
     let var = agent.online().get(name).unwrap();
     var.set(&direction.unwrap()).unwrap();
@@ -137,7 +137,7 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
         let beyond = format!("update 1 took {name} beyond");
         check_says(said, &[&beyond, "newest checkpoint"]);
         check_says(agent.weights().unwrap_err(), &[name, "inf"]);
-        // Elsewhere than on the CPU it shows when the weights are asked for.
+        // With candle's operations, the error shows only when the weights are exported.
         let (agent, said) = diverged(&CANDLE, name);
         said.unwrap();
         check_says(agent.weights().unwrap_err(), &[name, "inf"]);

@@ -1,4 +1,4 @@
-//! What a learned network says of states agrees with what it learns by.
+//! The inspection of a trained network agrees with the loss that it was trained with.
 
 use driml_learner::{Compute, Lambda, insight::Insight};
 
@@ -20,7 +20,7 @@ fn distributions_have_the_network_s_values() {
     }
 }
 
-/// The mean of -ln of the probabilities is the loss of the same states.
+/// The mean of -ln of the probabilities equals the loss of the same states.
 #[test]
 fn matches_are_what_the_loss_is_made_of() {
     let (agent, mut rows) = (agent(ALL_DIM, 5), random_batch(4, 3));

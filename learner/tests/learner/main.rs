@@ -1,5 +1,5 @@
-//! The learner as its process uses it: updates on made-up batches, and checkpoints.
-//! The arithmetic's oracle is in `parity`; here is what must hold for any batch.
+//! The learner as its process uses it: updates on synthetic batches, and checkpoints.
+//! `parity` checks the arithmetic; these tests check what must hold for any batch.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,5 +1,5 @@
-//! Settings that float64 holds and float32 does not are refused by name, before anything is learned with them.
-//! What is computed within the ranges is tested beside each routine.
+//! Settings that float64 holds and float32 does not are rejected by name before anything is learned.
+//! The tests beside each routine check the computation within the ranges.
 
 use driml_learner::{AffinityConfig, UpdateSettings};
 use rand::SeedableRng;
@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{ALL_DIM, check_says, settings};
 
-/// A setting's name, values that are refused, and values that are not.
+/// A setting's name, values that are rejected, and values that are accepted.
 const RANGES: &str = "
 tanh_clip     : 0.0 1e-40 1e31 1e300           : 1e-30 20.0 1e15 1e30
 max_grad_norm : 0.0 1e-300 1e16 2e19 1e300     : 1e-6 10.0 1e15
@@ -48,7 +48,7 @@ fn what_float32_does_not_hold_is_refused_by_name() {
     }
 }
 
-/// Numbers of an affinity that cannot work, of either estimator, and their errors.
+/// Invalid settings of either affinity estimator, and their errors.
 const AFFINITY: &str = "
 exact = { decay = 0.0, smoothing = 1.0 }    : decay = 0.0
 exact = { decay = 1.1, smoothing = 1.0 }    : decay = 1.1

@@ -1,5 +1,5 @@
-//! What a learner of each agent does with batches as its replay server sends them: augmentation, priorities, checkpoints.
-//! Losses and gradients on made-up rows are in `agents`.
+//! A learner of each agent on batches as its replay server sends them: augmentation, priorities, checkpoints.
+//! `agents` tests losses and gradients on synthetic rows.
 
 use std::fs;
 
@@ -90,7 +90,7 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
         action: (row % 4) as u8,
         next_action: 0,
         n_step_return: rng.random_range(-1.0..1.0),
-        // The last one's episode ends.
+        // The episode of the last row ends.
         bootstrap_discount: if row < 5 { 0.9 } else { 0.0 },
         positives: positives.min(row) as u32,
         k_first: 1,
@@ -121,7 +121,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
             made(&config).update(&served(&config, 1)).unwrap()
         };
         let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(PAPER)));
-        // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
+        // The augmented states add rows to the pass, so the sum of gradients may round differently.
         assert_eq!(
             (plain.c51_kl, &plain.losses),
             (identity.c51_kl, &identity.losses)
@@ -132,7 +132,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
     }
 }
 
-/// The draws and the key encoder are part of a checkpoint: half a run and the other half are the run.
+/// Checkpoints contain the generator and the key encoder: half a run, resumed for the other half, equals the whole run.
 #[test]
 fn an_augmenting_run_resumes_bit_for_bit() {
     for auxiliary_loss in [CURL, DIM] {
@@ -140,7 +140,7 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         let mut config = config(auxiliary_loss, Some(PAPER));
         // A number that f32 does not hold exactly.
         config.model.v_max = 12.6;
-        // And one of whose digits a reader in a hurry makes its neighbour.
+        // A number whose digits an inexact parser reads as the neighbouring float.
         config.learner.affinity = AffinityConfig {
             estimator: EstimatorKind::Learned,
             alphabet: Some(AlphabetKind::Raw),
@@ -198,7 +198,7 @@ fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
     check_says(resume().unwrap_err(), &[missing]);
 }
 
-/// A refused batch leaves the generator where it was.
+/// A rejected batch leaves the generator unchanged.
 #[test]
 fn a_refused_batch_draws_nothing() {
     let config = config(CURL, Some(PAPER));
@@ -223,7 +223,7 @@ fn augmentation_and_auxiliary_loss_belong_together() {
     assert_eq!(wild.validate().unwrap_err().to_string(), wanted);
 }
 
-/// The chance of each row weights its C51 loss, at the beta of the update's number; nothing else, and the row's own loss comes back.
+/// The probability of each row weights its C51 loss alone, at the update's beta. The row's unweighted loss is reported.
 #[test]
 fn rows_drawn_by_priority_are_weighted_and_answered() {
     let uniform = config(DIM, None);
@@ -247,7 +247,7 @@ fn rows_drawn_by_priority_are_weighted_and_answered() {
     let plain = made(&uniform).update(&served(&uniform, 1)).unwrap();
     assert!(plain.row_kls.is_empty());
 
-    // Equal chances are a weight of 1 each.
+    // Equal probabilities give each row a weight of 1.
     let mut equal = made(&config);
     let report = equal.update(&drawn(&[0.25; 6])).unwrap();
     assert_eq!(report.losses, plain.losses);

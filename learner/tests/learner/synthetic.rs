@@ -1,4 +1,4 @@
-//! Small networks, settings and batches for these tests, and what several of them check.
+//! Small networks, settings and batches for these tests, and checks that several tests share.
 //! Nothing here is measured.
 
 use std::{collections::HashMap, fmt::Display};
@@ -100,7 +100,7 @@ pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
     made(model(lambda), settings(lambda), compute, seed)
 }
 
-/// A learner whose head is made so.
+/// An agent with the given head.
 pub(crate) fn agent_with(head: HeadConfig, settings: UpdateSettings, seed: u64) -> Agent {
     let model = ModelConfig {
         head,
@@ -116,7 +116,7 @@ pub(crate) fn random_batch(rows: usize, seed: u64) -> OwnedBatch {
     batch_of(rows, 20 * 24 * 2, seed)
 }
 
-/// With states of `frame_len` bytes.
+/// A random batch with states of `frame_len` bytes.
 pub(crate) fn batch_of(rows: usize, frame_len: usize, seed: u64) -> OwnedBatch {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut states = || -> Vec<u8> { (0..rows * frame_len).map(|_| rng.random()).collect() };
@@ -155,7 +155,7 @@ pub(crate) fn values(parameters: &Parameters) -> Values {
         .collect()
 }
 
-/// Checks that an error has all of these words.
+/// Checks that an error message contains each of these texts.
 #[track_caller]
 pub(crate) fn check_says(error: impl Display, all: &[&str]) {
     let said = error.to_string();
@@ -164,7 +164,7 @@ pub(crate) fn check_says(error: impl Display, all: &[&str]) {
     }
 }
 
-/// The agent with its online parameters changed in place.
+/// Changes the agent's online parameters in place, and returns the agent.
 pub(crate) fn changed(agent: Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
     for (name, var) in agent.online().iter() {
         let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();

@@ -1,5 +1,5 @@
-//! What holds for every update, and what nothing may touch.
-//! It compares with no outside numbers: `parity` does, and at extreme inputs the property "whole update" of `driml experiment stability`.
+//! Properties of every update, and state that no update may touch.
+//! `parity` compares with outside numbers; at extreme inputs, the property "whole update" of `driml experiment stability` does.
 
 use candle_core::Device;
 use driml_learner::{UpdateNoise, UpdateSettings};
@@ -43,7 +43,7 @@ fn rows_without_a_bootstrap_ignore_what_comes_after() {
             let action = first.next_greedy_action[row];
             assert_eq!(ended.contains(&row), action == NO_ACTION);
             if ended.contains(&row) {
-                // All of its mass is at its return, on the two atoms around it.
+                // All of the row's probability is at its return, on the two atoms around it.
                 assert!(law.iter().filter(|&&p| p > 0.0).count() <= 2, "{law:?}");
             }
         }
@@ -59,7 +59,7 @@ fn double_dqn_chooses_by_the_online_network() {
     for double_dqn in [false, true] {
         settings.double_dqn = double_dqn;
         let agent = made(model(NO_DIM), settings.clone(), &Compute::CPU, 16);
-        // The online network alone turns to action 2.
+        // Only the online network prefers action 2.
         let agent = changed(agent, |name, values| {
             if name == "head.bias" {
                 values[2 * 21 + 20] += 50.0;
@@ -86,7 +86,7 @@ fn actors_get_torso_and_head_and_nothing_else() {
 fn candle_s_own_operations_learn_the_same() {
     for lambda in [ALL_DIM, NO_DIM] {
         let (mut ours, mut theirs) = (agent(lambda, 1), agent_on(&CANDLE, lambda, 1));
-        // Past the third update the target network has moved.
+        // After the third update the target network has moved.
         for update in 0..5 {
             let rows = random_batch(8, update);
             let (a, b) = (
@@ -114,7 +114,7 @@ fn candle_s_own_operations_learn_the_same() {
 
 #[test]
 fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
-    // A kernel that its stride does not divide is candle's own convolution, whose gradient is a tracked tensor.
+    // A kernel size that the stride does not divide uses candle's own convolution, whose gradient is a tracked tensor.
     let mut model = model(NO_DIM);
     for (layer, kernel) in model.conv.iter_mut().zip([4, 3]) {
         (layer.kernel, layer.stride) = (kernel, 2);
@@ -131,7 +131,7 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
 
 #[test]
 fn learners_of_one_process_do_not_touch_each_other() {
-    // They share the pool: a thread that waits for one's products takes up another's whole update.
+    // The agents share the thread pool: a thread that waits for one agent's products may run a whole update of the other.
     const UPDATES: u64 = 12;
     let learned = |lambda| {
         let mut agent = agent(lambda, 1);
@@ -151,7 +151,7 @@ fn learners_of_one_process_do_not_touch_each_other() {
     });
 }
 
-/// Every update has its own noise, and in it each of the three networks; it is a function of the seed and the number of the update.
+/// Each of the three networks has its own noise in every update, a function of the seed and the number of the update.
 #[test]
 fn noise_is_drawn_anew_for_each_update_and_each_network() {
     let settings = UpdateSettings {
@@ -172,7 +172,7 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
     }
     assert!(one.noise() != first && one.noise() == same.noise());
     assert_eq!(values(one.online()), values(same.online()));
-    // Means alone, or another noise, is another loss.
+    // The means alone, or another noise, give another loss.
     let means = one.evaluate_with(&rows.batch(), &UpdateNoise::default());
     let (noisy, means) = (one.evaluate(&rows.batch()).unwrap(), means.unwrap());
     assert_ne!(noisy.c51_kl, means.c51_kl);

@@ -1,20 +1,20 @@
-//! The action-affinity matrix on its way from the learner to the replay server.
-//! It does not estimate: how A comes about is the learner's.
+//! The action-affinity matrix A, which the learner sends to the replay server.
+//! The learner estimates A elsewhere.
 
 use serde::{Deserialize, Serialize};
 
 use crate::wire::error::CodecError;
 
-/// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
+/// The matrix A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AffinityUpdate {
-    /// Which learner sends it: that of its [`LearnerJoin`](crate::LearnerJoin).
+    /// The sender's number, as in its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
-    /// Counts up from 1; an older one than this learner's newest is ignored.
+    /// Counts up from 1. The replay server ignores a version older than this learner's newest.
     pub version: u64,
-    /// Raw actions of the world, the side of the matrix.
+    /// Number of raw actions of the world, n: the side of the matrix.
     pub num_actions: u32,
-    /// [n, n] probabilities.
+    /// The probabilities [n, n].
     pub matrix: Vec<f32>,
 }
 

@@ -1,5 +1,5 @@
-//! Batches on their way from the replay server to the learner: how they are written, merged of parts, and read.
-//! It does not sample: which rows and which k are the replay server's choice.
+//! Batches that the replay server sends to the learner: how they are written, merged from parts, and read.
+//! The replay server chooses the rows and each k.
 
 use std::{borrow::Cow, ops::Range};
 
@@ -10,30 +10,29 @@ use super::{
 };
 use crate::wire::{buffers::Buffer, error::CodecError};
 
-/// Stands where a row has no next action: its transition ended the episode or the level.
+/// The value of a row's next action if its transition ended the episode or the level.
 pub const NO_ACTION: u8 = 255;
 
 /// Rows (s_t, a_t, a_{t+1}, R_t, discount, s_{t+k}, s_{t+n}), as the replay server made them.
 ///
-/// Buffer, one after the other: states_t [B, state bytes]; states_k of the positives that rows have, in the order of [P, B];
+/// The buffer holds, one after the other: states_t [B, state bytes]; states_k of the positives that rows have, in the order of [P, B];
 /// states_n of the rows that bootstrap; then B rows each: n-step return f32, bootstrap discount f32 (little-endian); action, next action,
-/// positive valid [P, B], k [P, B] (u8). Where rows are drawn by priority, then: transition u64, probability f32. No state travels
-/// that a row does not have.
+/// positive valid [P, B], k [P, B] (u8). Rows drawn by priority add: transition u64, probability f32. States that a row lacks are not sent.
 ///
-/// Where a state is a stack of frames, these come first, each once however many states have it; and in place of each state the
+/// If a state is a stack of frames, the frames come first, each once however many states contain it. In place of each state then stand the
 /// numbers of its frames, oldest first (u32).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Batch {
-    /// What it says of itself.
+    /// The batch's header.
     pub header: BatchHeader,
     payload: Buffer,
-    /// Who drew its rows by priority: so many at a time.
+    /// Which replay server drew the rows by priority, and how many: one entry per part of the batch.
     origins: Vec<(Origin, usize)>,
 }
 
 impl Batch {
-    /// A batch of `rows`, whose states are then to be written with [`Batch::states_mut`]; rows and states of `header` are set to
-    /// what `rows` has, its frames are as many as it says. `memory` gives so many bytes, with anything in them.
+    /// Creates a batch of `rows`, whose states the caller then writes with [`Batch::states_mut`]. The counts of rows and states come from
+    /// `rows`, the count of frames from `header`. `memory` returns a buffer of the given bytes, with arbitrary content.
     ///
     /// # Panics
     /// If the memory is of another size, or a row has more positives than the header.
@@ -58,7 +57,7 @@ impl Batch {
         batch.fill(Column::BootstrapDiscount, discounts);
         batch.fill(Column::Action, rows.iter().map(|row| [row.action]));
         batch.fill(Column::NextAction, rows.iter().map(|row| [row.next_action]));
-        // Of each positive [P, B] the k, if it is there.
+        // The k of each positive [P, B], if the row has it.
         let k = |p: u32, row: &RowScalars| (p < row.positives).then_some(row.k_first + p);
         let ks = (0..positives).flat_map(|p| rows.iter().map(move |row| k(p, row)));
         let valid = ks.clone().map(|k| [u8::from(k.is_some())]);
@@ -68,7 +67,7 @@ impl Batch {
         batch
     }
 
-    /// Writes the values of a column that is neither of states nor of frames.
+    /// Writes the values of a column of neither states nor frames.
     fn fill<const BYTES: usize>(
         &mut self,
         column: Column,
@@ -81,7 +80,7 @@ impl Batch {
         assert!(rest.is_empty() && values.next().is_none(), "{column:?}");
     }
 
-    /// A batch in memory that may hold anything.
+    /// Creates a batch in memory with arbitrary content.
     fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
         assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
         Self {
@@ -91,18 +90,18 @@ impl Batch {
         }
     }
 
-    /// The rows of all `parts`, one part after the other, in memory that may hold anything; as many bytes as
-    /// [`Batch::merged_header`] says.
+    /// Merges the rows of all `parts`, one part after the other. `memory` may have arbitrary content, and has the payload bytes of
+    /// [`Batch::merged_header`].
     ///
     /// # Panics
-    /// If there is no such header, or the memory is of another size.
+    /// If the parts have no common header, or the memory is of another size.
     pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
         for (column, _) in header.columns() {
             let mut to = &mut merged.payload[header.range(column)];
             let pieces: Vec<_> = parts.iter().map(|part| part.pieces(column)).collect();
-            // Of each positive, the rows of the part come together.
+            // For each positive, the rows of all parts are adjacent.
             for piece in 0..pieces[0].len() {
                 let mut frames_before = 0;
                 for (part, pieces) in parts.iter().zip(&pieces) {
@@ -123,7 +122,7 @@ impl Batch {
         merged
     }
 
-    /// The values of a column, those of each positive for themselves; all at once where a column is not of positives.
+    /// The values of a column, split by positive; a column without positives is one piece.
     fn pieces(&self, column: Column) -> Vec<&[u8]> {
         let values = self.column(column);
         match column {
@@ -143,9 +142,9 @@ impl Batch {
         }
     }
 
-    /// The header of [`Batch::merge`]; none if `parts` are none or differ in shape.
+    /// The header of [`Batch::merge`]; `None` if `parts` is empty or the parts differ in shape.
     pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
-        // What is the same in all parts.
+        // The fields that all parts must share.
         let shape = |it: &BatchHeader| {
             let frames = it.stacked.map(|it| StackedFrames { frames: 0, ..it });
             (it.positives, it.state_bytes, it.origin.is_some(), frames)
@@ -179,7 +178,7 @@ impl Batch {
         self.header.rows as usize
     }
 
-    /// Positives a row, P.
+    /// Positives per row, P.
     pub const fn positives(&self) -> usize {
         self.header.positives as usize
     }
@@ -192,7 +191,7 @@ impl Batch {
         self.header.f32s(column, &self.payload).collect()
     }
 
-    /// The states of a column; where they are stacks of frames, put together now.
+    /// The states of a column, assembled from their frames if they are stacks.
     fn states(&self, column: Column) -> Cow<'_, [u8]> {
         let values = self.column(column);
         match self.header.stacked {
@@ -204,7 +203,7 @@ impl Batch {
         }
     }
 
-    /// s_t [B, state bytes]; a state [H, W, C * stack] has a pixel's oldest channels first.
+    /// s_t [B, state bytes]. In a state [H, W, C * stack], the channels of a pixel stand oldest first.
     pub fn states_t(&self) -> Cow<'_, [u8]> {
         self.states(Column::StatesT)
     }
@@ -249,19 +248,19 @@ impl Batch {
         self.column(Column::K)
     }
 
-    /// The chance with which each row was drawn [B], where rows are drawn by priority.
+    /// The probability with which each row was drawn [B]; `None` if rows are drawn uniformly.
     pub fn probabilities(&self) -> Option<Vec<f32>> {
         self.header.origin?;
         Some(self.column_f32(Column::Probability))
     }
 
-    /// The transition of each row [B], by its number since the start of the replay that drew it; none where rows are drawn uniformly.
+    /// The number of each row's transition [B], since the start of the replay that drew it; empty if rows are drawn uniformly.
     fn transitions(&self) -> Vec<u64> {
         let (values, _) = self.column(Column::Transition).as_chunks();
         values.iter().copied().map(u64::from_le_bytes).collect()
     }
 
-    /// Writes of each row which transition it is, and the chance with which it was drawn.
+    /// Writes the number of each row's transition, and the probability with which the row was drawn.
     pub fn set_draws(&mut self, draws: &[(u64, f32)]) {
         assert!(self.header.origin.is_some(), "rows drawn by priority");
         assert_eq!(draws.len(), self.rows(), "a draw a row");
@@ -271,15 +270,15 @@ impl Batch {
         self.fill(Column::Probability, chances);
     }
 
-    /// Makes the chance of each row `share` of what it was: that its replay server was chosen.
+    /// Multiplies the probability of each row by `share`, the probability that its replay server was chosen.
     pub fn scale_probabilities(&mut self, share: f32) {
         let chances = self.probabilities().expect("rows drawn by priority");
         let scaled = chances.into_iter().map(|it| (it * share).to_le_bytes());
         self.fill(Column::Probability, scaled);
     }
 
-    /// What `learner` says back of rows that were drawn by priority: update `number`, with the `priorities` [B]; none where rows
-    /// are drawn uniformly.
+    /// Returns update `number` of `learner`, with the `priorities` [B] for the replay servers that drew the rows; `None` if rows are drawn
+    /// uniformly.
     pub fn priority_update(
         &self,
         learner: u64,
@@ -305,24 +304,24 @@ impl Batch {
         })
     }
 
-    /// The places of all states that the rows have.
+    /// Borrows the places of all states that the rows have, for writing.
     pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
         BatchStatesMut::new(self.header, &mut self.payload)
     }
 
-    /// Header and payload, to travel as a [`BatchReply`](super::batch_header::BatchReply).
+    /// Header and payload, to be sent as a [`BatchReply`](super::batch_header::BatchReply).
     pub fn into_payload(self) -> (BatchHeader, Buffer) {
         (self.header, self.payload)
     }
 
-    /// Takes the payload of a decoded reply, checking that it is as long as its header says, with the states that its rows say.
+    /// Makes a batch of a decoded reply. Checks that the payload has the length that `header` gives and the states that its rows need.
     pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.check_payload(&payload)?;
         Ok(Self::in_memory(header, payload))
     }
 }
 
-/// All of a row but its states.
+/// A row without its states.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RowScalars {
     /// a_t.
@@ -333,9 +332,9 @@ pub struct RowScalars {
     pub n_step_return: f32,
     /// gamma^n, or 0 where the row does not bootstrap.
     pub bootstrap_discount: f32,
-    /// Positives that the row has: the first so many of P.
+    /// Number of positives that the row has, the first of P.
     pub positives: u32,
-    /// k of the first of them; the others follow it step by step. It travels capped at 255.
+    /// k of the first positive; each further one has the next k. On the wire, k is capped at 255.
     pub k_first: u32,
 }
 
@@ -353,24 +352,24 @@ impl RowScalars {
 
 /// The places of a batch's states and their frames, borrowed for writing.
 ///
-/// States have numbers: those of s_t, then those of s_{t+k}, then those of s_{t+n}. Where a state is one frame, that has its number.
+/// States are numbered: first all s_t, then all s_{t+k}, then all s_{t+n}. If a state is one frame, the frame has the state's number.
 #[derive(Debug)]
 pub struct BatchStatesMut<'a> {
     rows: usize,
     frame_bytes: usize,
-    /// The frames that travel.
+    /// The frames in the payload.
     frames: &'a mut [u8],
-    /// Of each state, which of them it is made of; none where states are one frame each.
+    /// The numbers of each state's frames; empty if a state is one frame.
     stacks: &'a mut [u8],
     stack_bytes: usize,
-    /// Of each positive [P, B] the number of its state.
+    /// The number of the state of each positive [P, B].
     numbers_k: Vec<Option<usize>>,
-    /// Of each row the number of its s_{t+n}.
+    /// The number of each row's s_{t+n} [B].
     numbers_n: Vec<Option<usize>>,
 }
 
 impl<'a> BatchStatesMut<'a> {
-    /// Those of a payload whose scalars are written.
+    /// Borrows the places in a payload whose scalars are written.
     fn new(header: BatchHeader, payload: &'a mut [u8]) -> Self {
         let rows = header.rows as usize;
         let first_n = rows + header.states_k as usize;
@@ -391,26 +390,26 @@ impl<'a> BatchStatesMut<'a> {
         }
     }
 
-    /// The numbers of the states that `row` has, in this order: of s_t, of s_{t+n}, and of s_{t+k} of each positive.
+    /// The numbers of the states that `row` has: of s_t, of s_{t+n}, and of s_{t+k} of each positive, in this order.
     pub fn of_row(&self, row: usize) -> impl Iterator<Item = usize> {
         let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
         let first = [Some(row), self.numbers_n[row]];
         first.into_iter().chain(of_positives.copied()).flatten()
     }
 
-    /// Where frame `number` is written.
+    /// The place of frame `number`, for writing.
     pub fn frame(&mut self, number: usize) -> &mut [u8] {
         &mut self.frames[number * self.frame_bytes..][..self.frame_bytes]
     }
 
-    /// Says of which frames state `number` is made, oldest first.
+    /// Writes the numbers of the frames of state `number`, oldest first.
     pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
         let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
         StackedFrames::write(stack, frames);
     }
 }
 
-/// Of each its number, counted from `first` over those that are there.
+/// Numbers the entries of `there` that are true, from `first` on.
 fn numbers(there: &[bool], first: usize) -> Vec<Option<usize>> {
     let mut numbers = first..;
     let number = |&there: &bool| there.then(|| numbers.next()).flatten();

@@ -1,5 +1,5 @@
-//! States that are stacks of frames, as a batch carries them: each frame once, and of each state which frames it is.
-//! Which frames are the same the replay server knows by where it holds them; no bytes are compared.
+//! Stacked states as a batch contains them: each frame once, and for each state the numbers of its frames.
+//! The replay server knows equal frames by their place in its memory; no bytes are compared.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,19 +8,19 @@ use crate::run_spec::{FRAME_STACK_MAX, RunSpec};
 /// The number of a frame in its batch, little-endian.
 type Number = [u8; size_of::<u32>()];
 
-/// How the states of a batch are made of the frames that travel.
+/// How the states of a batch are stacks of the frames in the payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StackedFrames {
-    /// Frames that travel.
+    /// Frames in the payload.
     pub frames: u32,
-    /// Frames of one state, 2 to 16, oldest first along the channels.
+    /// Frames in one state, 2 to 16, oldest first along the channels.
     pub frame_stack: u32,
-    /// Bytes a pixel of a frame.
+    /// Bytes per pixel of a frame.
     pub frame_channels: u32,
 }
 
 impl StackedFrames {
-    /// Those of a batch of `rows` rows, no two of which share a frame; none where a state is one frame.
+    /// The stacks of a batch of `rows` rows, if no two rows share a frame; `None` if a state is one frame.
     pub(super) fn of(spec: &RunSpec, rows: u32) -> Option<Self> {
         (spec.frame_stack > 1).then(|| Self {
             frames: rows.saturating_mul(row_frames_max(spec)),
@@ -29,7 +29,7 @@ impl StackedFrames {
         })
     }
 
-    /// Whether `states` states of so many bytes can be made of them.
+    /// Whether the frames can form `states` states of `state_bytes` bytes.
     pub(super) fn fit(&self, states: usize, state_bytes: usize) -> bool {
         let stack = self.frame_stack as usize;
         let pixel_bytes = stack.checked_mul(self.frame_channels as usize);
@@ -42,17 +42,17 @@ impl StackedFrames {
         state_bytes / self.frame_stack as usize
     }
 
-    /// Bytes that say of which frames a state is made.
+    /// Bytes of the frame numbers of one state.
     pub(super) const fn stack_bytes(&self) -> usize {
         self.frame_stack as usize * size_of::<Number>()
     }
 
-    /// The first number in `stacks` that is not a frame's.
+    /// The first number in `stacks` that belongs to no frame.
     pub(super) fn first_unknown(&self, stacks: &[u8]) -> Option<u32> {
         numbers(stacks).find(|number| *number >= self.frames)
     }
 
-    /// Writes into `stack` of which frames a state is made, oldest first.
+    /// Writes the frame numbers `frames` of a state into `stack`, oldest first.
     pub(super) fn write(stack: &mut [u8], frames: &[u32]) {
         let (places, _) = stack.as_chunks_mut::<{ size_of::<Number>() }>();
         assert_eq!(places.len(), frames.len(), "a number for each of a stack");
@@ -61,14 +61,14 @@ impl StackedFrames {
         }
     }
 
-    /// Makes every number in `stacks` larger by `frames`.
+    /// Adds `frames` to every number in `stacks`.
     pub(super) fn shift(stacks: &mut [u8], frames: u32) {
         for place in stacks.as_chunks_mut().0 {
             *place = (u32::from_le_bytes(*place) + frames).to_le_bytes();
         }
     }
 
-    /// The states [.., H, W, C * stack] of which `stacks` says the frames; `frames` are those that travel, [.., H, W, C].
+    /// Assembles the states [.., H, W, C * stack] whose frame numbers are `stacks`, from `frames` [.., H, W, C].
     pub(super) fn stacked(&self, frames: &[u8], stacks: &[u8], state_bytes: usize) -> Vec<u8> {
         let (frame_bytes, stack) = (self.frame_bytes(state_bytes), self.frame_stack as usize);
         let stacks = stacks.chunks_exact(self.stack_bytes());
@@ -84,9 +84,9 @@ impl StackedFrames {
     }
 }
 
-/// Most distinct frames of a row: those of s_t, and those that come after it up to the last state.
+/// Returns the most distinct frames that a row may have: those of s_t, and those after it up to the last state.
 ///
-/// A later state adds no more frames than a stack has, nor more than steps lie between.
+/// A later state adds at most as many frames as a stack has, and at most as many as there are steps between.
 fn row_frames_max(spec: &RunSpec) -> u32 {
     let (stack, n, k_max) = (spec.frame_stack, spec.n_step, spec.horizon.k_max());
     let of_positives = k_max.min(stack.saturating_mul(spec.horizon.positives() as u32));
@@ -100,7 +100,7 @@ fn numbers(stacks: &[u8]) -> impl Iterator<Item = u32> {
 
 /// Writes `frames`, each [pixels, C], into `out` [pixels, stack, C].
 ///
-/// A pixel of the output is written at once: the sizes in use are compiled, the others take their time.
+/// Writes whole pixels of the output. The sizes in use have compiled loops; other sizes are slower.
 fn interleave(frames: &[&[u8]], pixel_bytes: usize, out: &mut [u8]) {
     fn compiled<const STACK: usize, const C: usize>(frames: &[&[u8]], out: &mut [u8]) {
         let frames: [&[[u8; C]]; STACK] = std::array::from_fn(|slot| frames[slot].as_chunks().0);

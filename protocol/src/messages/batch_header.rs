@@ -1,5 +1,5 @@
-//! What a batch says of itself, how its columns lie in its payload, and the reply that it travels in.
-//! It knows how many bytes a batch has and which are absurd; what they mean is `batch`'s.
+//! The header of a batch, the layout of the columns in its payload, and the reply that contains a batch.
+//! This file knows the possible sizes of a batch; `batch` knows the meaning of its columns.
 
 use std::ops::Range;
 
@@ -14,38 +14,38 @@ use crate::{
     wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::no_payload, shared_memory},
 };
 
-/// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
+/// Batches for which a replay server has shared memory: those being assembled, sent, and copied by the learner.
 pub const POOL_BATCHES: usize = 6;
 
-/// What a batch says of itself.
+/// The header of a batch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BatchHeader {
     /// Rows, B.
     pub rows: u32,
-    /// Positives a row, P: 0 without DIM.
+    /// Positives per row, P: 0 without DIM.
     pub positives: u32,
     /// Bytes of one state.
     pub state_bytes: u32,
-    /// States s_{t+k} that travel: one for each positive that a row has, at most P for each row.
+    /// States s_{t+k} in the payload: one for each positive that a row has, at most P per row.
     pub states_k: u32,
-    /// States s_{t+n} that travel: one for each row that bootstraps, at most B.
+    /// States s_{t+n} in the payload: one for each row that bootstraps, at most B.
     pub states_n: u32,
-    /// What the replay server that drew this had counted then, this batch included.
+    /// Counts of the replay server that drew the batch, this batch included.
     pub counts: ShardCounts,
-    /// Transitions that it held.
+    /// Transitions that the replay server held.
     pub held: u64,
     /// Mean age of the rows, in transitions stored since.
     pub mean_age: f64,
-    /// Version of the newest weights that chose an action of this batch, and of the oldest.
+    /// Versions of the newest and of the oldest weights that chose an action of this batch.
     pub weights_versions: (u64, u64),
-    /// Who drew the rows, where they are drawn by priority.
+    /// The replay server that drew the rows, if they are drawn by priority.
     pub origin: Option<Origin>,
-    /// The frames that states are stacks of, each of which travels once; none where a state is one frame.
+    /// How states are stacks of frames, each of which is sent once; `None` if a state is one frame.
     pub stacked: Option<StackedFrames>,
 }
 
 impl BatchHeader {
-    /// A batch of `rows` rows of this run, before any row is drawn: as large as one can be.
+    /// Returns the header of the largest possible batch of `rows` rows in this run.
     pub fn of(spec: &RunSpec, rows: u32) -> Self {
         let positives = spec.horizon.positives() as u32;
         Self {
@@ -60,7 +60,7 @@ impl BatchHeader {
         }
     }
 
-    /// The same where rows are drawn by this rule.
+    /// Returns the same header for rows drawn by the rule `sampling`.
     #[must_use]
     pub fn sampled_by(self, sampling: &Sampling) -> Self {
         Self {
@@ -80,7 +80,7 @@ impl BatchHeader {
             .expect("a batch is far below the address space")
     }
 
-    /// Checks that `payload` is as long as such a batch's, has as many states as its rows say, and that these are made of its frames.
+    /// Checks that `payload` has the right length, as many states as its rows need, and valid frame numbers and probabilities.
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.bytes() != Some(payload.len()) || self.rows == 0 {
             return Err(CodecError::Header(format!(
@@ -89,7 +89,7 @@ impl BatchHeader {
             )));
         }
         if let Some(stacked) = self.stacked {
-            // What few frames may be made into, if many states have them.
+            // Limits the memory of the assembled states: many states may share few frames.
             let whole = Self {
                 stacked: None,
                 ..*self
@@ -126,9 +126,9 @@ impl BatchHeader {
     }
 }
 
-/// The columns of a batch, in the order in which they lie one after the other. Each has a value for every row; those of the
-/// positives have one for every row of the first positive, then of the second, and so on. States that a row does not have are left out.
-/// Where states are stacks of frames, each frame is there once, and the columns of states say which of them each is made of.
+/// The columns of a batch, in the order of their layout. Each has a value for every row; a column of positives has a value for every row of
+/// the first positive, then of the second, and so on. States that a row lacks are left out. If states are stacks of frames, each frame is
+/// stored once, and the columns of states contain the numbers of their frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Column {
     Frames,
@@ -151,10 +151,10 @@ impl Column {
     }
 }
 
-/// Where everything lies in the payload.
+/// The layout of the payload.
 impl BatchHeader {
-    /// All columns in their order, and the bytes of each. A return, a discount and a probability are an f32, a transition is a u64, all
-    /// else that is neither a state nor a frame is a u8. Of numbers of 32 bits, no three make an overflow.
+    /// Returns all columns in order, with the bytes of each. A return, a discount and a probability are f32, a transition is u64, and other
+    /// columns without states or frames are u8. Products of three numbers of 32 bits do not overflow a u128.
     pub(super) fn columns(&self) -> [(Column, u128); 12] {
         let rows = u128::from(self.rows);
         let of_positives = rows * u128::from(self.positives);
@@ -179,7 +179,7 @@ impl BatchHeader {
         ]
     }
 
-    /// Where a column lies, in a payload of so many bytes.
+    /// The range of a column in the payload.
     pub(super) fn range(&self, column: Column) -> Range<usize> {
         let mut end = 0;
         for (each, bytes) in self.columns() {
@@ -192,8 +192,8 @@ impl BatchHeader {
         unreachable!("{column:?} is listed")
     }
 
-    /// Bytes of all columns; none if they are more than the address space, if there are more states than rows can have, or if
-    /// states are not stacks of the frames.
+    /// Bytes of all columns; `None` if they exceed the address space, if there are more states than rows can have, or if states cannot be
+    /// stacks of the frames.
     fn bytes(&self) -> Option<usize> {
         let positives = u64::from(self.rows) * u64::from(self.positives);
         let states = self.states().try_into().ok()?;
@@ -216,13 +216,13 @@ impl BatchHeader {
         values.iter().copied().map(f32::from_le_bytes)
     }
 
-    /// Whether each row [B] bootstraps, in a payload whose scalars are written.
+    /// Whether each row [B] bootstraps, from a payload whose scalars are written.
     pub(super) fn bootstraps(&self, payload: &[u8]) -> Vec<bool> {
         let discounts = self.f32s(Column::BootstrapDiscount, payload);
         discounts.map(|discount| discount != 0.0).collect()
     }
 
-    /// Whether each positive [P, B] is there, in a payload whose scalars are written.
+    /// Whether each positive [P, B] exists, from a payload whose scalars are written.
     pub(super) fn positives_there(&self, payload: &[u8]) -> Vec<bool> {
         let valid = payload[self.range(Column::PositiveValid)].iter();
         valid.map(|&valid| valid != 0).collect()
@@ -232,13 +232,13 @@ impl BatchHeader {
         &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
     }
 
-    /// Bytes of a value in a column of states: all of a state, or what says of which frames it is made.
+    /// Bytes of a value in a column of states: a whole state, or the numbers of its frames.
     pub(super) fn value_bytes(&self) -> usize {
         let stacked = self.stacked.as_ref();
         stacked.map_or(self.state_bytes as usize, StackedFrames::stack_bytes)
     }
 
-    /// Frames that travel, and bytes of each: states where they are one frame.
+    /// The number of frames in the payload, and the bytes of each. Without stacks, each state is a frame.
     pub(super) fn frames(&self) -> (usize, usize) {
         let state_bytes = self.state_bytes as usize;
         match self.stacked {
@@ -251,23 +251,23 @@ impl BatchHeader {
 /// Why there is no batch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum NotReady {
-    /// Not yet: who waits for what.
+    /// No batch is ready yet: which side waits for what.
     Wait(Waiting),
-    /// Never again: all transitions are in and sampled.
+    /// No batch follows: all transitions are stored and sampled.
     Finished,
-    /// Never: the reason, for a person.
+    /// The request is rejected, and a retry is useless.
     Refused {
-        /// Why, and what to do about it.
+        /// The reason and the remedy, for the user.
         why: String,
     },
 }
 
-/// The answer to a request.
+/// The reply to a request for a batch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum BatchReply {
     /// The payload that follows is a batch.
     Batch(BatchHeader),
-    /// There is none.
+    /// There is no batch.
     NotReady(NotReady),
 }
 

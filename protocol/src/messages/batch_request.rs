@@ -1,45 +1,45 @@
-//! The learner's request for a batch, and how one that repeats another is told from a new one.
-//! Which rows a batch has is the replay server's choice.
+//! The learner's request for a batch, and the numbers that tell a repeated request from a new one.
+//! The replay server chooses the rows of a batch.
 
 use serde::{Deserialize, Serialize};
 
-/// The learner's request.
+/// The learner's request for a batch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
-    /// Which learner asks: that of its [`LearnerJoin`](crate::LearnerJoin).
+    /// The learner's number, as in its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
-    /// Which request this is.
+    /// The identity of this request.
     pub id: RequestId,
     /// Rows wanted, B.
     pub rows: u32,
-    /// Whether the batch may come through shared memory.
+    /// Whether the batch may be sent through shared memory.
     pub shared_memory: bool,
-    /// What the learner has done so far.
+    /// The learner's progress.
     pub learned: Learned,
-    /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
+    /// The sum of the counts of all other shards, if the replay has several. The rows are then a part of a batch.
     pub other_shards: Option<ShardCounts>,
 }
 
-/// How far a learner is. It alone knows; a replay server that was started again learns it from here.
+/// The progress of a learner, which only the learner knows. A restarted replay server learns it from here.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Learned {
     /// Updates since the start of the run.
     pub updates: u64,
     /// Updates in its newest checkpoint.
     pub saved_updates: u64,
-    /// Rows of this shard that it has received since the start of the run, without those learned after its checkpoint by a learner
-    /// before it.
+    /// Rows of this shard that the learner has received since the start of the run, without rows that an earlier learner learned from after
+    /// this learner's checkpoint.
     pub rows_received: u64,
 }
 
-/// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
+/// Tells a repeated request from a new one, because a batch that did not arrive must not count as sampled.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RequestId {
-    /// Who asks: a random number, which tells it from all others. It waits for one request at a time.
+    /// The client's random number, which no other client has. A client waits for one request at a time.
     pub client_id: u64,
-    /// How many requests of this client were answered before.
+    /// Number of earlier requests of this client that were answered.
     pub number: u64,
-    /// Which attempt at this one it is: a later one has a higher number.
+    /// The attempt at this request; a later attempt has a higher number.
     pub attempt: u64,
 }
 
@@ -53,7 +53,7 @@ impl RequestId {
         }
     }
 
-    /// The same request, sent once more.
+    /// The next attempt at this request.
     #[must_use]
     pub const fn again(self) -> Self {
         Self {
@@ -62,7 +62,7 @@ impl RequestId {
         }
     }
 
-    /// The request after this one, which was answered.
+    /// The next request, once this one is answered.
     #[must_use]
     pub const fn next(self) -> Self {
         Self {
@@ -73,7 +73,7 @@ impl RequestId {
     }
 }
 
-/// What the rate limiter of each replay server counts. The learner tells each of the others, so that all decide as one.
+/// The counts of one replay server's rate limiter. The learner tells each server the counts of the others, so that all decide as one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ShardCounts {
     /// Transitions stored since the start of the run.

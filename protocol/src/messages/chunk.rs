@@ -1,5 +1,5 @@
-//! Transitions on their way from an actor to the replay server, the question about those that have to wait, and the answers.
-//! It does not decide what is stored: exactly-once and order are the replay server's.
+//! Chunks of transitions that actors send to the replay server, the question about chunks that wait, and the replies.
+//! The replay server decides what it stores, and ensures order and exactly-once storage.
 
 use std::ops::Range;
 
@@ -7,26 +7,26 @@ use serde::{Deserialize, Serialize};
 
 use crate::wire::{buffers::Buffer, codec, error::CodecError};
 
-/// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
+/// Bytes of one transition in a chunk without its frame: an action, an end and a reward.
 pub const TRANSITION_BYTES: usize = size_of::<u8>() + size_of::<End>() + size_of::<f32>();
 const _: () = assert!(TRANSITION_BYTES == 6);
 
-/// What a step ended, if anything.
+/// What ended with a step, if anything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum End {
     /// The episode continues with the next step.
     Running = 0,
-    /// A level: a boundary for DIM, not for the return.
+    /// A level ended: a boundary for DIM, not for the return.
     LevelChange = 1,
-    /// The episode, by its step limit.
+    /// The episode ended at its step limit.
     TimedOut = 2,
-    /// The episode, by the rules of the world.
+    /// The episode ended by the rules of the world.
     Terminal = 3,
 }
 
 impl End {
-    /// The end that `byte` stands for.
+    /// Returns the end that `byte` encodes, if it encodes one.
     pub const fn from_byte(byte: u8) -> Option<Self> {
         match byte {
             0 => Some(Self::Running),
@@ -43,22 +43,22 @@ impl End {
     }
 }
 
-/// What a chunk says of itself.
+/// The header of a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkHeader {
-    /// Which actor, unique in the run.
+    /// The actor's number, unique in the run.
     pub actor: u32,
-    /// Which life of that actor: drawn anew at each start.
+    /// The actor's incarnation, drawn at each start of the process.
     pub incarnation: u64,
     /// Number of the chunk within the incarnation, from 0.
     pub sequence: u64,
-    /// Transitions that this incarnation produced before this chunk: the second count, by which loss shows.
+    /// Transitions that this incarnation produced before this chunk. This second count reveals losses.
     pub first_transition: u64,
-    /// The weights that chose every action of this chunk; 0 before the first.
+    /// Version of the weights that chose every action of this chunk; 0 before the first version.
     pub weights_version: u64,
-    /// The actor was told to stop and sends what it has left: the rate limiter lets it pass.
+    /// Whether the actor is shutting down and sends its remaining transitions. The rate limiter lets them pass.
     pub leaving: bool,
-    /// Environments, one stream each.
+    /// Number of environments, each of which is a stream.
     pub streams: u32,
     /// Consecutive steps of each stream in this chunk.
     pub steps: u32,
@@ -72,7 +72,7 @@ impl ChunkHeader {
         self.streams as usize * self.steps as usize
     }
 
-    /// Bytes of the payload of such a chunk; none if they are more than the address space.
+    /// Bytes of the chunk's payload; `None` if they exceed the address space.
     pub fn payload_bytes(&self) -> Option<usize> {
         self.transitions()
             .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
@@ -92,11 +92,11 @@ impl ChunkHeader {
     }
 }
 
-/// Transitions that a chunk of any run may have: an actor may step so many environments, whatever the settings say.
+/// Transitions that a chunk of any run may have, because an actor may have this many environments whatever the settings say.
 const TRANSITIONS_LEAST: u64 = 4096;
 
-/// Transitions that the longest chunk of a run has, by its settings `actor.envs`, `steps_per_chunk` and `round_transitions_max`;
-/// at least 4,096, as an actor may step up to so many environments (`--envs`).
+/// Returns the transitions in the longest chunk of a run, from its settings `actor.envs`, `steps_per_chunk` and `round_transitions_max`.
+/// The result is at least 4,096, because an actor may have up to that many environments (`--envs`).
 pub fn transitions_max(envs: u32, steps_per_chunk: u32, round_transitions_max: Option<u64>) -> u64 {
     let envs = u64::from(envs);
     let whole = envs.saturating_mul(steps_per_chunk.into());
@@ -104,18 +104,18 @@ pub fn transitions_max(envs: u32, steps_per_chunk: u32, round_transitions_max: O
     longest.max(TRANSITIONS_LEAST)
 }
 
-/// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).
+/// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, end of step t).
 ///
-/// Buffer, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
+/// The buffer holds, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chunk {
-    /// What it says of itself.
+    /// The chunk's header.
     pub header: ChunkHeader,
     payload: Buffer,
 }
 
 impl Chunk {
-    /// A chunk of zeros, to be filled in place.
+    /// Creates a chunk of zeros, to be filled in place.
     pub fn zeroed(header: ChunkHeader) -> Self {
         let bytes = header
             .payload_bytes()
@@ -123,14 +123,14 @@ impl Chunk {
         Self::in_memory(header, Buffer::zeroed(bytes))
     }
 
-    /// A chunk in memory that may hold anything: every row is to be written.
+    /// Creates a chunk in memory with arbitrary content; the caller must write every row.
     pub fn in_memory(header: ChunkHeader, payload: Buffer) -> Self {
         let bytes = header.payload_bytes();
         assert_eq!(Some(payload.len()), bytes, "memory for a chunk");
         Self { header, payload }
     }
 
-    /// Where its frames, actions, ends and rewards lie in the payload, one after the other.
+    /// The ranges of frames, actions, ends and rewards in the payload, one after the other.
     fn columns(&self) -> [Range<usize>; 4] {
         let rows = self.header.transitions();
         let frame_bytes = self.header.frame_bytes as usize;
@@ -172,13 +172,13 @@ impl Chunk {
         f32::from_le_bytes(rewards[row])
     }
 
-    /// Where row's frame is written.
+    /// The place of `row`'s frame, for writing.
     pub fn frame_mut(&mut self, row: usize) -> &mut [u8] {
         let bytes = self.header.frame_bytes as usize;
         &mut self.payload[row * bytes..(row + 1) * bytes]
     }
 
-    /// Writes everything of one row but its frame.
+    /// Writes action, reward and end of one row.
     pub fn set(&mut self, row: usize, action: u8, reward: f32, end: End) {
         let rows = self.header.transitions();
         assert!(row < rows, "row {row} of a chunk of {rows}");
@@ -194,18 +194,18 @@ impl Chunk {
         &self.payload
     }
 
-    /// The payload, to travel after the header.
+    /// The payload, to be sent after the header.
     pub fn into_payload(self) -> Buffer {
         self.payload
     }
 
-    /// Reads a chunk in one piece and checks lengths, ends and rewards.
+    /// Decodes a chunk in one buffer and checks lengths, ends and rewards.
     pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<Self, CodecError> {
         let (header, payload) = codec::decode(bytes, Some(spec_hash))?;
         Self::from_payload(header, payload.to_vec().into())
     }
 
-    /// The chunk of a header and payload that were received; checks all that [`Chunk::decode`] does.
+    /// Makes a chunk of a received header and payload, with all checks of [`Chunk::decode`].
     pub fn from_payload(header: ChunkHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.checked(&payload)?;
         let chunk = Self { header, payload };
@@ -222,49 +222,49 @@ impl Chunk {
     }
 }
 
-/// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its payload.
+/// Asks whether the replay server has stored a chunk that it keeps until its rate limiter has room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkPoll {
     /// The actor's number in the run.
     pub actor: u32,
-    /// Which life of that actor.
+    /// The actor's incarnation.
     pub incarnation: u64,
     /// Number of the chunk within the incarnation.
     pub sequence: u64,
-    /// The actor was told to stop: the rate limiter lets the chunk pass.
+    /// Whether the actor is shutting down. The rate limiter then lets the chunk pass.
     pub leaving: bool,
 }
 
-/// The replay server's answer to a chunk or a poll.
+/// The replay server's reply to a chunk or a poll.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum InsertReply {
-    /// Stored, now or by an earlier try: the actor may forget it.
+    /// The chunk is stored, now or by an earlier attempt. The actor may drop it.
     Stored {
         /// Transitions that the run has stored.
         inserted_total: u64,
-        /// Actors that are connected, by which they choose the length of their chunks.
+        /// Number of connected actors, from which actors choose the length of their chunks.
         actors: u32,
         /// Whether the chunk had to wait for the rate limiter.
         waited: bool,
     },
-    /// Not stored yet: the rate limiter has no room.
+    /// The chunk is not stored yet: the rate limiter has no room.
     Wait {
         /// Transitions that the run has stored.
         inserted_total: u64,
-        /// Whether the replay server keeps the chunk and will store it: then a [`ChunkPoll`] is enough, else it must be sent again.
+        /// Whether the replay server keeps the chunk to store it later. If not, the actor must resend it instead of polling.
         kept: bool,
     },
-    /// Not stored: chunks before it are missing. The sender repeats them from its first that was not acknowledged.
+    /// The chunk is not stored, because chunks before it are missing. The actor resends from its first unacknowledged chunk on.
     OutOfOrder {
-        /// The sequence number that is expected, for a person.
+        /// The expected sequence number, for messages to the user.
         expected: u64,
     },
-    /// Not stored, and no longer wanted: the run has all the transitions it asked for.
+    /// The chunk is not stored: the run has all its transitions.
     Finished {
         /// Transitions that the run has stored.
         inserted_total: u64,
     },
-    /// Not stored, and never will be: the reason, for a person.
+    /// The chunk will never be stored.
     Refused {
         /// The replay server's reason, a sentence.
         why: String,

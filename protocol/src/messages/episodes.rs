@@ -1,36 +1,36 @@
-//! The episodes that ended, one by one, for the recorder of the run.
-//! Means over the newest of them are in `status`.
+//! The ended episodes, one by one, for the recorder of the run.
+//! The newest returns and their mean are in `status`.
 
 use serde::{Deserialize, Serialize};
 
 use crate::wire::{error::CodecError, message::no_payload};
 
-/// Most episodes in one answer; those after it are asked for again. With the longest numbers it takes half of what a header may.
+/// Most episodes in one reply; the requester asks again for the rest. With the longest numbers, a reply takes half of the longest header.
 pub const EPISODES_MAX: usize = 8_192;
 
 /// Asks for the episodes that ended after the first `since`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EpisodesRequest {
-    /// Episodes that the asker knows of already.
+    /// Episodes that the requester already has.
     pub since: u64,
-    /// The asker is the run's launcher: what it does not know of is kept, whatever others know.
+    /// Whether the requester is the run's launcher. The replay server keeps episodes until the launcher has them, whatever others have.
     pub is_launcher: bool,
 }
 
 /// An episode that ended: by the rules of the world, or by its step limit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EndedEpisode {
-    /// Transitions that the run had stored with the chunk that held its end.
+    /// Transitions that the run had stored once it had stored the chunk with the episode's end.
     pub frames: u64,
     /// The actor that played it.
     pub actor: u32,
     /// The actor's environment in which it was played, from 0.
     pub env: u32,
-    /// What all of it earned; none if a part of it was lost.
+    /// Return and length of the whole episode; `None` if a part of it was lost.
     pub played: Option<Played>,
 }
 
-/// What is known of an episode of which all was seen, up to some step.
+/// Return and length of an episode of which no part was lost, up to some step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Played {
     /// Sum of the rewards as the world gave them, undiscounted.
@@ -42,16 +42,16 @@ pub struct Played {
 /// Episodes in the order in which their ends were stored.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EpisodesReply {
-    /// How many ended in all. Fewer than the asker knows of: this replay server counts anew.
+    /// Number of episodes that ended in all. If it is less than the requester has, this replay server has restarted its count.
     pub ended: u64,
-    /// How many ended before the first of these. More than were asked for: those between are not kept any more.
+    /// Number of episodes that ended before the first of these. If it is more than `since`, those between are no longer kept.
     pub before: u64,
-    /// At most [`EPISODES_MAX`].
+    /// The episodes, at most [`EPISODES_MAX`].
     pub episodes: Vec<EndedEpisode>,
 }
 
 impl EpisodesReply {
-    /// How many ended up to the last of these.
+    /// Number of episodes that ended up to the last of these.
     pub const fn up_to(&self) -> u64 {
         self.before.saturating_add(self.episodes.len() as u64)
     }

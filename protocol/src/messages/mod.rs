@@ -1,5 +1,5 @@
-//! Everything that is sent, a file for what belongs together; `table` lists it.
-//! `wire` turns messages into bytes; each process decides what it answers.
+//! The messages, grouped in files by topic; `table` lists all of them.
+//! `wire` turns messages into bytes; each process decides what it replies.
 
 pub(crate) mod affinity;
 pub(crate) mod batch;

@@ -1,43 +1,43 @@
-//! Priorities on their way from the learner back to the replay servers that drew the rows.
-//! What a priority is made of is the learner's business, what it does to later draws the replay server's.
+//! Priorities that the learner sends back to the replay servers that drew the rows.
+//! The learner computes priorities; the replay server decides their effect on later draws.
 
 use serde::{Deserialize, Serialize};
 
 use crate::wire::{error::CodecError, message::no_payload};
 
-/// Which life of which replay server drew rows by priority: their numbers mean nothing to another one.
+/// The replay server and its incarnation that drew rows by priority. Other incarnations cannot interpret the transition numbers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Origin {
-    /// Which of the run's replay shards drew them, from 0.
+    /// The replay server's shard number, from 0.
     pub shard: u32,
-    /// A number that a replay server has for as long as it runs.
+    /// The replay server's incarnation: a random number, drawn at each start of the process.
     pub incarnation: u64,
 }
 
-/// What the learner found of the rows of one batch.
+/// The priorities of the rows of one batch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PriorityUpdate {
-    /// Which learner sends it: that of its [`LearnerJoin`](crate::LearnerJoin).
+    /// The sender's number, as in its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
-    /// Counts up; one that is not above this learner's last is a repetition, and changes nothing.
+    /// Counts up. An update with a number not above this learner's last is a repetition and changes nothing.
     pub number: u64,
-    /// The rows, by where they come from. Every shard is sent all, and takes its own.
+    /// The rows, grouped by origin. The learner sends all groups to every shard, which uses its own.
     pub parts: Vec<PriorityPart>,
 }
 
 /// Rows that one replay server drew.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PriorityPart {
-    /// Who drew them.
+    /// The replay server that drew the rows.
     pub origin: Origin,
-    /// The transition of each row, by its number since the start of the replay.
+    /// The number of each row's transition, since the start of the replay.
     pub transitions: Vec<u64>,
-    /// Its priority: the row's C51 loss before any weight, in nats, from 0 on.
+    /// The priority of each row: its C51 loss before weighting, in nats, at least 0.
     pub priorities: Vec<f32>,
 }
 
 impl PriorityUpdate {
-    /// Rows of all parts.
+    /// Number of rows in all parts.
     pub fn rows(&self) -> usize {
         self.parts.iter().map(|part| part.transitions.len()).sum()
     }

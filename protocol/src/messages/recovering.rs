@@ -1,5 +1,5 @@
-//! What a replay server answers to everything while it reads its replay back from disk: how far it is.
-//! It travels as an error reply to any query; the sender retries.
+//! The reply of a replay server to all queries while it reads its replay back from disk: its progress.
+//! The message is sent as an error reply; the requester retries.
 
 use std::fmt;
 
@@ -7,19 +7,19 @@ use serde::{Deserialize, Serialize};
 
 use crate::wire::{error::CodecError, message::no_payload};
 
-/// How far a replay server is with reading its replay back from disk.
+/// The progress of a replay server that reads its replay back from disk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecoveryProgress {
     /// Bytes of the log that have been read.
     pub bytes_read: u64,
     /// Bytes of the whole log.
     pub bytes: u64,
-    /// Seconds for which it has been reading.
+    /// Seconds since the reading began.
     pub since_s: f64,
 }
 
 impl RecoveryProgress {
-    /// Whether it takes so long that a person should know.
+    /// Whether the reading takes so long that the user should be told.
     pub fn is_slow(&self) -> bool {
         self.since_s >= 1.0
     }
@@ -35,9 +35,9 @@ impl fmt::Display for RecoveryProgress {
 /// The replay server cannot answer yet, because it is reading its replay back. The query had no effect.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Recovering {
-    /// How far it is.
+    /// The progress of the reading.
     pub progress: RecoveryProgress,
-    /// The run's resolved settings, TOML: with them a status says which run it is.
+    /// The run's resolved settings, TOML, from which a status shows which run this is.
     pub config_toml: String,
 }
 

@@ -1,6 +1,6 @@
-//! What an actor or the learner says of itself every few seconds, and what a replay server then knows of all processes of the run, for
-//! `driml status`: who is connected, what each does, who waits, and when each was last seen.
-//! Nothing depends on it but what a person is told. Counts and rates are in `status`.
+//! The reports that an actor or the learner sends every few seconds, and what a replay server knows of all processes of the run, for
+//! `driml status`: which are connected, what each does, which wait, and when each was last seen.
+//! This data is only shown to the user. Counts and rates are in `status`.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,27 +13,27 @@ use crate::wire::{
 
 /// Most bytes of the description of what a process does.
 const DOING_MAX: usize = 80;
-/// Bytes of a warning that is passed on.
+/// Most bytes of a warning in a report.
 const WARNING_MAX: usize = 400;
-/// Processes whose last warning is passed on: those with the newest ones.
+/// Most processes whose last warning is in a status: those with the newest warnings.
 pub const WARNINGS_MAX: usize = 64;
 
-/// One incarnation of a process, by the number that only it and the replay server know.
+/// One incarnation of a process, by a number that only this process and the replay server know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Participant {
-    /// Of an actor.
+    /// An actor.
     Actor {
         /// The actor's number in the run.
         actor: u32,
-        /// This life's.
+        /// The actor's incarnation.
         incarnation: u64,
     },
-    /// Of a learner.
+    /// A learner, by its number.
     Learner(u64),
 }
 
 impl Participant {
-    /// How others see that it is connected.
+    /// The process as other processes see it by its liveliness token.
     pub fn alive(self) -> Alive {
         match self {
             Self::Actor { actor, incarnation } => Alive::actor(actor, incarnation),
@@ -45,29 +45,29 @@ impl Participant {
 /// What a process reports about itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Report {
-    /// Whose it is.
+    /// The process that reports.
     pub who: Participant,
-    /// What it does, such as `plays`; at most 80 bytes.
+    /// What the process does, such as `plays`; at most 80 bytes.
     pub doing: String,
-    /// For how long, seconds.
+    /// Seconds since the process began to do this.
     pub since_s: f64,
-    /// The last warning or error in its log.
+    /// The last warning or error in the process's log.
     pub last_warning: Option<Warning>,
-    /// Updates after which the run is finished: the learner has learned from every batch, and has saved.
+    /// Updates after which the run was finished; `None` before the learner has learned from every batch and has saved.
     pub finished: Option<u64>,
 }
 
-/// A line of a process's log.
+/// A warning or an error in a process's log.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Warning {
     /// The line, cut to 400 bytes.
     pub text: String,
-    /// Its age, seconds.
+    /// The warning's age, seconds.
     pub age_s: f64,
 }
 
 impl Warning {
-    /// One of this age, cut to what may be sent.
+    /// Creates a warning whose text is cut to 400 bytes.
     pub fn new(text: &str, age_s: f64) -> Self {
         Self {
             text: cut(text, WARNING_MAX),
@@ -77,7 +77,7 @@ impl Warning {
 }
 
 impl Report {
-    /// Cut to what may be sent.
+    /// Creates a report whose `doing` is cut to 80 bytes.
     pub fn new(who: Participant, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
         Self {
             who,
@@ -127,59 +127,59 @@ fn cut(text: &str, bytes_max: usize) -> String {
 pub struct ProcessStatus {
     /// The learner, or an actor by its number.
     pub who: ProcessName,
-    /// Whether it is connected.
+    /// Whether the process is connected.
     pub connected: bool,
-    /// Seconds for which it has been connected, or gone.
+    /// Seconds since the process connected or disconnected.
     pub since_s: f64,
-    /// How often it has joined since this replay server started.
+    /// How often the process has joined since this replay server started.
     pub lives: u32,
-    /// Seconds since its last chunk, or request for a batch; none before the first.
+    /// Seconds since the process's last chunk or request for a batch; `None` before the first.
     pub last_seen_s: Option<f64>,
-    /// Seconds for which its chunk, or request, has been waiting at the rate limiter; none if none waits.
+    /// Seconds for which its chunk or request has been waiting at the rate limiter; `None` if none waits.
     pub held_s: Option<f64>,
-    /// An actor's: the version of the weights that acted in its last chunk.
+    /// For an actor: the version of the weights that chose the actions of its last chunk.
     pub weights_version: Option<u64>,
-    /// What it says that it does, for how many seconds, and how many seconds ago it said so; none if it has said nothing.
+    /// The reported activity, its duration in seconds, and the age of the report in seconds; `None` before the first report.
     pub doing: Option<(String, f64, f64)>,
-    /// The last warning in its log, where it is among the newest of all processes.
+    /// The last warning in the process's log, if it is among the newest of all processes.
     pub last_warning: Option<Warning>,
 }
 
-/// How the log stands in which a replay server keeps its replay on disk.
+/// The state of the log in which a replay server keeps its replay on disk.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LogStatus {
     /// The folder, on the replay server's machine.
     pub folder: String,
     /// Bytes on disk.
     pub bytes: u64,
-    /// Most that they may become; none if the replay's capacity alone limits them.
+    /// Limit of `bytes`; `None` if only the replay's capacity limits it.
     pub bytes_max: Option<u64>,
-    /// Seconds since a flush began that succeeded: a power cut takes what was written since.
+    /// Seconds since the start of the last successful flush. A power failure loses what was written since.
     pub flushed_s: f64,
-    /// For how many seconds the disk has been refusing what is to be written, and what it says; none if it takes it.
+    /// Seconds for which writes to the disk have failed, and the error; `None` if writes succeed.
     pub refused: Option<(f64, String)>,
-    /// Bytes of what has happened and could not be written: lost if the process dies now. No transitions are among them.
+    /// Bytes of events that could not be written, which are lost if the process dies now. They contain no transitions.
     pub unwritten_bytes: u64,
 }
 
 /// A replay server's report on itself and on all processes that have joined it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ProcessesStatus {
-    /// Seconds since it started.
+    /// Seconds since the replay server started.
     pub up_s: f64,
-    /// Who waits at the rate limiter now.
+    /// Which side waits at the rate limiter now.
     pub waiting: Waiting,
-    /// For how many seconds.
+    /// Seconds for which it has been waiting.
     pub waiting_s: f64,
-    /// Requests for a batch that wait.
+    /// Number of requests for a batch that wait.
     pub requests_waiting: u32,
-    /// Chunks that wait.
+    /// Number of chunks that wait.
     pub chunks_waiting: u32,
-    /// Their bytes in memory.
+    /// Bytes of memory that the waiting chunks take.
     pub chunk_bytes_waiting: u64,
     /// Version of the newest weights; 0 before the first.
     pub weights_version: u64,
-    /// Their age, seconds; none before the first.
+    /// Seconds since the newest weights arrived; `None` before the first.
     pub weights_age_s: Option<f64>,
     /// The log on disk; none if the replay is in memory alone.
     pub log: Option<LogStatus>,

@@ -1,26 +1,26 @@
-//! What processes report when asked: counters and means, never data.
-//! It computes nothing; each process fills in its own.
+//! The counters and means that processes report on request, but no data.
+//! Each process fills in its own values; only merges of shards and derived values are computed here.
 
 use serde::{Deserialize, Serialize};
 
-/// Who waits for whom at the rate limiter.
+/// Which side waits for the other at the rate limiter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Waiting {
     /// Neither side waits.
     #[default]
     Neither,
-    /// The learner, for the first transitions.
+    /// The learner waits for the first transitions.
     WarmUp {
         /// Transitions stored so far.
         have: u64,
         /// Transitions needed before the first batch.
         need: u64,
     },
-    /// The learner: all rows that the replay ratio allows were sampled.
+    /// The learner waits: all rows that the replay ratio allows were sampled.
     LearnerWaitsForActors,
-    /// The actors: as many transitions are stored as the replay ratio allows.
+    /// The actors wait: as many transitions are stored as the replay ratio allows.
     ActorsWaitForLearner,
-    /// Neither side: all transitions are stored and their rows sampled.
+    /// Neither side waits: all transitions are stored and their rows sampled.
     Finished,
 }
 
@@ -42,14 +42,14 @@ pub const RETURNS_OF: usize = 100;
 /// Returns of the episodes that ended last.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Returns {
-    /// Episodes whose return is known, as all of them was seen, since the start.
+    /// Episodes since the start whose return is known, because no part of them was lost.
     pub known: u64,
-    /// Undiscounted returns of the newest of them, the oldest first; of one replay at most [`RETURNS_OF`].
+    /// Undiscounted returns of the newest of these episodes, oldest first; at most [`RETURNS_OF`] per shard.
     pub newest: Vec<f64>,
 }
 
 impl Returns {
-    /// Mean of the newest returns; none before the first.
+    /// Mean of the newest returns; `None` before the first.
     pub fn mean(&self) -> Option<f64> {
         let sum: f64 = self.newest.iter().sum();
         (!self.newest.is_empty()).then(|| sum / self.newest.len() as f64)
@@ -61,14 +61,14 @@ impl Returns {
 pub struct Quantiles {
     /// The median of all values since the start.
     pub p50: f64,
-    /// What 99% do not exceed.
+    /// The value that 99% of all values do not exceed.
     pub p99: f64,
     /// The largest value since the start.
     pub max: f64,
 }
 
 impl Quantiles {
-    /// The worse of each of two, where there are two.
+    /// The larger value of each field, or the only one of the two.
     fn worst(one: Option<Self>, other: Option<Self>) -> Option<Self> {
         let (Some(one), Some(other)) = (one, other) else {
             return one.or(other);
@@ -81,7 +81,7 @@ impl Quantiles {
     }
 }
 
-/// The replay server's account of itself. In a run's summary, what was not recorded may be missing.
+/// The counters and means of a replay server. Values that were not recorded may be missing in a run's summary.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReplayStatus {
@@ -91,7 +91,7 @@ pub struct ReplayStatus {
     pub transitions_refilled: u64,
     /// Transitions held now, from which rows can be drawn: 0 while a replay fills its memory again.
     pub transitions_held: u64,
-    /// Bytes of memory that their frames take.
+    /// Bytes of memory that the frames of these transitions take.
     pub frame_bytes_held: u64,
     /// Transitions that actors produced and that never arrived.
     pub transitions_lost: u64,
@@ -99,17 +99,17 @@ pub struct ReplayStatus {
     pub transitions_duplicated: u64,
     /// Chunks recognised as a retry of a stored one, and not stored again.
     pub chunks_retried: u64,
-    /// Batches that did not reach the learner, which asked again; they do not count as served.
+    /// Batches that did not reach the learner, which requested them again; not counted as served.
     pub batches_retried: u64,
-    /// Messages refused as malformed or foreign, or because their sender's role may not send them.
+    /// Messages rejected as malformed or foreign, or because their sender's role may not send them.
     pub messages_refused: u64,
     /// Rows served since the start.
     pub rows_sampled: u64,
-    /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
+    /// Rows served to a learner that died before it saved what it learned from them; not counted as sampled.
     pub rows_unlearned: u64,
-    /// Updates since the start of the run, as the learner said last.
+    /// Updates since the start of the run, as the learner last reported.
     pub updates: u64,
-    /// Updates that were learned again, as a learner came back with an older checkpoint.
+    /// Updates that were repeated because the learner resumed from an older checkpoint.
     pub updates_relearned: u64,
     /// Transitions stored before the first row could be sampled.
     pub warmup_transitions: u64,
@@ -120,41 +120,40 @@ pub struct ReplayStatus {
     /// How often each k was served; index 0 counts rows without a positive. A row of several positives counts once, under
     /// its furthest.
     pub k_histogram: Vec<u64>,
-    /// Mean age of the rows served last, in transitions stored since theirs.
+    /// Mean age of the rows of the last batches, in transitions stored since.
     pub mean_age: f64,
     /// How often each action was stored.
     pub action_histogram: Vec<u64>,
-    /// Who waits now.
+    /// Which side waits now.
     pub waiting: Waiting,
     /// Seconds that requests for a batch spent waiting at the limiter.
     pub learner_waited_s: f64,
     /// Seconds that chunks spent waiting at the limiter.
     pub actors_waited_s: f64,
-    /// Actors that are connected.
+    /// Number of connected actors.
     pub actors: u32,
-    /// Actors of which a chunk has come.
+    /// Number of actors that have sent a chunk.
     pub actors_acting: u32,
-    /// Actors whose next chunk waits until the rate limiter lets it in.
+    /// Number of actors whose next chunk waits until the rate limiter lets it in.
     pub actors_waiting: u32,
-    /// Milliseconds from a question about a chunk to its answer, be it only that the chunk waits.
+    /// Milliseconds from a chunk or a question about one to its reply, even if the reply is only that the chunk waits.
     pub answer_ms: Option<Quantiles>,
     /// Milliseconds from a chunk's arrival until it was stored.
     pub insert_ms: Option<Quantiles>,
-    /// Seconds for which newer weights had been there when a chunk was stored; 0 where the newest ones had acted.
+    /// Seconds for which newer weights had existed when a chunk was stored; 0 if the newest weights chose its actions.
     pub weights_behind_s: Option<Quantiles>,
-    /// Updates by which the weights that acted were behind the newest ones when their chunk was stored.
+    /// Updates by which the weights that chose a chunk's actions were behind the newest when the chunk was stored.
     pub weights_behind_updates: Option<Quantiles>,
-    /// Version of the affinity matrix in use; 0 is the uniform one.
+    /// Version of the affinity matrix in use; 0 for the uniform one.
     pub affinity_version: u64,
-    /// All transitions are in.
+    /// Whether all transitions are stored.
     pub finished: bool,
-    /// The learner has learned from every batch, and has saved.
+    /// Whether the learner has learned from every batch and has saved.
     pub learner_finished: bool,
 }
 
 impl ReplayStatus {
-    /// The account of a replay of several shards from each shard's own. The newest returns are those of all shards, shard after
-    /// shard; the mean age is weighted by rows.
+    /// Merges the statuses of all shards. The newest returns of the shards follow one another; the mean age is weighted by rows.
     pub fn merged(shards: &[Self]) -> Self {
         let Some((first, others)) = shards.split_first() else {
             return Self::default();
@@ -170,7 +169,7 @@ impl ReplayStatus {
         sum
     }
 
-    /// Adds another shard's account, but for the mean age. Every shard has the whole run's warm-up.
+    /// Adds another shard's status, except for the mean age. Every shard has the warm-up of the whole run.
     fn add(&mut self, it: &Self) {
         macro_rules! add {
             ($($count:ident)+) => {
@@ -198,14 +197,14 @@ impl ReplayStatus {
         ] {
             *worst = Quantiles::worst(*worst, other);
         }
-        // Each learns of them with its next request.
+        // Each shard learns these counts with the learner's next request.
         self.updates = self.updates.max(it.updates);
         self.updates_relearned = self.updates_relearned.max(it.updates_relearned);
         self.returns.newest.extend(&it.returns.newest);
         self.learner_waited_s += it.learner_waited_s;
         self.actors_waited_s += it.actors_waited_s;
         self.affinity_version = self.affinity_version.min(it.affinity_version);
-        // Each knows of the others what the learner told it; the one that knows of the end is right.
+        // A shard knows of the others only what the learner told it. If one knows of the end, it is right.
         self.finished |= it.finished;
         self.learner_finished |= it.learner_finished;
         if it.waiting == Waiting::Finished || self.waiting == Waiting::Neither {
@@ -213,7 +212,7 @@ impl ReplayStatus {
         }
     }
 
-    /// Rows sampled per transition inserted after the warm-up; none before.
+    /// Rows sampled per transition inserted after the warm-up; `None` before.
     pub fn replay_ratio(&self) -> Option<f64> {
         let after = self
             .transitions_inserted
@@ -221,16 +220,16 @@ impl ReplayStatus {
         (after > 0).then(|| self.rows_sampled as f64 / after as f64)
     }
 
-    /// Mean k, over the rows served with a positive, of the furthest; none before the first.
+    /// Mean k of the furthest positive, over the rows served with a positive; `None` before the first.
     pub fn mean_k(&self) -> Option<f64> {
-        // Counts of another process, which may be any.
+        // The counts come from another process and may have any value.
         let counts = || self.k_histogram.iter().map(|&n| u128::from(n));
         let positives: u128 = counts().skip(1).sum();
         let weighted: u128 = (0_u128..).zip(counts()).map(|(k, n)| k * n).sum();
         (positives > 0).then(|| weighted as f64 / positives as f64)
     }
 
-    /// Standard deviation of k over all positives served; none before the first.
+    /// Standard deviation of k of the furthest positive, over the rows served with a positive; `None` before the first.
     pub fn sd_k(&self) -> Option<f64> {
         let mean = self.mean_k()?;
         let served = || self.k_histogram.iter().enumerate().skip(1);
@@ -242,14 +241,14 @@ impl ReplayStatus {
     }
 }
 
-/// The learner's account of itself.
+/// The counters and means of the learner.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct LearnerStatus {
     /// Updates done since the start of the run.
     pub updates: u64,
     /// C51 loss of the last update.
     pub c51_kl: f32,
-    /// Auxiliary losses of the last update by name; those that the agent has no weight for are not there.
+    /// Auxiliary losses of the last update by name, without those that have no weight in the agent's loss.
     pub losses: Vec<(String, f32)>,
     /// Total loss of the last update.
     pub total: f32,
@@ -265,7 +264,7 @@ pub struct LearnerStatus {
     pub computing_s: f64,
     /// Seconds spent waiting for a batch.
     pub waiting_s: f64,
-    /// The last checkpoint is written and nothing is left to do.
+    /// Whether the last checkpoint is written and nothing is left to do.
     pub finished: bool,
 }
 
@@ -281,10 +280,10 @@ impl LearnerStatus {
 mod tests {
     use super::*;
 
-    /// A status in which no field is zero or what it is by default. All by name, so that a new one is not forgotten where shards are added.
+    /// A status in which no field has its default. All fields are named, so that a new one is not forgotten where shards are merged.
     fn full(n: u64) -> ReplayStatus {
         let quantiles = |what: u64| {
-            // The first shard's median is the worse one, the second's are the others.
+            // The first shard has the worse median; the second has the worse p99 and maximum.
             let p50 = if n == 1 { 9_000.0 } else { 8_000.0 };
             let (p99, max) = ((what * n) as f64, (2 * what * n) as f64);
             (n < 3).then_some(Quantiles { p50, p99, max })
@@ -352,7 +351,7 @@ mod tests {
             // 9 rows of age 13, 18 of age 26.
             mean_age: (9.0 * 13.0 + 18.0 * 26.0) / 27.0,
             waiting: Waiting::Finished,
-            // The shard that has the older matrix.
+            // The older matrix of the two shards.
             affinity_version: 18,
             updates: 54,
             updates_relearned: 56,
@@ -367,7 +366,7 @@ mod tests {
         assert_eq!(merged, expected);
         assert_eq!(merged.returns.mean(), Some(1.5));
         assert_eq!(Returns::default().mean(), None);
-        // Counts of another process may be any.
+        // Counts from another process may have any value.
         let most = ReplayStatus {
             k_histogram: vec![0, u64::MAX, u64::MAX],
             ..merged

@@ -1,5 +1,5 @@
-//! All messages: number, type, key, priority and reply of each. What each is made of is in its own file.
-//! `wire` turns them into bytes; each process decides what it answers.
+//! The table of all messages: number, type, key, priority and reply of each. Other files of this folder define the types.
+//! `wire` turns messages into bytes; each process decides what it replies.
 
 use serde::{Deserialize, Serialize};
 use zenoh::qos::Priority;
@@ -22,15 +22,14 @@ use crate::wire::{
     message::{Keyed, Message, Request},
 };
 
-/// "Understood".
+/// Acknowledges a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ack;
 
 /// `NUMBER NAME: TYPE [checked], at KEY of its actor (PRIORITY) -> REPLY;`
 ///
-/// `[checked]`: its method of this name is called for every one that is received. `of its actor`: each actor has its own key. The priority is
-/// `Data` unless it is named. Replies have no key, they travel back; a message that is its own reply is
-/// fetched, with a query that carries nothing.
+/// `[checked]` names the method that checks each received message. `of its actor`: each actor has its own key. The default priority is
+/// `Data`. Replies have no key; a message that is its own reply is fetched by an empty query.
 macro_rules! messages {
     ($(
         #[doc = $doc:literal]
@@ -38,7 +37,7 @@ macro_rules! messages {
         $(, at $key:literal $(of its $actor:ident)? $(of an $who:ident or the learner)? $(($priority:ident))?)?
         $(-> $reply:ident)?;
     )+) => {
-        /// The numbers of all messages, so that none is given twice.
+        /// The numbers of all messages; as variants of one enum they are unique.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[repr(u16)]
         pub enum Kind {
@@ -66,7 +65,7 @@ macro_rules! messages {
 
             $(impl Keyed for $message {
                 const KEY: &'static str = $key;
-                // True where the row names an actor: a macro repeats only what uses a name.
+                // Always true: a macro repetition must use the name that it repeats.
                 $(const BY_ACTOR: bool = !stringify!($actor).is_empty();)?
                 $(const BY_ACTOR: bool = !stringify!($who).is_empty();)?
                 $(const PRIORITY: Priority = Priority::$priority;)?
@@ -82,7 +81,7 @@ macro_rules! messages {
 messages! {
     /// Transitions, actor to replay server.
     1 Chunk: ChunkHeader [checked], at "ingest" of its actor -> InsertReply;
-    /// The answer to a chunk.
+    /// The reply to a chunk or to a question about one.
     2 InsertReply: InsertReply;
     /// A request for a batch, learner to replay server.
     3 BatchRequest: BatchRequest, at "batch" -> BatchReply;
@@ -94,23 +93,23 @@ messages! {
     6 Weights: WeightsReply [checked];
     /// "Newer weights exist", replay server to actors.
     7 WeightsVersion: WeightsVersion, at "weights-version" (InteractiveHigh);
-    /// An actor's last word.
+    /// An actor leaves, with the count of its transitions.
     8 Leave: Leave, at "leave" of its actor -> Ack;
-    /// The replay server's account of itself.
+    /// Counters and means of the replay server.
     9 ReplayStatus: ReplayStatus, at "status/replay" (InteractiveHigh) -> ReplayStatus;
-    /// The learner's account of itself.
+    /// Counters and means of the learner.
     10 LearnerStatus: LearnerStatus, at "status/learner" (InteractiveHigh) -> LearnerStatus;
-    /// What a joining process needs to know.
+    /// The run's settings and state, for a joining process.
     11 RunInfo: RunInfo, at "run-info" -> RunInfo;
-    /// "Understood"; carries nothing.
+    /// An acknowledgement without content.
     12 Ack: Ack;
-    /// An actor that starts.
+    /// An actor joins the run.
     13 ActorJoin: ActorJoin, at "join/actor" of its actor -> JoinReply;
-    /// A learner that starts.
+    /// A learner joins the run.
     14 LearnerJoin: LearnerJoin, at "join/learner" -> JoinReply;
-    /// The answer to a process that starts.
+    /// The reply to an actor or a learner that joins.
     15 JoinReply: JoinReply;
-    /// What became of a chunk, actor to replay server.
+    /// A question about a chunk that may have been stored by now, actor to replay server.
     16 ChunkPoll: ChunkPoll, at "poll" of its actor -> InsertReply;
     /// New weights, learner to replay server.
     17 WeightsUpload: WeightsUpload [checked], at "weights-upload" (DataHigh) -> Ack;
@@ -118,13 +117,13 @@ messages! {
     18 WeightsRequest: WeightsRequest, at "weights" (DataLow) -> WeightsReply;
     /// The state of an actor or the learner, to the replay server.
     19 Report: Report [checked], at "report" of an actor or the learner -> Ack;
-    /// The replay server's account of who takes part.
+    /// The state of all processes of the run, as the replay server knows it.
     20 ProcessesStatus: ProcessesStatus, at "status/processes" (InteractiveHigh) -> ProcessesStatus;
     /// Priorities of the rows of a batch, learner to replay server.
     21 Priorities: PriorityUpdate [checked], at "priorities" (DataHigh) -> Ack;
-    /// A request for the episodes that ended.
+    /// A request for the episodes that have ended.
     22 EpisodesRequest: EpisodesRequest, at "episodes" (InteractiveHigh) -> EpisodesReply;
-    /// Episodes that ended.
+    /// Episodes that have ended.
     23 EpisodesReply: EpisodesReply [checked];
     /// "Not yet: the replay is being read back from disk", replay server in answer to any query.
     24 Recovering: Recovering [checked];

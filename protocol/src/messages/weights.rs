@@ -1,7 +1,7 @@
-//! Weights on their way: whole from the learner to the replay server, once a version; in pieces from there to the actors.
-//! It does not read them: the payload is a safetensors file, which `driml-model` knows.
+//! Weights in transit: the learner sends each version whole to the replay server, from which actors fetch it in pieces.
+//! The payload is a safetensors file, which `driml-model` reads.
 //!
-//! Pieces, because a message has to be through within seconds (see `session`): a slow link gets the weights later, not never.
+//! Pieces are needed because a message must be sent within seconds (see `session`): a slow link gets the weights later, not never.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -11,19 +11,19 @@ use crate::wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::no_paylo
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
 
-/// "These are the newest weights": small, sent at each new version.
+/// Announces the newest weights at each new version: a small message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsVersion {
     /// Counts up from 1.
     pub version: u64,
 }
 
-/// What weights say of themselves.
+/// The description of one version of the weights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsHeader {
     /// Counts up from 1.
     pub version: u64,
-    /// Updates behind these weights.
+    /// Number of updates that led to these weights.
     pub updates: u64,
     /// SHA-256 of the safetensors file.
     pub sha256: [u8; 32],
@@ -32,18 +32,18 @@ pub struct WeightsHeader {
 /// One version of the learner's weights, whole.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Weights {
-    /// What they say of themselves.
+    /// The description of the weights.
     pub header: WeightsHeader,
     /// The networks' parameters, a safetensors file.
     pub safetensors: Vec<u8>,
 }
 
-/// New weights on their way to the replay server; the payload is a safetensors file.
+/// New weights from the learner to the replay server; the payload is a safetensors file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WeightsUpload {
-    /// Which learner sends them: that of its [`LearnerJoin`](crate::LearnerJoin).
+    /// The sender's number, as in its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
-    /// What they say of themselves.
+    /// The description of the weights.
     pub weights: WeightsHeader,
 }
 
@@ -53,21 +53,21 @@ impl WeightsUpload {
     }
 }
 
-/// An actor's question.
+/// An actor's request for weights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum WeightsRequest {
     /// The first piece of the newest weights, if their version is above this one.
     NewerThan(u64),
     /// The piece of these weights that starts at `offset`.
     Piece {
-        /// The version of the weights, as the first piece said it.
+        /// The version of the weights, from the header of the first piece.
         version: u64,
-        /// Byte of the safetensors file, a multiple of [`PIECE_BYTES`].
+        /// Position of the piece in the safetensors file, bytes: a multiple of [`PIECE_BYTES`].
         offset: u64,
     },
 }
 
-/// The answer to a [`WeightsRequest`].
+/// The reply to a [`WeightsRequest`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum WeightsReply {
     /// There are no newer weights.
@@ -76,11 +76,11 @@ pub enum WeightsReply {
     Gone,
     /// The payload that follows is a piece of these weights.
     Piece {
-        /// What the whole says of itself.
+        /// The description of the whole weights.
         weights: WeightsHeader,
         /// Bytes of the whole safetensors file.
         bytes: u64,
-        /// Byte at which the piece starts.
+        /// Position of the piece in the safetensors file, bytes.
         offset: u64,
     },
 }
@@ -88,7 +88,7 @@ pub enum WeightsReply {
 impl WeightsReply {
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
-            // Which piece is due is for [`Assembly`] to know.
+            // [`Assembly`] checks that the piece is the expected one.
             Self::Piece { .. } => Ok(()),
             Self::NoneNewer | Self::Gone => no_payload(payload),
         }
@@ -96,7 +96,7 @@ impl WeightsReply {
 }
 
 impl WeightsHeader {
-    /// Describes `safetensors`.
+    /// Creates the description of `safetensors`.
     pub fn new(version: u64, updates: u64, safetensors: &[u8]) -> Self {
         Self {
             version,
@@ -110,7 +110,7 @@ impl WeightsHeader {
         self.sha256.iter().map(|b| format!("{b:02x}")).collect()
     }
 
-    /// Checks that `safetensors` is what this describes.
+    /// Checks that `safetensors` has the hash of this description.
     pub fn check(&self, safetensors: &[u8]) -> Result<(), CodecError> {
         if self.sha256 == <[u8; 32]>::from(Sha256::digest(safetensors)) {
             Ok(())
@@ -122,7 +122,7 @@ impl WeightsHeader {
     }
 }
 
-/// Weights of which the first pieces have come.
+/// Weights of which some pieces have arrived.
 #[derive(Debug)]
 pub struct Assembly {
     weights: WeightsHeader,
@@ -131,7 +131,7 @@ pub struct Assembly {
 }
 
 impl Assembly {
-    /// Weights of which nothing has come yet, `bytes` bytes in all.
+    /// Starts to receive weights of `bytes` bytes in all.
     pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
         let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
         CodecError::check_size(bytes, PAYLOAD_BYTES_MAX)?;
@@ -142,10 +142,10 @@ impl Assembly {
         })
     }
 
-    /// Takes the next piece.
+    /// Appends the next piece.
     ///
     /// # Errors
-    /// A piece of other weights, or one that is not the next: nothing of it is taken.
+    /// The piece is of other weights or is not the next one. It is then dropped.
     pub fn take(
         &mut self,
         weights: WeightsHeader,
@@ -170,22 +170,22 @@ impl Assembly {
         Ok(())
     }
 
-    /// Byte at which the next piece starts.
+    /// Position at which the next piece starts, bytes.
     pub const fn next_offset(&self) -> u64 {
         self.have.len() as u64
     }
 
-    /// Bytes of the whole.
+    /// Bytes of the whole safetensors file.
     pub const fn bytes(&self) -> u64 {
         self.bytes as u64
     }
 
-    /// Whether all pieces have come.
+    /// Whether all pieces have arrived.
     pub const fn is_whole(&self) -> bool {
         self.have.len() == self.bytes
     }
 
-    /// The whole safetensors file.
+    /// Returns the whole weights, after checking their hash.
     pub fn finish(self) -> Result<Weights, CodecError> {
         self.weights.check(&self.have)?;
         Ok(Weights {

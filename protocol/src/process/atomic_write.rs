@@ -1,5 +1,5 @@
-//! Writing a file so that after a crash at any moment the old one is there or the new one, whole.
-//! What is in it is the caller's.
+//! Writes a file so that a crash at any moment leaves either the old file or the new one, whole.
+//! The content is up to the caller.
 
 use std::{
     fs::{File, Permissions},
@@ -8,17 +8,17 @@ use std::{
     path::Path,
 };
 
-/// Writes `bytes` beside `path`, flushes them to disk, renames them into their place and flushes the folder. On an error what was
-/// there stays, and nothing is left beside it. The file may be read by everyone.
+/// Writes `bytes` to a temporary file beside `path`, flushes it to disk, renames it to `path` and flushes the folder. If a step up to the
+/// renaming fails, the old file stays and the temporary one is removed. All users may read the file.
 ///
 /// # Errors
-/// A file system that refuses; the error names no path.
+/// The file system rejects an operation; the error names no path.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let folder = match path.parent() {
         Some(folder) if folder != Path::new("") => folder,
         _ => Path::new("."),
     };
-    // It is removed again unless it gets its place.
+    // The temporary file is removed unless it is renamed.
     let mut file = tempfile::NamedTempFile::new_in(folder)?;
     file.write_all(bytes)?;
     // Temporary files are private by default.
@@ -26,7 +26,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
         .set_permissions(Permissions::from_mode(0o644))?;
     file.as_file().sync_all()?;
     file.persist(path).map_err(|e| e.error)?;
-    // Or a crash of the machine may undo the renaming.
+    // Otherwise a crash of the machine may undo the renaming.
     File::open(folder)?.sync_all()
 }
 

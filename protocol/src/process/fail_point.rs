@@ -1,5 +1,5 @@
-//! Fail points for tests: with `DRIML_TEST_PANIC=NAME` in the environment, the thread that reaches the point NAME panics; with
-//! `DRIML_TEST_HOLD=UPDATES FILE` a learner that has made so many updates waits for the file.
+//! Fail points for tests: with `DRIML_TEST_PANIC=NAME` in the environment, the thread that reaches the point NAME panics. With
+//! `DRIML_TEST_HOLD=UPDATES FILE`, a learner that has made this many updates waits until the file exists.
 //! They exist in debug builds only; a release build reads no such variables.
 
 use std::{env, path::Path, sync::OnceLock, thread::sleep, time::Duration};
@@ -7,10 +7,10 @@ use std::{env, path::Path, sync::OnceLock, thread::sleep, time::Duration};
 /// The variable that names the point at which to panic.
 pub const VARIABLE: &str = "DRIML_TEST_PANIC";
 
-/// Panics if `DRIML_TEST_PANIC` names this point, in a debug build; else does nothing.
+/// In a debug build, panics if `DRIML_TEST_PANIC` names this point; else does nothing.
 ///
-/// Every working thread passes one such point in each iteration of its loop, named as the thread is. So a test can show for each
-/// thread that a panic ends the process.
+/// Every worker thread passes one point, named like the thread, in each iteration of its loop. So a test can show for each thread that a
+/// panic ends the process.
 #[inline]
 #[track_caller]
 pub fn reach(name: &str) {
@@ -21,12 +21,12 @@ pub fn reach(name: &str) {
     }
 }
 
-/// The variable that says after how many updates to wait, and for which file.
+/// The variable that gives the number of updates after which to wait, and the file to wait for.
 pub const HOLD: &str = "DRIML_TEST_HOLD";
 
-/// Waits until the file exists that `DRIML_TEST_HOLD` names, if so many `updates` are made, in a debug build; else does nothing.
+/// In a debug build, waits for the file in `DRIML_TEST_HOLD` once `updates` has reached the number there; else does nothing.
 ///
-/// A run that is held is not over before the test that watches it has seen and done what it has to, however slow the test is.
+/// A held run does not finish before the test that watches it is done, however slow the test is.
 #[inline]
 pub fn hold(updates: u64) {
     static WANTED: OnceLock<Option<(u64, String)>> = OnceLock::new();

@@ -1,5 +1,5 @@
 //! The last warning or error of this process, for status reports.
-//! The logger stores it here; where else a log line goes is not known here.
+//! The logger stores the warning here, and also writes log lines elsewhere.
 
 use std::{
     sync::Mutex,
@@ -10,12 +10,12 @@ use super::lock;
 
 static LAST: Mutex<Option<(String, Instant)>> = Mutex::new(None);
 
-/// Keeps a warning in the place of the one before.
+/// Stores a warning in place of the previous one.
 pub fn note(text: String) {
     *lock(&LAST) = Some((text, Instant::now()));
 }
 
-/// The last one and its age; none if there was none.
+/// Returns the last warning and its age; `None` if there was none.
 pub fn get() -> Option<(String, Duration)> {
     let last = lock(&LAST);
     last.as_ref().map(|(text, at)| (text.clone(), at.elapsed()))

@@ -1,5 +1,5 @@
-//! Files whose lock says that something is in use. The lock ends with the last process that has the file open, however it ends.
-//! It does not wait and logs nothing; the caller does.
+//! Files whose lock shows that something is in use. The lock ends with the last process that has the file open, however it ends.
+//! These functions do not wait; the caller does.
 
 use std::{
     fs::{File, TryLockError},
@@ -7,12 +7,12 @@ use std::{
     path::Path,
 };
 
-/// Creates `path` and locks it; `None` where another process holds it.
+/// Creates `path` and locks it; returns `None` if another process holds the lock.
 ///
-/// Not every file system of a cluster has locks. There the file counts as locked, and a warning ends with `advice`.
+/// Some file systems of clusters have no locks. There the file counts as locked, and a warning that ends with `advice` is logged.
 ///
 /// # Errors
-/// A file that cannot be created; the error names no path.
+/// The file cannot be created; the error names no path.
 pub fn create(path: &Path, advice: &str) -> io::Result<Option<File>> {
     let file = File::create(path)?;
     match try_lock(&file) {
@@ -25,7 +25,7 @@ pub fn create(path: &Path, advice: &str) -> io::Result<Option<File>> {
     }
 }
 
-/// Locks `file`; `false` where another process holds it.
+/// Locks `file`; returns `false` if another process holds the lock.
 pub fn try_lock(file: &File) -> io::Result<bool> {
     match file.try_lock() {
         Ok(()) => Ok(true),

@@ -1,9 +1,9 @@
-//! Log lines that could come many times a second: the first of a kind at once, then one in a while with a count.
-//! It does not log by itself.
+//! Limits log lines that could come many times a second: the first of a kind at once, then at most one every 10 s with a count.
+//! The caller writes the lines.
 
 use std::time::{Duration, Instant};
 
-/// How long one line stands for those like it.
+/// The shortest time between two written lines of a kind.
 const PERIOD: Duration = Duration::from_secs(10);
 
 /// Decides which lines of one kind are written.
@@ -14,7 +14,7 @@ pub struct LogLimiter {
 }
 
 impl LogLimiter {
-    /// Whether a line is to be written now: what to add to it, nothing or how many like it were left out since the last.
+    /// Returns `None` if a line must not be written now, else the text to append: how many like it were left out since the last, if any.
     pub fn due(&mut self) -> Option<String> {
         self.due_at(Instant::now())
     }

@@ -1,5 +1,5 @@
-//! What every process of a run needs beside messages: when to end, how to write and lock a file, how seldom to log.
-//! It sends nothing.
+//! Tools that every process of a run needs besides messages: shutdown, writing and locking files, and limits on logging.
+//! They send nothing.
 
 pub(crate) mod activity;
 pub mod atomic_write;
@@ -13,7 +13,7 @@ pub(crate) mod termination;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Locks `mutex`, also if a thread panicked while it held it: that panic ends the process, so nothing is done about it here.
+/// Locks `mutex`, even if a thread panicked while holding it: that panic ends the process, so it is not handled here.
 pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

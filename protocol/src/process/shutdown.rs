@@ -1,5 +1,5 @@
-//! The flag by which the threads of a process learn that it should stop.
-//! Draining and saving are each process's own; what raises the flag from outside is in `termination`.
+//! The flag that tells the threads of a process to stop.
+//! Each process drains and saves by itself; `termination` watches for the external reasons that raise the flag.
 
 use std::{
     ops::ControlFlow,
@@ -13,9 +13,9 @@ use super::{
     termination::{self, EndSign},
 };
 
-/// How often it is looked whether the flag is raised, where something else is waited for too.
+/// How often a thread that also waits for something else checks the flag.
 const TICK: Duration = Duration::from_millis(50);
-/// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
+/// Signals closer together count as one request to exit: tools such as `timeout` signal the process and its group.
 const ONE_WISH: Duration = Duration::from_millis(300);
 
 /// A flag that is raised once and never lowered; clones share it.
@@ -49,7 +49,7 @@ impl Shutdown {
         while !self.wait_timeout(Duration::from_secs(3600)) {}
     }
 
-    /// The result of `work`, run on a thread of this `name`; `None` if the flag is raised first. The thread is then left alone.
+    /// Runs `work` on a thread of this `name` and returns its result; `None` if the flag is raised first. The thread then runs unattended.
     pub fn unless_set<T: Send + 'static>(
         &self,
         name: &'static str,
@@ -78,18 +78,18 @@ impl Shutdown {
     }
 }
 
-/// When a process that others need while they end is to end itself.
+/// Flags that tell a process when to exit if others need it while they exit themselves.
 #[derive(Clone, Debug, Default)]
 pub struct GracefulShutdown {
-    /// Raised when it should end as soon as the others have left.
+    /// Raised when the process should exit as soon as the others have left.
     pub ending: Shutdown,
-    /// Raised when it should end without waiting for the others.
+    /// Raised when the process should exit without waiting for the others.
     pub now: Shutdown,
 }
 
 impl GracefulShutdown {
-    /// The first flag is raised at any reason to exit, the second at SIGINT and SIGTERM, and without a `parent` at any reason. With a
-    /// parent, its death, SIGHUP or a closed stderr raise only the first: the other processes exit then, too.
+    /// Raises `ending` at any reason to exit, and `now` at SIGINT and SIGTERM, or without a `parent` at any reason. With a parent, its
+    /// death, SIGHUP and a closed stderr raise only `ending`, because the other processes then exit too.
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let steps = Self::default();
         let raised = steps.clone();
@@ -104,7 +104,7 @@ impl GracefulShutdown {
         Ok(steps)
     }
 
-    /// The first flag is raised at any reason to exit, the second when SIGINT or SIGTERM comes again later.
+    /// Raises `ending` at any reason to exit, and `now` when SIGINT or SIGTERM arrives later.
     pub fn on_repeated_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let steps = Self::default();
         let (raised, mut first) = (steps.clone(), None);
@@ -115,23 +115,23 @@ impl GracefulShutdown {
         Ok(steps)
     }
 
-    /// Takes a sign received at `now`. `first` is when the first request began.
+    /// Handles a sign received at `now`. `first` is the time of the first sign.
     fn note(&self, sign: EndSign, first: &mut Option<Instant>, now: Instant) {
         match *first {
             None => {
                 *first = Some(now);
                 self.ending.set();
             }
-            // A closed terminal sends SIGHUP, and the other signs follow: no user is there who wants it faster.
+            // A closed terminal causes SIGHUP and then other signs, but no user there asks for a faster exit.
             Some(first) if sign == EndSign::Asked && now - first > ONE_WISH => self.now.set(),
             Some(_) => {}
         }
     }
 }
 
-/// Waits until all of `threads` have ended, at most for `wait_max`.
+/// Waits until all of `threads` have ended, for at most `wait_max`.
 ///
-/// A thread that still runs while the process ends may find memory gone that it shares with others.
+/// A thread that still runs while the process exits may use shared memory that is already gone.
 pub fn join_within(threads: impl IntoIterator<Item = JoinHandle<()>>, wait_max: Duration) {
     let started = Instant::now();
     for thread in threads {
@@ -176,13 +176,13 @@ mod tests {
     #[test]
     fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
         for signs in [
-            // Seconds, what came, and whether both flags are raised then.
+            // Seconds, the sign, and whether both flags are raised then.
             &[
                 (0.0, EndSign::Abandoned, false),
                 (5.0, EndSign::Abandoned, false),
                 (5.0, EndSign::Asked, true),
             ][..],
-            // One wish lasts from the first signal on.
+            // The time counts from the first signal.
             &[
                 (0.0, EndSign::Asked, false),
                 (0.299, EndSign::Asked, false),

@@ -1,15 +1,15 @@
-//! For how long another process has not answered. Of a time in which this process was stopped only a little counts.
-//! It sends nothing and gives up nothing.
+//! Measures how long another process has not answered. Time in which this process was stopped hardly counts.
+//! The caller sends requests and decides when to give up.
 
 use std::time::{Duration, Instant};
 
-/// The longest time between two looks that counts, beside what one try waits: a process that runs asks again sooner.
+/// The longest time between two failed attempts that counts, besides one attempt's time-out: a running process retries sooner.
 const LOOK_MAX: Duration = Duration::from_secs(15);
 
-/// For how long another process has not answered.
+/// The time for which another process has not answered.
 ///
-/// Of what this process spends stopped (Ctrl-Z, a paused container) at most 15 s count: it could not ask, and the other may have been
-/// stopped with it.
+/// While this process is stopped (Ctrl-Z, a paused container), at most 15 s and one attempt's time-out count: it could not ask, and the
+/// other process may have been stopped too.
 #[derive(Clone, Copy, Debug)]
 pub struct Silence {
     length: Duration,
@@ -17,7 +17,7 @@ pub struct Silence {
     look_max: Duration,
 }
 
-/// A silence that begins now; a try waits for its answer for no more than 10 s.
+/// A silence that begins now, for attempts with a time-out of at most 10 s.
 impl Default for Silence {
     fn default() -> Self {
         Self::with_tries_of(Duration::ZERO)
@@ -25,7 +25,7 @@ impl Default for Silence {
 }
 
 impl Silence {
-    /// A silence that begins now; a try may wait for its answer as long as this.
+    /// A silence that begins now, for attempts with a time-out of at most `try_max`.
     pub fn with_tries_of(try_max: Duration) -> Self {
         Self {
             length: Duration::ZERO,
@@ -34,12 +34,12 @@ impl Silence {
         }
     }
 
-    /// The other answered: the silence begins again.
+    /// Records an answer: the silence begins again.
     pub fn answered(&mut self) {
         (self.length, self.looked) = (Duration::ZERO, Instant::now());
     }
 
-    /// The other did not answer, when asked just now; gives the length of its silence.
+    /// Records that an attempt just failed; returns the length of the silence.
     pub fn unanswered(&mut self) -> Duration {
         self.unanswered_at(Instant::now())
     }
@@ -50,7 +50,7 @@ impl Silence {
         self.length
     }
 
-    /// The length of the silence when the other was asked last.
+    /// The length of the silence at the last attempt.
     pub const fn length(&self) -> Duration {
         self.length
     }

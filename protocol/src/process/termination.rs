@@ -1,5 +1,5 @@
-//! Reasons for a process to exit: a signal, a closed terminal or stderr, a dead parent. It listens for the process's whole life.
-//! What a sign means, a wish to drain or to end at once, is for the caller.
+//! Watches for reasons to exit, as long as the process runs: a signal, a closed terminal or stderr, a dead parent.
+//! The caller decides whether a sign means to drain or to exit at once.
 
 use std::{
     fs,
@@ -16,22 +16,22 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::fail_point;
 
-/// How often it is looked whether parent and stderr are still there.
+/// How often a process checks whether its parent and the reader of stderr still exist.
 const LOOK: Duration = Duration::from_millis(500);
 
-/// Why a process should end.
+/// A reason for a process to exit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum EndSign {
-    /// It was requested: SIGINT (Ctrl-C) or SIGTERM.
+    /// A request: SIGINT (Ctrl-C) or SIGTERM.
     Asked,
     /// The terminal was closed (SIGHUP), the reader of stderr exited, or the parent died.
     Abandoned,
 }
 
-/// Calls `on_sign` at each sign, on a thread of this `name`, until it breaks or the process ends. `parent` is the process whose
-/// death is a sign, given by its number: if it died before this process looked, that is seen too.
+/// Calls `on_sign` at each sign, on a thread of this `name`, until `on_sign` breaks or the process exits. `parent` is the number of the
+/// process whose death is a sign, even if it died before this call.
 ///
-/// SIGHUP is left ignored where it is ignored at the start, as `nohup` does it.
+/// SIGHUP stays ignored if it is ignored at the start, as under `nohup`.
 pub(super) fn listen(
     name: &'static str,
     parent: Option<u32>,
@@ -42,13 +42,13 @@ pub(super) fn listen(
         .build()?;
     let (mut interrupt, mut terminate, mut hangup) = {
         let _inside = runtime.enter();
-        // A file at its size limit (`ulimit -f`) becomes a write error, like a full disk; without a handler this signal would kill
-        // the process. The handler stays.
+        // With a handler, a file at its size limit (`ulimit -f`) causes a write error, like a full disk; without one, this signal kills the
+        // process. The handler stays after the drop.
         drop(signal(SignalKind::from_raw(Number::SIGXFSZ as i32))?);
         (
             signal(SignalKind::interrupt())?,
             signal(SignalKind::terminate())?,
-            // None where it was set to be ignored before this process started, by the kernel's own table.
+            // `None` if the kernel's table shows that the signal was ignored before this process started.
             match is_set("SigIgn:", Number::SIGHUP as u32 - 1) {
                 true => None,
                 false => Some(signal(SignalKind::hangup())?),
@@ -64,7 +64,7 @@ pub(super) fn listen(
                 _ = interrupt.recv() => EndSign::Asked,
                 _ = terminate.recv() => EndSign::Asked,
                 () = received(&mut hangup) => EndSign::Abandoned,
-                // Said once: it stays so.
+                // Reported once, because the state does not change back.
                 _ = look.tick(), if !abandoned => {
                     abandoned = is_gone(std::io::stderr()) || parent.is_some_and(|pid| parent_id() != pid);
                     if !abandoned {
@@ -84,7 +84,7 @@ pub(super) fn listen(
     Ok(())
 }
 
-/// Waits for the signal; without one it never returns.
+/// Waits for the signal; without one, never returns.
 async fn received(signal: &mut Option<Signal>) {
     match signal {
         Some(signal) => {
@@ -94,7 +94,7 @@ async fn received(signal: &mut Option<Signal>) {
     }
 }
 
-/// Whether a bit of one of this process's masks is set, by the name of the mask in `/proc/PID/status`.
+/// Whether a bit is set in one of this process's signal or capability masks, named as in `/proc/PID/status`.
 pub(crate) fn is_set(mask: &str, bit: u32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     is_set_in(&status, mask, bit)
@@ -112,7 +112,7 @@ fn is_gone(output: impl AsFd) -> bool {
     let mut output = [PollFd::new(output.as_fd(), PollFlags::empty())];
     let found = poll(&mut output, PollTimeout::ZERO);
     let events = output[0].revents().unwrap_or(PollFlags::empty());
-    // These two are always looked for.
+    // `poll` always reports these two.
     found.is_ok() && events.intersects(PollFlags::POLLERR | PollFlags::POLLHUP)
 }
 

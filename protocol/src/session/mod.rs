@@ -1,5 +1,5 @@
-//! Opening a zenoh session that suits large, acknowledged messages, and the two ways to talk over it.
-//! It does not scout, gossip or mesh: one process listens, the others connect and redial.
+//! Opens a zenoh session for large, acknowledged messages, over which processes ask and answer.
+//! Sessions do not scout, gossip or mesh: one process listens, and the others connect and reconnect.
 
 mod questions;
 
@@ -17,43 +17,43 @@ use crate::{
     wire::keys::Keys,
 };
 
-/// How a process reaches the others.
+/// The endpoints by which a process reaches the others.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoints {
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447` or `unixsock-stream//tmp/driml.sock`.
     pub listen: Vec<String>,
-    /// Endpoints to connect to, and to redial whenever the link breaks.
+    /// Endpoints to connect to, and to reconnect to whenever the link breaks.
     pub connect: Vec<String>,
 }
 
-/// What zenoh says where no endpoint could be connected to.
+/// The part of zenoh's error message that says that it could connect to no endpoint.
 const NOTHING_LISTENS: &str = "Unable to connect to any of";
 
-/// How long one message may take to go out before its link is given up: below every time-out of a question, so that a peer that
-/// was frozen or vanished is gone before others miss an answer. It comes back, and asks again, once it is well. A message must
-/// be small enough for this: 3 MB need 3 Mbit/s.
+/// How long sending one message may take before its link is closed. This is less than the 10 s time-outs of chunks, batches and weights, so
+/// a frozen or vanished peer loses its link before others time out. Once the peer recovers, it reconnects and retries. A message must be
+/// small enough: 3 MB need 3 Mbit/s.
 const STALLED_MAX: Duration = Duration::from_secs(8);
-/// How long something may take to listen: a replay server waits for shared memory first, while others take theirs.
+/// How long a client waits for a listener. A replay server first waits for shared memory while other processes allocate theirs.
 const START_MAX: Duration = Duration::from_secs(30);
 const CONNECT_MAX: Duration = Duration::from_secs(10);
-/// How long a first try may take to find that those who listen understand; then it is looked who they are.
+/// How long the first attempt to connect may take. After it, the client checks whether a foreign server listens.
 const UNDERSTOOD_MAX: Duration = Duration::from_millis(2500);
-/// Longest message accepted from a peer, bytes, while a process does not know its run's sizes yet.
+/// Longest message accepted from a peer, bytes, before a process knows the sizes of its run.
 pub const MESSAGE_BYTES_MAX: usize = 1 << 29;
-/// The same for a process that only receives settings, status and pieces of weights.
+/// Longest message accepted by a process that only receives settings, status and pieces of weights, bytes.
 pub const SMALL_MESSAGE_BYTES_MAX: usize = 1 << 22;
 
 /// Opens a session. A process that listens is the run's router; one that only connects is a client.
 ///
 /// # Errors
-/// An endpoint that cannot be listened on; a client with nothing listening on its endpoint after half a minute.
+/// An endpoint cannot be listened on, or nothing listens at a client's endpoints within half a minute.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     open_with(endpoints, MESSAGE_BYTES_MAX, &[])
 }
 
-/// As [`open`], with certificates where there are any: then endpoints are `quic/HOST:PORT` or unix sockets, and a replay server
-/// gives each role of the run with these keys what it needs and no more. Messages of more than `message_bytes_max` bytes, which no
-/// peer of this run sends, are dropped while they come in.
+/// Like [`open`], with `credentials` if there are any: endpoints are then `quic/HOST:PORT` or unix sockets, and a replay server grants each
+/// role of the run only the keys that it needs. Messages of more than `message_bytes_max` bytes, which no peer of this run sends, are
+/// dropped on arrival.
 pub fn open_as(
     endpoints: &Endpoints,
     keys: &Keys,
@@ -77,7 +77,7 @@ pub fn open_as(
     open_with(endpoints, message_bytes_max, &settings)
 }
 
-/// [`open_as`] of a process that has to wait for its replay server; `None` if it is told to stop before.
+/// Like [`open_as`], for a process that waits for its replay server; returns `None` if `shutdown` is set first.
 pub fn open_unless(
     shutdown: &Shutdown,
     endpoints: Endpoints,
@@ -95,7 +95,7 @@ pub fn open_unless(
 }
 
 impl Endpoints {
-    /// Only to connect.
+    /// Creates endpoints to connect to, and none to listen on.
     pub fn to(connect: Vec<String>) -> Self {
         let listen = Vec::new();
         Self { listen, connect }
@@ -119,7 +119,7 @@ fn open_with(
     message_bytes_max: usize,
     more: &[(&str, String)],
 ) -> Result<Session, SessionError> {
-    // zenoh adds where in its own sources it failed.
+    // zenoh appends the place in its sources where it failed; this cuts it off.
     let fail = |why: String| endpoints.not_opened(why.split(" at /").next().unwrap_or_default());
     let router = !endpoints.listen.is_empty();
     let max = message_bytes_max.to_string();
@@ -141,8 +141,8 @@ fn open_with(
         ("scouting/gossip/enabled", "false"),
         ("transport/unicast/open_timeout", "2000"),
         ("transport/unicast/accept_timeout", "5000"),
-        // Long enough for a machine that is busy with much else: a process that got no processor for a while is not gone. One
-        // that died is known at once, as its connection closes; over QUIC, which has no system to close it, after this long.
+        // Long enough for a busy machine, on which a live process may get no processor for a while. The death of a process closes its
+        // connections at once; only over QUIC, where the system closes nothing, does detection take this long.
         ("transport/link/tx/lease", "30000"),
         ("transport/link/tx/queue/size/data", "16"),
         (
@@ -151,7 +151,7 @@ fn open_with(
         ),
         ("transport/link/rx/max_message_size", &max),
         ("transport/link/rx/buffer_size", "4194304"),
-        // Only what a process itself puts into shared memory goes through it.
+        // Only messages that a process itself puts into shared memory go through it.
         (
             "transport/shared_memory/transport_optimization/enabled",
             "false",
@@ -173,7 +173,7 @@ fn open_with(
     };
     let open = |connect_ms: &str| {
         open_within("true", connect_ms).or_else(|why| {
-            // Without shared memory nothing would listen either.
+            // Without shared memory, there would still be no listener.
             if why.contains(NOTHING_LISTENS) {
                 return Err(why);
             }
@@ -188,8 +188,7 @@ fn open_with(
     let not_driml = |what: &str| {
         let connect = endpoints.connect.join(", ");
         SessionError::Failed(match endpoints.connect.iter().any(|it| is_quic(it)) {
-            // Whether none listens or one side rejects the other's certificate is known to zenoh alone, whose log has it on the side
-            // that rejects.
+            // zenoh does not tell a missing listener from a rejected certificate; its log on the rejecting side does.
             true => format!(
                 "no replay server lets this process in on {connect}: is it running, with --tls-dir, and is the endpoint right (its port is \
                  one of UDP)? If so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay \
@@ -205,7 +204,7 @@ fn open_with(
         Err(why) if why.contains(NOTHING_LISTENS) => why,
         opened => return opened.map_err(fail),
     };
-    // A process of the run may be slow on a busy machine, and then sends nothing; a foreign server may introduce itself.
+    // A process of the run that is slow on a busy machine sends nothing; a foreign server may introduce itself.
     let mut listening = endpoints.connect.iter();
     if let Some(words) = listening.find_map(|it| reach::what_listens(it)) {
         return Err(not_driml(&format!("it says {words:?}")));
@@ -219,8 +218,8 @@ fn open_with(
     })
 }
 
-/// Removes the shared memory of processes that ended without doing so, as killed ones do; that of living ones stays. For the
-/// launcher and for processes started by hand: many processes that start at once need not all look.
+/// Removes the shared memory of processes that ended without doing so, such as killed ones, and keeps that of running processes. The
+/// launcher and processes started by hand call this, so that not each of many processes scans for it at once.
 pub fn sweep_shared_memory() {
     zenoh::shm::cleanup_orphaned_shm_segments();
 }

@@ -1,4 +1,4 @@
-//! Asking over a session, answering, and why either may fail.
+//! Sends requests over a session, answers them, and defines why either may fail.
 
 use std::time::{Duration, Instant};
 
@@ -29,8 +29,7 @@ pub enum SessionError {
     NoAnswerer { key: String },
     #[error("{key}: no answer within {within_ms} ms")]
     NoReply { key: String, within_ms: u128 },
-    /// The replay server is reading its replay back from disk, and will answer then. It is there: this may be waited for as long as it
-    /// takes.
+    /// The replay server runs, but still reads its replay back from disk. It answers afterwards, so a caller may wait without a limit.
     #[error("{0}")]
     Recovering(Recovering),
     #[error("{key}: {why}")]
@@ -40,7 +39,7 @@ pub enum SessionError {
     Failed(String),
 }
 
-/// What zenoh replies where a process does not.
+/// zenoh's error reply if no process replies in time.
 const TIMED_OUT: &str = "Timeout";
 
 #[derive(Debug)]
@@ -48,7 +47,7 @@ pub(crate) struct PendingBytes {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
-    /// Why none of the replies so far was taken.
+    /// The error of the last reply, if no reply so far was accepted.
     failed: Option<SessionError>,
 }
 
@@ -62,7 +61,7 @@ pub(crate) fn send(
     let replies = session
         .get(key)
         .payload(payload)
-        // Foreign processes that answer, too: with one target zenoh might choose one of them.
+        // Queries foreign processes too: with a single target, zenoh might choose one of them.
         .target(QueryTarget::All)
         .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Block)
@@ -79,7 +78,7 @@ pub(crate) fn send(
 }
 
 impl PendingBytes {
-    /// Waits for the one answer that `read` takes. Without certificates foreign processes may answer, too.
+    /// Waits for the first reply that `read` accepts. Without certificates, foreign processes may reply too.
     pub(crate) fn wait_for<T>(
         &mut self,
         read: impl Fn(&ZBytes) -> Result<T, CodecError>,
@@ -92,7 +91,7 @@ impl PendingBytes {
         }
     }
 
-    /// [`PendingBytes::wait_for`] at most for `wait_max`; `None` if it has not come by then.
+    /// Like [`PendingBytes::wait_for`] for at most `wait_max`; returns `None` if no such reply has arrived by then.
     pub(crate) fn wait_for_within<T>(
         &mut self,
         wait_max: Duration,
@@ -111,7 +110,7 @@ impl PendingBytes {
         }
     }
 
-    /// What `read` takes of a reply; `None` if there may be another. `reply` is none if there is not.
+    /// Applies `read` to a reply; returns `None` if it fails and another may follow. `reply` is `None` after the last one.
     fn read<T>(
         &mut self,
         reply: Option<Reply>,
@@ -146,7 +145,7 @@ impl PendingBytes {
     }
 }
 
-/// Asks one question and waits for its one answer, whatever it says.
+/// Sends one request and returns the bytes of its first reply, unchecked.
 pub fn ask(
     session: &Session,
     key: &str,
@@ -157,14 +156,14 @@ pub fn ask(
     send(session, key, payload, priority, timeout)?.wait_for(|bytes| Ok(bytes.clone()))
 }
 
-/// Answers a question with `payload`; an asker that has gone away is logged and forgotten.
+/// Answers `query` with `payload`. If the requester has gone away, this is logged and ignored.
 pub fn answer(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply(query.key_expr().clone(), payload).wait() {
         tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
     }
 }
 
-/// Answers a question that cannot be dealt with now by an error, `payload`; its asker asks again.
+/// Answers `query` with the error `payload`, because it cannot be handled now. The requester retries.
 pub(crate) fn put_off(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply_err(payload).wait() {
         tracing::debug!("{}: the asker is gone: {e}", query.key_expr());

@@ -1,6 +1,5 @@
-//! The roles of processes, each the common name of a certificate, and what each may do, as rules for zenoh's access control at the
-//! replay server: everything else is denied.
-//! A message is let in by its sender's common name and its key alone; its content is checked by the process that answers it.
+//! The roles of processes, each a certificate's common name, and their rights as rules for zenoh's access control, which denies all else.
+//! The rules see only a message's key and its sender's common name; the process that answers checks the content.
 
 use crate::{
     messages::{
@@ -17,20 +16,19 @@ use crate::{
     wire::keys::{Keys, ProcessName},
 };
 
-/// Actors that certificates can name: 0 to this many, less one. The access rules of all of them are made when a replay server
-/// starts, and take memory.
+/// Number of actors that certificates can name, from 0. A replay server makes the rules of all at its start, which takes memory.
 pub const ACTORS_MAX: u32 = 1024;
 
 /// The role of a process, and the common name of its certificate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// The actor of this number.
+    /// The actor with this number.
     Actor(u32),
     /// The one learner of a run.
     Learner,
     /// A replay server: the side that listens.
     ReplayServer,
-    /// A process that only watches.
+    /// A process that only watches the run.
     Observer,
 }
 
@@ -48,7 +46,7 @@ impl std::fmt::Display for Role {
 impl std::str::FromStr for Role {
     type Err = String;
 
-    /// Reads what [`Role`] is displayed as, and nothing else.
+    /// Parses exactly the text that `Display` writes.
     fn from_str(name: &str) -> Result<Self, String> {
         let number = name.strip_prefix("actor-").and_then(|it| it.parse().ok());
         let others = [Self::Learner, Self::ReplayServer, Self::Observer];
@@ -60,7 +58,7 @@ impl std::str::FromStr for Role {
 }
 
 impl Role {
-    /// How `deploy/certs.sh` is told to make the certificate of this role in DIR.
+    /// The arguments after DIR with which `deploy/certs.sh` makes the certificate of this role.
     pub(super) fn how_to_make(self) -> String {
         match self {
             Self::Actor(number) => format!("--actors {}", number.saturating_add(1)),
@@ -70,7 +68,7 @@ impl Role {
     }
 }
 
-/// What a role may do, by keys; everything else it may not.
+/// The keys at which a role may ask, answer, subscribe and declare liveliness. Everything else is denied.
 #[derive(Default)]
 struct Grant {
     asks: Vec<String>,
@@ -79,7 +77,7 @@ struct Grant {
     lives: Vec<String>,
 }
 
-/// What a role may do in the run whose keys these are; nothing for a replay server, which does not connect.
+/// Returns the rights of `role` in the run with these keys; none for a replay server, which does not connect.
 fn grant(keys: &Keys, role: Role) -> Grant {
     match role {
         Role::Actor(actor) => Grant {
@@ -125,7 +123,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
     }
 }
 
-/// Rules, subjects and policies as zenoh has them.
+/// The rules, subjects and policies of zenoh's access control, as JSON5.
 #[derive(Default)]
 struct Lists {
     rules: Vec<String>,
@@ -152,7 +150,7 @@ impl Lists {
                 continue;
             }
             let id = format!("{name}-{what}");
-            // Rust writes strings and lists of them as JSON5 does.
+            // Rust's debug format of strings and of lists of them is JSON5.
             self.rules.push(format!(
                 "{{ id: {id:?}, permission: \"allow\", flows: [\"{flow}\"], messages: [{messages}], key_exprs: {keys:?} }}"
             ));
@@ -165,7 +163,7 @@ impl Lists {
             .push(format!("{{ rules: {rules:?}, subjects: [\"{name}\"] }}"));
     }
 
-    /// Who comes through a unix socket of this machine: its folder's permissions are the guard.
+    /// Allows everything through a unix socket of this machine, which the permissions of its folder guard.
     fn add_unix_sockets(&mut self) {
         let all = "\"put\", \"delete\", \"declare_subscriber\", \"query\", \"reply\", \"declare_queryable\", \"liveliness_token\", \
                    \"liveliness_query\", \"declare_liveliness_subscriber\"";
@@ -179,7 +177,7 @@ impl Lists {
     }
 }
 
-/// The whole of zenoh's `access_control`, JSON5, for the replay server of the run whose keys these are.
+/// Returns zenoh's whole `access_control`, JSON5, for the replay server of the run with these keys.
 pub(crate) fn rules(keys: &Keys) -> String {
     let mut lists = Lists::default();
     let actors = (0..ACTORS_MAX).map(Role::Actor);

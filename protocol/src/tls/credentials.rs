@@ -1,5 +1,5 @@
-//! The files of one process in a folder of certificates, read and checked before anything is sent.
-//! The other side's files are checked there, before its start.
+//! Reads and checks the files of one process in a folder of certificates, before anything is sent.
+//! Each process checks its own files at its start.
 
 use std::{
     fs, io,
@@ -26,10 +26,10 @@ use super::access::{ACTORS_MAX, Role};
 #[error("{0}")]
 pub struct TlsError(String);
 
-/// A certificate that expires sooner is warned of at the start.
+/// A certificate that expires sooner causes a warning at the start.
 const EXPIRES_SOON: Duration = Duration::from_secs(14 * 24 * 3600);
 
-/// The authority's certificate in a folder.
+/// The path of the authority's certificate in a folder.
 pub fn authority_path(folder: &Path) -> PathBuf {
     folder.join("ca.pem")
 }
@@ -37,17 +37,17 @@ pub fn authority_path(folder: &Path) -> PathBuf {
 /// A process's certificate and key, and the authority that it trusts. [`Credentials::read`] has checked them.
 #[derive(Debug)]
 pub struct Credentials {
-    /// What this process is.
+    /// The role of this process.
     pub role: Role,
     authority: PathBuf,
     certificate: PathBuf,
-    /// The key's file.
+    /// The path of the private key.
     pub key: PathBuf,
-    /// Until when the certificate is good, seconds since 1970.
+    /// When the certificate expires, seconds since 1970.
     expires: i64,
-    /// Until when the certificate is good, for a person.
+    /// When the certificate expires, as text for the user.
     pub expires_on: String,
-    /// The names and addresses that it is for: clients connect to the replay server by one of them.
+    /// The host names and addresses in the certificate. Clients connect to the replay server by one of them.
     pub hosts: Vec<String>,
 }
 
@@ -55,7 +55,7 @@ impl Credentials {
     /// Reads `ca.pem`, `ROLE.pem` and `ROLE.key` in `folder`, and checks that they belong to this role and to each other.
     ///
     /// # Errors
-    /// A file that is missing, unreadable, of another role, authority or key, expired or not valid yet; what to do.
+    /// A file is missing, unreadable, expired, not valid yet, or of another role, authority or key. The error says what to do.
     pub fn read(folder: &Path, role: Role) -> Result<Self, TlsError> {
         let read = Self::examine(folder, role)?;
         if read.is_key_open() {
@@ -67,7 +67,7 @@ impl Credentials {
         Ok(read)
     }
 
-    /// As [`Credentials::read`], and logs nothing.
+    /// Like [`Credentials::read`], but logs no warning.
     pub fn examine(folder: &Path, role: Role) -> Result<Self, TlsError> {
         if let Role::Actor(number) = role
             && number >= ACTORS_MAX
@@ -138,7 +138,7 @@ impl Credentials {
         mode.is_ok_and(|mode| mode & 0o077 != 0)
     }
 
-    /// How long the certificate is still good.
+    /// How long the certificate is still valid.
     pub fn expires_in(&self) -> Duration {
         let left = self.expires.saturating_sub(now().as_secs() as i64);
         Duration::from_secs(u64::try_from(left).unwrap_or(0))
@@ -173,7 +173,7 @@ impl Credentials {
     }
 }
 
-/// The provider of algorithms that zenoh uses too.
+/// The provider of cryptographic algorithms, the same as zenoh's.
 fn provider() -> CryptoProvider {
     ring::default_provider()
 }
@@ -217,7 +217,7 @@ fn not_pem(path: &Path) -> TlsError {
     ))
 }
 
-/// The certificates in a file, at least one.
+/// Reads the certificates in a file; an error if there are none.
 fn certificates(path: &Path, role: Role) -> Result<Vec<CertificateDer<'static>>, TlsError> {
     let bytes = read(path, role)?;
     let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
@@ -252,7 +252,7 @@ fn check_dates(certificate: &X509Certificate<'_>, path: &Path, role: Role) -> Re
     Ok(())
 }
 
-/// Checks that the authority signed the first of `chain`, for the side on which `role` uses it.
+/// Checks that the authority signed the first certificate of `chain` for the side of the connection that `role` takes: server or client.
 fn check_signed(
     roots: &RootCertStore,
     chain: &[CertificateDer<'static>],

@@ -1,8 +1,8 @@
-//! Memory for the long payloads of messages: used again and again, and shared with the other side where both are on one host.
-//! It does not know what is in it, and a message fares the same in either kind of memory.
+//! Reusable memory for the long payloads of messages, shared with the other side if both are on one host.
+//! The content is not known here, and messages are sent alike from private and from shared memory.
 //!
-//! Fresh memory costs a page fault every 4 KiB, more than filling it. Shared memory saves the trip through a socket, but a
-//! receiver may lose it (zenoh takes it back from a process that seems dead), so receivers copy before they check.
+//! Fresh memory costs a page fault every 4 KiB, more than filling it. Shared memory avoids the copy through a socket, but a receiver may
+//! lose it: zenoh reclaims it from a process that seems dead. So receivers copy before they check.
 
 use std::{
     fmt,
@@ -22,11 +22,11 @@ use zenoh::{
 use super::shared_memory::{self, METADATA_BYTES, Trust};
 use crate::process::lock;
 
-/// Memory for the payload of a message. Clones have memory of their own.
+/// Memory for the payload of a message. A clone is a copy in new memory.
 pub struct Buffer(Memory);
 
 enum Memory {
-    /// Given back to the pool, if there is one.
+    /// Private memory, which returns to the pool when dropped, if there is a pool.
     Own(Vec<u8>, Option<Arc<Pool>>),
     Shared(ZShmMut),
 }
@@ -42,18 +42,18 @@ struct Shared {
     trust: Mutex<Trust>,
 }
 
-/// A source of [`Buffer`]; clones are the same source.
+/// A source of [`Buffer`]s; clones share one pool.
 #[derive(Clone)]
 pub struct BufferPool(Arc<Pool>);
 
 impl BufferPool {
-    /// Memory of this process alone, of which `spare_max` pieces are kept for later use.
+    /// Creates a pool of private memory, which keeps at most `spare_max` returned buffers for reuse.
     pub fn new(spare_max: usize) -> Self {
         Self::with(spare_max, None)
     }
 
-    /// As [`BufferPool::new`], with shared memory for `count` pieces of `bytes` each; where the machine does not grant it,
-    /// a warning says so and everything works without.
+    /// Like [`BufferPool::new`], with shared memory for `count` buffers of `bytes` each. If the machine does not grant shared memory, a
+    /// warning is logged and all buffers are private.
     pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
         let mut shared = None;
         let asked = provider(shared_memory::pool_bytes(count, bytes));
@@ -72,15 +72,14 @@ impl BufferPool {
         }))
     }
 
-    /// `bytes` bytes of this process's own memory, with whatever was in them before.
+    /// Returns `bytes` bytes of private memory with arbitrary content.
     pub fn take_own(&self, bytes: usize) -> Buffer {
         let mut vec = lock(&self.0.spare).pop().unwrap_or_default();
         vec.resize(bytes, 0);
         Buffer(Memory::Own(vec, Some(self.0.clone())))
     }
 
-    /// `bytes` bytes with whatever was in them before: shared with others on this host if there is any, else
-    /// [`BufferPool::take_own`].
+    /// Returns `bytes` bytes with arbitrary content: shared memory if the pool has some and it may be used, else [`BufferPool::take_own`].
     pub fn take(&self, bytes: usize) -> Buffer {
         match self.0.shared.as_ref().and_then(|shared| shared.take(bytes)) {
             Some(shared) => Buffer(Memory::Shared(shared)),
@@ -88,14 +87,14 @@ impl BufferPool {
         }
     }
 
-    /// Tells that a message in shared memory did not arrive: the next ones are made of own memory.
+    /// Reports that a message in shared memory did not arrive: the next ones use private memory.
     pub fn avoid_shared_memory(&self) {
         if let Some(shared) = &self.0.shared {
             lock(&shared.trust).lost();
         }
     }
 
-    /// Tells that a message in shared memory has arrived.
+    /// Reports that a message in shared memory has arrived.
     pub fn shared_memory_works(&self) {
         if let Some(shared) = &self.0.shared {
             lock(&shared.trust).worked();
@@ -104,7 +103,7 @@ impl BufferPool {
 }
 
 impl Shared {
-    /// Never waits. A receiver that is killed keeps its pieces as long as this process runs: zenoh frees one once all have released it.
+    /// Never waits. A killed receiver's buffers stay in use while this process runs: zenoh frees a buffer once all have released it.
     fn take(&self, bytes: usize) -> Option<ZShmMut> {
         if !lock(&self.trust).ask() {
             return None;
@@ -116,10 +115,10 @@ impl Shared {
     }
 }
 
-/// A pool of `bytes` bytes of shared memory, or why there is none.
+/// Creates a pool of `bytes` bytes of shared memory, or returns why it cannot.
 ///
-/// zenoh makes its own part with the first piece, and panics where it cannot: so that piece is taken here, while there is room for
-/// it. All of it is locked in memory, so that a folder that fills up later takes nothing from this process.
+/// zenoh creates its metadata at the first allocation and panics if it cannot, so that allocation happens here, while there is room. zenoh
+/// locks all of this memory, so a folder that fills up later takes nothing from this process.
 fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
     let needed = shared_memory::process_bytes(bytes);
     shared_memory::check_lockable(needed)?;
@@ -134,17 +133,17 @@ fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String
 }
 
 impl Buffer {
-    /// `bytes` zeros in memory of their own.
+    /// Creates a buffer of `bytes` zeros outside any pool.
     pub fn zeroed(bytes: usize) -> Self {
         Self::from(vec![0; bytes])
     }
 
-    /// Whether they lie in memory that others on this host can read.
+    /// Whether the bytes lie in shared memory, which other processes on this host can read.
     pub const fn are_shared(&self) -> bool {
         matches!(self.0, Memory::Shared(_))
     }
 
-    /// The bytes as they travel, not copied. Own memory goes back to its pool when the last clone is dropped.
+    /// Returns the bytes for sending, without a copy. Private memory returns to its pool when the last clone is dropped.
     pub fn freeze(mut self) -> ZBytes {
         match std::mem::replace(&mut self.0, Memory::Own(Vec::new(), None)) {
             Memory::Shared(shared) => ZBytes::from(shared),
@@ -234,7 +233,7 @@ mod tests {
         assert_ne!(again.as_ptr(), address);
         assert_eq!(sent.to_bytes(), &b"abcde"[..]);
         drop((sent.clone(), again, sent));
-        // One piece is kept: the first that came back.
+        // The pool keeps one buffer, the first that came back.
         assert_eq!(pool.0.spare.lock().unwrap().len(), 1);
         assert_eq!(pool.take_own(3).len(), 3);
     }
@@ -250,7 +249,7 @@ mod tests {
             address(to) - address(from)
         });
         let lens: Vec<_> = lens.collect();
-        // Or this machine grants none.
+        // Unless this machine grants no shared memory.
         assert!(
             pool.0.shared.is_none() || lens.contains(&METADATA_BYTES),
             "{lens:?}"
@@ -261,7 +260,7 @@ mod tests {
     fn shared_memory_is_avoided_after_a_loss_and_never_waited_for() {
         let pool = BufferPool::shared(4, 2, 1_000_000);
         if pool.0.shared.is_none() {
-            // This machine grants none: then there is nothing but own memory.
+            // Without shared memory, all buffers are private.
             assert!(!pool.take(1_000_000).are_shared());
             return;
         }

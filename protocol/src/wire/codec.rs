@@ -1,5 +1,5 @@
 //! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
-//! It does not know what a message means; it alone calls bincode for what travels.
+//! The meaning of messages is not known here, and no other module encodes messages with bincode.
 
 use std::io::Read;
 
@@ -15,20 +15,20 @@ use super::{
 /// The version of every message in this crate; processes of different versions reject each other.
 pub const PROTOCOL_VERSION: u16 = 8;
 
-/// Length of the fixed prefix, bytes: the widths of its fields.
+/// Length of the fixed prefix, bytes: the sum of the widths of its fields.
 pub const PREFIX_BYTES: usize = 32;
-/// Longest header, bytes; a longer one is refused by both sides.
+/// Longest header, bytes; sender and receiver reject a longer one.
 pub const HEADER_BYTES_MAX: usize = 1 << 20;
-/// Longest payload, bytes; a longer one is refused by both sides.
+/// Longest payload, bytes; sender and receiver reject a longer one.
 pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 
-/// Bytes that are copied, then summed while they are in the nearest cache.
+/// Bytes that `copy` handles at a time: it copies a block, then adds it to the checksum while it is in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
 
-/// Longest value of [`encode_value`], bytes.
+/// Longest value of [`encode_value`], bytes; a longer one is an error.
 pub const VALUE_BYTES_MAX: usize = 1 << 28;
 
-/// The prefix's integers: of fixed width, without gaps.
+/// The encoding of the prefix: integers of fixed width, without gaps.
 const FIXED: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
@@ -39,7 +39,7 @@ fn encode_within<T: Serialize>(value: &T, max: usize) -> Result<Vec<u8>, CodecEr
     Ok(bytes)
 }
 
-/// The value of all of `bytes`, which claims no more than `MAX` bytes of memory.
+/// Decodes a value from all of `bytes`; the value may claim at most `MAX` bytes of memory.
 fn decode_within<T: DeserializeOwned, const MAX: usize>(bytes: &[u8]) -> Result<T, CodecError> {
     let config = bincode::config::standard().with_limit::<MAX>();
     let (value, used) = bincode::serde::decode_from_slice(bytes, config)
@@ -50,17 +50,17 @@ fn decode_within<T: DeserializeOwned, const MAX: usize>(bytes: &[u8]) -> Result<
     }
 }
 
-/// The bytes of a value that travels in no message, for files and hashes.
+/// Encodes a value that is not a message, for files and hashes.
 pub fn encode_value<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
     encode_within(value, VALUE_BYTES_MAX)
 }
 
-/// Reads what [`encode_value`] wrote. That the bytes are undamaged is the caller's to check.
+/// Decodes what [`encode_value`] wrote. The caller must check that the bytes are undamaged.
 pub fn decode_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
     decode_within::<T, VALUE_BYTES_MAX>(bytes)
 }
 
-/// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.
+/// Returns prefix and header of a message. On the wire, `payload` follows these bytes; it is not copied.
 pub fn seal<M: Message>(
     spec_hash: u64,
     message: &M,
@@ -84,7 +84,7 @@ pub fn seal<M: Message>(
     Ok([&prefix.to_bytes()[..], &header].concat())
 }
 
-/// A whole message in one piece, for small ones and for tests.
+/// Encodes a whole message into one buffer, for small messages and for tests.
 pub fn encode<M: Message>(
     spec_hash: u64,
     message: &M,
@@ -93,17 +93,17 @@ pub fn encode<M: Message>(
     Ok([&seal(spec_hash, message, payload)?, payload].concat())
 }
 
-/// Checks a message in one piece and gives it and its payload.
+/// Checks a message in one buffer and returns the message and its payload.
 ///
-/// `spec_hash` is the hash of this process's run, or `None` where any run is accepted (a process that joins to learn it).
+/// `spec_hash` is the hash of this process's run, or `None` to accept any run, for a process that joins to learn the hash.
 pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
     let (message, payload) = receive(bytes, bytes.len(), &BufferPool::new(0), spec_hash)?;
     Ok((message, &bytes[bytes.len() - payload.len()..]))
 }
 
-/// Checks a message of `len` bytes and copies its payload into own memory of `pool`.
+/// Checks a message of `len` bytes and copies its payload into private memory from `pool`.
 ///
-/// The checksum is the copy's, so what was checked cannot change afterwards, even if it came through shared memory.
+/// The checksum covers the copy, so the checked bytes cannot change afterwards, even if they came through shared memory.
 pub fn receive<M: Message>(
     mut bytes: impl Read,
     len: usize,
@@ -122,8 +122,8 @@ pub fn receive<M: Message>(
     Ok((message, payload))
 }
 
-/// Copies the next bytes into `out`, a block at a time, so that the sum finds each block of the copy in the cache.
-/// Where they end early, the sum will not fit.
+/// Copies the next bytes into `out` a block at a time, and adds each block to the checksum while it is in the cache.
+/// If `bytes` ends early, the checksum will not match.
 fn copy(bytes: &mut impl Read, out: &mut [u8], sum: &mut crc32fast::Hasher) {
     for block in out.chunks_mut(BLOCK_BYTES) {
         if bytes.read_exact(block).is_err() {
@@ -133,20 +133,20 @@ fn copy(bytes: &mut impl Read, out: &mut [u8], sum: &mut crc32fast::Hasher) {
     }
 }
 
-/// The first bytes of every message: each field with its width, in the order in which they travel.
+/// The first bytes of every message: fields of fixed width, in the order in which they are sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Prefix {
-    /// `DRML`, so that strangers are told from us.
+    /// `DRML`, which tells messages of DRIML from foreign bytes.
     magic: u32,
-    /// The protocol's version; others are refused.
+    /// The protocol version; messages of other versions are rejected.
     version: u16,
-    /// Which message it is: a [`Kind`](crate::Kind).
+    /// The kind of message: a [`Kind`](crate::Kind).
     kind: u16,
-    /// The hash of the run's spec, so that runs are not mixed.
+    /// The hash of the run's spec, so that runs do not mix.
     spec_hash: u64,
     header_bytes: u32,
     payload_bytes: u64,
-    /// CRC-32 of the prefix before it, the header and the payload. It stays the last field.
+    /// CRC-32 of the fields before it, the header and the payload. It must stay the last field.
     checksum: u32,
 }
 
@@ -160,20 +160,20 @@ impl Prefix {
         bytes
     }
 
-    /// The fields of bytes that came, whatever they say.
+    /// Decodes the fields of received bytes, without checking them.
     fn from_bytes(bytes: &[u8; PREFIX_BYTES]) -> Self {
         let read = bincode::serde::decode_from_slice(bytes, FIXED);
         read.expect("any 32 bytes are seven integers").0
     }
 
-    /// A checksum over the fields before it, to which header and payload are to be added.
+    /// Starts a checksum with the fields before `checksum`; the caller adds header and payload.
     fn checksum_begun(self) -> crc32fast::Hasher {
         let mut sum = crc32fast::Hasher::new();
         sum.update(&self.to_bytes()[..PREFIX_BYTES - size_of::<u32>()]);
         sum
     }
 
-    /// The prefix of a message of `len` bytes in all, if its magic, version and lengths are in order.
+    /// Decodes the prefix of a message of `len` bytes in all, and checks its magic, version and lengths.
     fn read(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
         let this = Self::from_bytes(bytes.ok_or(CodecError::Length {
             have: len,
@@ -205,7 +205,7 @@ impl Prefix {
         usize::try_from(self.payload_bytes).unwrap_or(usize::MAX)
     }
 
-    /// The message, if its checksum, kind and run are right, and header and payload are what its type promises.
+    /// Decodes the message, after checking checksum, kind and run, and validates header and payload by its type.
     fn message<M: Message>(
         &self,
         sum: crc32fast::Hasher,

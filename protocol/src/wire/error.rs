@@ -1,7 +1,7 @@
-//! Why bytes from another process were refused: each fault with a sentence, and what to do where something can be done.
-//! A refused message is never a panic.
+//! Why bytes from another process were rejected: each fault with a sentence, and a remedy if there is one.
+//! Rejected bytes never cause a panic.
 
-/// Why bytes were refused. None of these is ever a panic.
+/// Why a message was rejected, by its receiver or before it was sent.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum CodecError {

@@ -1,5 +1,5 @@
-//! Where each message travels: its own key under the run's namespace, and one for each process that is connected.
-//! What an actor says stands under its number, so that access can be given by key; versions and lives are in the messages.
+//! The key of each message under the run's namespace, and the key of each connected process's liveliness token.
+//! Keys of an actor's messages end in its number, so that access can be granted by key. Versions are in the messages.
 
 use std::fmt;
 
@@ -34,17 +34,17 @@ impl Keys {
         format!("{}/{name}", self.namespace)
     }
 
-    /// Where messages of type `M` are answered, fetched or announced: of those that have a key an actor, all of them.
+    /// The key at which messages of type `M` are answered, fetched or announced. If each actor has its own key, this one matches all.
     pub fn of<M: Keyed>(&self) -> String {
         self.said_by::<M>('*')
     }
 
-    /// Where `actor` asks messages of type `M`.
+    /// The key at which `actor` sends messages of type `M`.
     pub fn of_actor<M: Keyed>(&self, actor: u32) -> String {
         self.said_by::<M>(actor)
     }
 
-    /// Where the learner sends messages of type `M`, for which each actor may have its own key.
+    /// The key at which the learner sends messages of type `M`, whether or not each actor has its own.
     pub fn of_learner<M: Keyed>(&self) -> String {
         self.said_by::<M>("learner")
     }
@@ -56,12 +56,12 @@ impl Keys {
         }
     }
 
-    /// The actor under whose number `key` stands; none where it stands under no single one.
+    /// The actor's number at the end of `key`; `None` if `key` does not end in a number.
     pub(crate) fn actor(key: &str) -> Option<u32> {
         key.rsplit('/').next()?.parse().ok()
     }
 
-    /// The key of the liveliness token of one life of an actor, or of a learner.
+    /// The key of the liveliness token of one incarnation of an actor or a learner.
     pub fn alive_key(&self, Alive { process, mark }: Alive) -> String {
         self.lives(process, format_args!("{mark:016x}"))
     }
@@ -77,12 +77,12 @@ impl Keys {
         })
     }
 
-    /// Liveliness tokens of all actors and learners.
+    /// The key that matches the liveliness tokens of all actors and learners.
     pub fn all_alive(&self) -> String {
         self.key("alive/**")
     }
 
-    /// Whose liveliness token has this key; none for a token of another run.
+    /// The process and mark whose liveliness token has this key; `None` if it is not a token of this run.
     pub fn alive(&self, key: &str) -> Option<Alive> {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let (process, mark) = match rest.split('/').collect::<Vec<_>>()[..] {
@@ -100,7 +100,7 @@ impl Keys {
 pub enum ProcessName {
     /// The run's only learner.
     Learner,
-    /// The actor of this number.
+    /// The actor with this number.
     Actor(u32),
 }
 
@@ -113,29 +113,29 @@ impl fmt::Display for ProcessName {
     }
 }
 
-/// A process whose liveliness token was seen. Every client can see tokens, so they hide the numbers by which the replay server
-/// knows its actors and its learner: with such a number a client could send in their name.
+/// An incarnation of a process, as its liveliness token shows it. Every client can see tokens, so a token hides the number by which the
+/// replay server knows the incarnation: with this number, a client could send in its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Alive {
-    /// Which process it is, whatever its life.
+    /// The process, in any incarnation.
     pub process: ProcessName,
-    /// The mark of this life.
+    /// The mark of this incarnation, a hash of its number.
     pub mark: u64,
 }
 
 impl Alive {
-    /// The life of a process that has this number.
+    /// The incarnation of `process` with this number.
     pub fn of(process: ProcessName, number: u64) -> Self {
         let mark = mark(number);
         Self { process, mark }
     }
 
-    /// This life of an actor.
+    /// This incarnation of an actor.
     pub fn actor(actor: u32, incarnation: u64) -> Self {
         Self::of(ProcessName::Actor(actor), incarnation)
     }
 
-    /// The learner of this number.
+    /// The learner with this number.
     pub fn learner(learner: u64) -> Self {
         Self::of(ProcessName::Learner, learner)
     }

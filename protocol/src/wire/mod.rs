@@ -1,5 +1,5 @@
-//! How messages become bytes, the memory those lie in, and the keys they travel under.
-//! What a message means is not known here.
+//! How messages become bytes, the memory that holds these bytes, and the keys at which messages are sent.
+//! The meaning of messages is not known here.
 
 pub(crate) mod buffers;
 pub mod codec;

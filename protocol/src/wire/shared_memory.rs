@@ -1,5 +1,5 @@
-//! When messages may go through shared memory: what the system grants a process, and whether what was sent so arrives.
-//! It moves no bytes.
+//! When messages may go through shared memory: what the system grants a process, and whether such messages arrive.
+//! Buffers are handled in `buffers`.
 
 use std::{
     fs::File,
@@ -13,29 +13,29 @@ use nix::sys::{
 
 use crate::process::{lock_file, termination::is_set};
 
-/// Where the operating system keeps memory that the processes of a host share.
+/// The folder in which the operating system keeps memory that processes of one host share.
 pub const FOLDER: &str = "/dev/shm";
-/// What zenoh itself keeps there for each process that makes shared memory: 32,768 headers of 32 bytes, and as many words of 8.
+/// Bytes of zenoh's metadata in [`FOLDER`] for each process that creates shared memory: 32,768 headers of 32 bytes, 32,768 words of 8.
 pub const METADATA_BYTES: usize = 40 << 15;
-/// What zenoh keeps there for each session.
+/// Bytes that zenoh keeps in [`FOLDER`] for each session.
 pub const SESSION_BYTES: usize = 12 << 10;
-/// How long a process waits for others that look for room at the same time; each takes milliseconds.
+/// How long a process waits for others that allocate shared memory at the same time; each takes milliseconds.
 const OTHERS_MAX: Duration = Duration::from_secs(10);
-/// How often it looks whether they are done.
+/// How often a waiting process checks whether the others are done.
 const TICK: Duration = Duration::from_millis(2);
-/// After a message in shared memory was lost, how many go through the socket before shared memory is tried again.
+/// Messages that go through the socket after a loss in shared memory, before shared memory is tried again.
 const AVOID_COUNT: u32 = 64;
-/// So many losses without a message that arrived between them, and shared memory is not tried again.
+/// After this many losses without an arrival in between, shared memory is not tried again.
 const LOSSES_MAX: u32 = 2;
-/// After so many pieces that were not free, far more than are in use at a time, a warning says that some may be lost.
+/// After this many failed allocations in a row, far more than messages in use at a time, a warning says that memory may be lost.
 const MISSES_MAX: u32 = 64;
 /// Number of the capability by which a process may lock as much memory as it likes (`capabilities(7)`).
 const CAP_IPC_LOCK: u32 = 14;
 
-/// Whether shared memory is worth a try, by what became of the messages that went through it.
+/// Decides whether to try shared memory, by the fate of the messages that went through it.
 #[derive(Debug, Default)]
 pub struct Trust {
-    /// Messages that are still to go through the socket.
+    /// Messages still to be sent through the socket.
     avoid: u32,
     losses_in_a_row: u32,
     misses_in_a_row: u32,
@@ -51,7 +51,7 @@ impl Trust {
         may
     }
 
-    /// A message in shared memory was not answered. The next ones go through the socket; after a second loss in a row, all.
+    /// Records that a message in shared memory was not answered. The next ones go through the socket; after two losses in a row, all do.
     pub fn lost(&mut self) {
         self.avoid = AVOID_COUNT;
         self.losses_in_a_row += 1;
@@ -63,7 +63,7 @@ impl Trust {
         }
     }
 
-    /// Whether there was a free piece for a message; without one it goes through the socket.
+    /// Records whether shared memory was free for a message; if not, the message goes through the socket.
     pub fn found(&mut self, is_free: bool) {
         let misses = self.misses_in_a_row.saturating_add(1);
         self.misses_in_a_row = if is_free { 0 } else { misses };
@@ -75,31 +75,30 @@ impl Trust {
         }
     }
 
-    /// A message in shared memory has arrived.
+    /// Records that a message in shared memory has arrived.
     pub const fn worked(&mut self) {
         self.losses_in_a_row = 0;
     }
 }
 
-/// Bytes of shared memory for `count` pieces of `bytes` each, with a quarter more for what the allocator needs and leaves
-/// between pieces.
+/// Bytes of shared memory for `count` buffers of `bytes` each, plus a quarter and 64 KiB for the allocator's metadata and gaps.
 pub const fn pool_bytes(count: usize, bytes: usize) -> usize {
     count.saturating_mul(bytes) / 4 * 5 + (1 << 16)
 }
 
-/// Bytes of [`FOLDER`] that a process takes which has a pool of so many.
+/// Bytes of [`FOLDER`] that a process with a pool of `pool` bytes takes.
 pub const fn process_bytes(pool: usize) -> usize {
     pool.next_multiple_of(1 << 12) + METADATA_BYTES + SESSION_BYTES
 }
 
-/// Bytes that are free in [`FOLDER`].
+/// Returns the free bytes in [`FOLDER`].
 pub fn free_bytes() -> Result<u64, String> {
     statvfs(FOLDER)
         .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))
         .map_err(|e| format!("{FOLDER}: {e}"))
 }
 
-/// Whether so many bytes are free in [`FOLDER`]. The system would grant more than there is, and kill the process that writes to it.
+/// Checks that `bytes` bytes are free in [`FOLDER`]. The system grants more than there is, and kills the process that writes to it.
 pub fn check_room(bytes: usize) -> Result<(), String> {
     let free = free_bytes()?;
     if free >= bytes as u64 {
@@ -113,7 +112,7 @@ pub fn check_room(bytes: usize) -> Result<(), String> {
     ))
 }
 
-/// Whether this process may make a file of so many bytes, as a piece of shared memory is one.
+/// Checks that this process may create a file of `bytes` bytes, because shared memory is a file.
 pub(super) fn check_file_size(bytes: usize) -> Result<(), String> {
     let most = getrlimit(Resource::RLIMIT_FSIZE).ok().map(|it| it.0);
     check_limit(most, bytes, "write files of", "-f")
@@ -130,7 +129,7 @@ fn check_limit(most: Option<u64>, bytes: usize, to: &str, option: &str) -> Resul
     }
 }
 
-/// Whether shared memory is granted; where it is not, a warning says why, and what that means.
+/// Returns whether shared memory was granted; if not, logs a warning with the reason and the effect.
 pub fn is_granted(asked: Result<(), String>) -> bool {
     asked
         .inspect_err(|why| {
@@ -142,8 +141,8 @@ pub fn is_granted(asked: Result<(), String>) -> bool {
         .is_ok()
 }
 
-/// Takes room in [`FOLDER`] by `take` if so many bytes are free there: of processes that look at the same time one after the other,
-/// so that all of them together take no more than there is.
+/// Calls `take` to allocate in [`FOLDER`] if `bytes` bytes are free there. Processes that allocate at the same time take turns by a lock,
+/// so that all together take no more than there is.
 pub(super) fn take_room<T>(
     bytes: usize,
     take: impl FnOnce() -> Result<T, String>,
@@ -160,19 +159,19 @@ pub(super) fn take_room<T>(
     take()
 }
 
-/// Whether this process may lock `bytes` bytes, as zenoh does with the shared memory that it makes and that it reads.
+/// Checks that this process may lock `bytes` bytes, as zenoh locks the shared memory that it creates and that it reads.
 pub fn check_lockable(bytes: usize) -> Result<(), String> {
     check_limit(lockable_bytes(), bytes, "lock memory of", "-l")
 }
 
-/// Bytes that this process may lock; none if there is no limit.
+/// Returns the bytes that this process may lock; `None` if there is no limit. Raises the soft limit to the hard one.
 pub fn lockable_bytes() -> Option<u64> {
     if is_set("CapEff:", CAP_IPC_LOCK) {
         return None;
     }
-    // A system without the limit refuses in its own words when memory is locked.
+    // A system without this limit reports an error when memory is locked.
     let (soft, hard) = getrlimit(Resource::RLIMIT_MEMLOCK).ok()?;
-    // What may be raised is.
+    // The soft limit still applies if it cannot be raised.
     let most = match setrlimit(Resource::RLIMIT_MEMLOCK, hard, hard) {
         Ok(()) => hard,
         Err(_) => soft,

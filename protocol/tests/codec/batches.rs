@@ -1,4 +1,4 @@
-//! Batches of all kinds: drawn by priority, made of stacks of frames, merged of parts; and those that cannot be.
+//! Batches of all kinds: drawn by priority, made of stacks of frames, merged from parts; and impossible ones.
 
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, RowScalars, ShardCounts,
@@ -18,7 +18,7 @@ fn received(bytes: &[u8]) -> Batch {
     Batch::from_payload(header, payload.to_vec().into()).unwrap()
 }
 
-/// What a uniform run sends has 12 bytes a row less, and no origin.
+/// A batch of a uniform run has 12 bytes less per row, and no origin.
 #[test]
 fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     let (plain, prioritised) = (batch(), prioritised_batch());
@@ -29,7 +29,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     columns.extend([0.5f32, 1.0, 1e-30].map(f32::to_le_bytes).concat());
     assert!(payload.ends_with(&columns), "transitions, then chances");
     let sent = [sealed(plain.clone()), sealed(prioritised.clone())].map(|bytes| bytes.len());
-    // The origin: a byte of the shard, nine of the incarnation.
+    // The origin takes one byte for the shard and nine for the incarnation.
     assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
     assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
     assert_eq!(received(&sealed(plain.clone())), plain);
@@ -50,7 +50,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     assert_eq!((update.learner, update.number, update.rows()), (5, 9, 3));
     assert_eq!(update.parts, [part(ORIGIN, &own, &[1.0, 2.0, 3.0])]);
 
-    // Of two shards, the second of which gives three rows of four.
+    // Parts of two shards, of which the second is chosen with a probability of 3/4.
     let other = Origin {
         shard: 0,
         incarnation: 3,
@@ -75,19 +75,19 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     assert_eq!(Batch::merged_header(&mixed), None);
 }
 
-/// What a run with stacks sends is each frame once.
+/// A run with stacks sends each frame once.
 #[test]
 fn stacks_come_back_as_whole_states() {
     for origin in [None, Some(ORIGIN)] {
         let sent = stacked_batch(origin);
         let more = sent.header.payload_bytes() - batch_from(origin).header.payload_bytes();
-        // Five frames of two bytes, and two numbers of four for each of six states, which had four bytes.
+        // Five frames of two bytes. Each of six states has two frame numbers of four bytes in place of four bytes of pixels.
         assert_eq!(more, 5 * 2 + 6 * 8 - 6 * 4);
         let bytes = sealed(sent.clone());
         let back = received(&bytes);
         assert_eq!(back, sent);
         assert_eq!(back.probabilities().is_some(), origin.is_some());
-        // A pixel's oldest channels come first.
+        // The oldest channels of a pixel come first.
         let states_t = [50, 50, 50, 50, 50, 51, 50, 51, 51, 52, 51, 52];
         assert_eq!(back.states_t()[..], states_t);
         assert_eq!(back.states_k()[..], [50, 51, 50, 51, 53, 54, 53, 54]);
@@ -96,7 +96,7 @@ fn stacks_come_back_as_whole_states() {
     }
 }
 
-/// Each part's states are made of its own frames.
+/// After a merge, each part's states still consist of the part's own frames.
 #[test]
 fn parts_of_stacks_are_merged() {
     let first = stacked_batch(None);
@@ -169,7 +169,7 @@ fn stacks_that_cannot_be_are_refused() {
         let said = said(header, payload.clone());
         assert!(said.contains("do not fill"), "{wrong:?}: {said}");
     }
-    // More frames than all stacks have room for.
+    // More frames than all stacks can contain.
     let most = StackedFrames {
         frames: 13,
         ..STACKED
@@ -181,7 +181,7 @@ fn stacks_that_cannot_be_are_refused() {
     assert!(said(header, Buffer::zeroed(13 * 2 + 6 * 8 + 36)).contains("do not fill"));
 }
 
-/// A message of some MB whose states would fill the memory.
+/// A message of some MB, whose states would fill the memory once assembled.
 #[test]
 fn few_frames_do_not_make_more_than_a_message_may_have() {
     let rows = vec![
@@ -225,7 +225,7 @@ fn parts_are_merged_row_by_row() {
         weights_versions: versions,
         ..BatchHeader::default()
     };
-    // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
+    // Makes rows of `values`: their positives cycle through 3, 2, 1 and 0, and even values bootstrap.
     let part = |header: BatchHeader, values: std::ops::Range<u8>| {
         let scalars = |value: u8| RowScalars {
             action: value,

@@ -1,5 +1,5 @@
-//! Damaged, foreign and hostile messages are refused, never a panic.
-//! What fuzzers find beyond these is `decoders`' business.
+//! Damaged, foreign and hostile messages are rejected and never cause a panic.
+//! Inputs that fuzzers found are in `decoders`.
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
@@ -65,7 +65,7 @@ fn every_flipped_bit_is_refused() {
     }
 }
 
-/// A message that no process of this project sends: a right checksum over whatever header and payload.
+/// A message that no process of this project sends: any header and payload with a correct checksum.
 fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], payload: &[u8]) -> Vec<u8> {
     let mut bytes = b"DRML".to_vec();
     bytes.extend(version.to_le_bytes());
@@ -149,13 +149,13 @@ fn huge_lengths_are_refused_without_taking_memory() {
     ] {
         assert_eq!(read(lengths), expected);
     }
-    // A header that claims more elements than any header has room for.
+    // The header claims more elements than any header has room for.
     let header = [&[1u8, 1, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
     let bytes = forge_whole(Kind::Affinity as u16, &header, &[]);
     let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     let first = "UnexpectedEnd { additional: 4 }";
     assert_eq!(refused, CodecError::Header(first.into()));
-    // The sender keeps to the limit too.
+    // The sender observes the limit too.
     let run_info = RunInfo {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         ..RunInfo::default()
@@ -209,7 +209,7 @@ fn counts_that_do_not_fit_their_payload_are_refused() {
         |it| it.rows = 4,
         |it| it.states_n = 4,
         |it| it.positives = 0,
-        // As long, but other states than those of its rows.
+        // The same length, but other counts of states than its rows have.
         |it| (it.states_k, it.states_n) = (1, 2),
         |it| it.states_k = u32::MAX,
     ];
@@ -306,7 +306,7 @@ fn what_no_process_says_is_refused() {
     }
 }
 
-/// What is cut before it is sent, and as many episodes as an answer may have.
+/// Texts that are cut before sending, and replies with the most episodes.
 #[test]
 fn the_longest_messages_can_be_sent() {
     let long = "x".repeat(401);

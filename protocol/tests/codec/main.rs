@@ -1,5 +1,5 @@
-//! Every message comes back as it was sent, and each has a sample.
-//! It opens no session; what is refused is `damaged`'s.
+//! Every message survives encoding and decoding, and each kind has a sample.
+//! No session is opened; `damaged` tests rejected messages.
 #![allow(clippy::unwrap_used)]
 
 mod batches;
@@ -36,7 +36,7 @@ fn chunk_batch_and_weights_hold_what_was_written() {
     assert_eq!((payload.len(), weights.sha256_hex().len()), (40, 64));
 }
 
-/// However a message was cut on its way, what is received is what was sent, and in memory that held something else before.
+/// However a message is cut into pieces on its way, the receiver gets the message that was sent, even in memory with other content.
 #[test]
 fn pieces_are_received_as_the_whole_is() {
     let pool = BufferPool::new(1);
@@ -51,7 +51,7 @@ fn pieces_are_received_as_the_whole_is() {
         pool.take_own(64).fill(0xAB);
         let back = receive(first, second, bytes.len()).unwrap();
         assert_eq!(back, chunk(), "cut at {at}");
-        // A piece that is missing at the end, or a length that is not the sum of the pieces.
+        // The last piece is missing, or the length is not the sum of the pieces.
         if at < bytes.len() {
             assert!(receive(first, &[], at).is_err());
             assert!(receive(first, &[], bytes.len()).is_err());
@@ -78,7 +78,7 @@ fn every_kind_has_a_sample_that_is_read() {
     }
 }
 
-/// What fuzzers of the decoders begin with is today's messages: `UPDATE_CORPUS=1` writes them.
+/// Fuzzers of the decoders start with today's messages: `UPDATE_CORPUS=1` writes them.
 #[test]
 fn the_fuzzers_seeds_are_the_samples() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/decoders/fuzz/corpus/wire");

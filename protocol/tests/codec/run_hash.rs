@@ -1,11 +1,11 @@
-//! The hash by which processes of one run know one another.
-//! Messages that carry another are refused in `damaged`.
+//! The hash by which processes of one run recognize each other.
+//! `damaged` tests that messages with another hash are rejected.
 
 use std::collections::HashSet;
 
 use driml_protocol::{Horizon, RunSpec, TimeoutRule};
 
-/// Any change of a field, and of the protocol version, makes another run.
+/// A change of any field changes the hash.
 #[test]
 fn the_hash_knows_every_field() {
     let spec = RunSpec {
@@ -48,6 +48,6 @@ fn the_hash_knows_every_field() {
     let hashes: HashSet<u64> = changed.chain([spec.hash()]).collect();
     assert_eq!(hashes.len(), changes.len() + 1);
     assert_eq!(spec.hash(), spec.clone().hash());
-    // Checkpoints hold it: with another hash they could not be resumed.
+    // Checkpoints contain this hash: with another one, they could not be resumed.
     assert_eq!(format!("{:016x}", spec.hash()), "0c6c6069564f3984");
 }

@@ -1,5 +1,5 @@
-//! A message of every kind, and what reads it.
-//! It tests nothing but that each comes back.
+//! A sample message of every kind, and the code that reads it.
+//! The only check here is that each sample survives encoding and decoding.
 
 use std::fmt::Debug;
 
@@ -16,7 +16,7 @@ use driml_protocol::{
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
-/// A message of one type, and whether some bytes are accepted in its place.
+/// A message of one type, and a check whether some bytes are accepted in its place.
 pub(crate) struct Sample {
     pub(crate) name: String,
     pub(crate) kind: u16,
@@ -65,7 +65,7 @@ pub(crate) fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
     }
 }
 
-/// Why a message is refused where it is received.
+/// The error with which the receiver rejects a message.
 pub(crate) fn refusal<M: Message>(message: &M, payload: &[u8]) -> String {
     let bytes = codec::encode(SPEC, message, payload).unwrap();
     let received = codec::decode::<M>(&bytes, Some(SPEC)).map(drop);
@@ -96,7 +96,7 @@ pub(crate) fn batch() -> Batch {
     batch_from(None)
 }
 
-/// Its rows drawn by priority.
+/// The sample batch with rows drawn by priority.
 pub(crate) fn prioritised_batch() -> Batch {
     let mut batch = batch_from(Some(ORIGIN));
     batch.set_draws(&[(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)]);
@@ -108,7 +108,7 @@ pub(crate) const ORIGIN: Origin = Origin {
     incarnation: u64::MAX,
 };
 
-/// Of these the first does not bootstrap, the second has no positive and ends its episode.
+/// Three rows: the first does not bootstrap, and the second has no positive and ends its episode.
 pub(crate) fn rows() -> Vec<RowScalars> {
     let rows = [(4, 0.0, 2), (NO_ACTION, 0.0, 0), (6, 0.5, 300)];
     let scalars = |(row, (next_action, bootstrap_discount, k)): (u8, _)| RowScalars {
@@ -156,7 +156,7 @@ pub(crate) const STACKED: StackedFrames = StackedFrames {
     frame_channels: 1,
 };
 
-/// The same rows, whose states are stacks of two of five frames.
+/// The same rows with states that are stacks of two of five frames.
 pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     let header = BatchHeader {
         stacked: Some(STACKED),
@@ -168,7 +168,7 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     for frame in 0..5 {
         places.frame(frame).fill(50 + frame as u8);
     }
-    // s_t; s_{t+k} of the first and the last; s_{t+n} of the last.
+    // s_t of all rows; s_{t+k} of the first and the last; s_{t+n} of the last.
     let stacks = [[0, 0], [0, 1], [1, 2], [0, 1], [3, 4], [4, 4]];
     for (state, stack) in stacks.iter().enumerate() {
         places.set_stack(state, stack);
@@ -179,12 +179,12 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     batch
 }
 
-/// A chunk as it travels.
+/// An encoded chunk.
 pub(crate) fn sealed_chunk() -> Vec<u8> {
     codec::encode(SPEC, &chunk().header, chunk().payload()).unwrap()
 }
 
-/// A batch as it travels.
+/// An encoded batch.
 pub(crate) fn sealed(batch: Batch) -> Vec<u8> {
     let (header, payload) = batch.into_payload();
     codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
@@ -232,7 +232,7 @@ pub(crate) fn processes_status() -> ProcessesStatus {
     }
 }
 
-/// An episode of which all was seen, and one of which a part was lost.
+/// An episode that was received whole, and one of which a part was lost.
 pub(crate) fn episodes() -> EpisodesReply {
     let whole = EndedEpisode {
         frames: 1 << 20,

@@ -1,5 +1,5 @@
-//! Exactly once: which life of each actor counts, which chunk it sends next, what it says it produced, where its streams stand.
-//! It stores no transitions, answers nothing itself and does not know who is connected.
+//! Exactly-once storage: each actor's current incarnation, next chunk, reported number of transitions, and the state of its streams.
+//! It stores no transitions, sends no replies and does not know which actors are connected.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -8,26 +8,26 @@ use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
 
-/// Most actors a run may ever have; a further one is rejected, the known ones continue.
+/// Maximum actors of a run. A further one is rejected; the known ones continue.
 pub const ACTORS_MAX: usize = 4096;
-/// Most streams of one actor; a chunk with more is refused.
+/// Maximum streams of one actor. A chunk with more is rejected.
 pub const STREAMS_MAX: u32 = 4096;
-/// Past lives remembered for each actor; what an older one still says is ignored.
+/// Maximum past incarnations remembered per actor. Chunks of older ones are rejected as unknown.
 const PAST_INCARNATIONS_MAX: usize = 64;
 
 /// One environment of an actor's world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stream {
-    /// How its next transition hangs together with the last.
+    /// How the next transition is linked to the last one.
     pub(crate) link: Link,
-    /// The episode so far; none if a part of it was lost.
+    /// Return and length of the episode so far; `None` if a part of the episode was lost.
     pub(crate) episode: Option<Played>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Count {
     incarnation: u64,
-    /// Transitions that it has produced, by its last report.
+    /// Transitions that this incarnation has produced, by its last report.
     produced: u64,
     has_left: bool,
 }
@@ -35,13 +35,13 @@ struct Count {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Actor {
     current: Count,
-    /// Number of the chunk that comes next in the current life.
+    /// Sequence number of the next chunk of the current incarnation.
     expected: u64,
     streams: Vec<Stream>,
     past: VecDeque<Count>,
-    /// Lives before the current one, forgotten ones too.
+    /// Number of incarnations before the current one, including those no longer in `past`.
     earlier_incarnations: u32,
-    /// A chunk of it that came although chunks before it are missing, after the server was started again.
+    /// Sequence number of a chunk that came after a restart of the server although chunks before it are missing.
     #[serde(skip)]
     insisted: Option<u64>,
 }
@@ -51,7 +51,7 @@ impl Actor {
         self.past.iter().any(|it| it.incarnation == incarnation)
     }
 
-    /// Whether a chunk continues its streams, or begins them.
+    /// Whether a chunk has the actor's number of streams, or is the first.
     fn fits(&self, header: &ChunkHeader) -> bool {
         self.streams.is_empty() || self.streams.len() == header.streams as usize
     }
@@ -59,9 +59,9 @@ impl Actor {
 
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// The next of its actor: store it.
+    /// The next chunk of its actor: store it.
     Next,
-    /// A copy of one that is stored already.
+    /// A copy of a chunk that is already stored.
     Retried,
     /// Chunks before this one are missing.
     OutOfOrder { expected: u64 },
@@ -70,9 +70,9 @@ pub(crate) enum Verdict {
 /// How two counts of the same transitions differ.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Difference {
-    /// Produced, never stored.
+    /// Transitions produced but never stored.
     pub(crate) lost: u64,
-    /// Stored, never produced.
+    /// Transitions stored but never produced.
     pub(crate) duplicated: u64,
 }
 
@@ -88,14 +88,14 @@ impl Difference {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Actors {
     actors: BTreeMap<u32, Actor>,
-    /// This is what was read from disk: what was stored last may have been lost with the machine's power.
+    /// Set if this state was read from disk: a power cut may have lost the transitions stored last.
     #[serde(skip)]
     pub(crate) restored: bool,
 }
 
 impl Actors {
-    /// Makes `join.incarnation` the life that counts of its actor; the same one may be named again. Gives the number of its earlier lives.
-    /// One actor more than a run may have, or a life that another one has replaced, is an error: the reason, for a person.
+    /// Makes `join.incarnation` the current incarnation of its actor; a join may be repeated. Returns the number of earlier incarnations.
+    /// Too many actors, or an incarnation that another one has replaced, is an error: the reason, for a person.
     pub(crate) fn join(&mut self, join: ActorJoin) -> Result<u32, String> {
         let ActorJoin { actor, incarnation } = join;
         let current = Count {
@@ -127,12 +127,12 @@ impl Actors {
         Ok(known.earlier_incarnations)
     }
 
-    /// The life of `actor` that counts; none before the first.
+    /// Returns the current incarnation of `actor`; `None` before the first.
     pub(crate) fn current_incarnation(&self, actor: u32) -> Option<u64> {
         self.actors.get(&actor).map(|it| it.current.incarnation)
     }
 
-    /// The actor, if this is the life of it that counts.
+    /// Returns the actor, if `incarnation` is its current one.
     fn living(&self, actor: u32, incarnation: u64) -> Result<&Actor, String> {
         match self.actors.get(&actor) {
             Some(known) if known.current.incarnation == incarnation => Ok(known),
@@ -144,7 +144,7 @@ impl Actors {
         }
     }
 
-    /// Judges a chunk without changing anything; an error says why it is never to be stored.
+    /// Judges a chunk without changing any state. An error says why the chunk must never be stored.
     pub(crate) fn judge(&self, header: &ChunkHeader) -> Result<Verdict, String> {
         let (number, streams) = (header.actor, header.streams);
         let actor = self.living(number, header.incarnation)?;
@@ -172,7 +172,7 @@ impl Actors {
         Ok(Verdict::Next)
     }
 
-    /// Checks that a chunk can be counted: it is of a life that counts, and has its streams. If not, the error says why.
+    /// Checks that a chunk can be counted: its incarnation is current, and its number of streams fits. The error says why not.
     pub(crate) fn check_known(&self, header: &ChunkHeader) -> Result<(), String> {
         let actor = self.living(header.actor, header.incarnation)?;
         if header.sequence == 0 || actor.fits(header) {
@@ -182,10 +182,10 @@ impl Actors {
         Err(format!("{streams} streams after {before}"))
     }
 
-    /// Whether a chunk that was judged out of order is to be stored all the same: those before it were stored by an earlier life of
-    /// this server, which lost them with the machine's power, so that they will never come again.
+    /// Whether to store an out-of-order chunk anyway: an earlier process of this server acknowledged the chunks before it and then lost
+    /// them in a power cut, so that they will never come again.
     ///
-    /// An actor that sends the same one again, although it was told what is expected, has nothing older.
+    /// An actor that repeats the same chunk, although the reply named the expected one, has no older chunk left.
     pub(crate) fn insists(&mut self, header: &ChunkHeader) -> bool {
         let actor = self.actors.get_mut(&header.actor);
         actor.is_some_and(|actor| {
@@ -195,7 +195,7 @@ impl Actors {
         })
     }
 
-    /// Transitions from `first_lost` on are gone: streams that end among them hang together with nothing any more.
+    /// Unlinks each stream whose last transition is `first_lost` or later, as these transitions are gone.
     pub(crate) fn cut_streams(&mut self, first_lost: u64) {
         for stream in self.actors.values_mut().flat_map(|it| &mut it.streams) {
             stream.link = stream.link.without(first_lost);
@@ -209,7 +209,7 @@ impl Actors {
         if self.actors.len() > ACTORS_MAX || self.actors.values().any(too_many) {
             return Err("a state with more actors, lives or streams than a run may have");
         }
-        // No transition has two that follow it.
+        // A transition has at most one successor.
         let mut followed = BTreeSet::new();
         let streams = self.actors.values().flat_map(|it| &it.streams);
         let mut after = streams.filter_map(|it| it.link.after());
@@ -219,7 +219,7 @@ impl Actors {
         }
     }
 
-    /// Actors of which a chunk has come.
+    /// Returns the actors that have delivered a chunk, or had an earlier incarnation.
     pub(crate) fn delivered(&self) -> impl Iterator<Item = u32> {
         let all = self.actors.iter();
         let delivered = all.filter(|(_, it)| it.expected > 0 || it.earlier_incarnations > 0);
@@ -231,10 +231,10 @@ impl Actors {
         Ok(poll.sequence < actor.expected)
     }
 
-    /// Counts a chunk that was judged `Next`; gives its streams, and how its own count of what came before differs.
+    /// Counts a chunk to be stored. Returns the actor's streams, and how the chunk's count of earlier transitions differs from ours.
     ///
-    /// A new life starts with fresh streams. Where the counts differ, the streams are cut: what follows does not continue
-    /// what was stored.
+    /// A new incarnation starts with fresh streams. If the counts differ, the streams are unlinked, so that the chunk does not continue
+    /// the transitions stored before.
     pub(crate) fn accept(&mut self, header: &ChunkHeader) -> (&mut [Stream], Difference) {
         let actor = self.actors.get_mut(&header.actor);
         let actor = actor.expect("a chunk of an actor that has not joined is never judged Next");
@@ -258,8 +258,8 @@ impl Actors {
         (&mut actor.streams, difference)
     }
 
-    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; none if it has come before.
-    /// A life that never joined is an error: the reason, for a person.
+    /// Takes the `Leave` of a current or past incarnation. Returns how its count differs from ours; `None` if the message is repeated.
+    /// An incarnation that never joined is an error: the reason, for a person.
     pub(crate) fn leave(&mut self, leave: &Leave) -> Result<Option<Difference>, String> {
         let (actor, produced) = (leave.actor, leave.produced);
         let known = self.actors.get_mut(&actor).into_iter();

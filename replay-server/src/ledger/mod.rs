@@ -1,4 +1,4 @@
-//! What was counted: which chunks of which actor are stored, which request was served what, and the statistics of both.
+//! Bookkeeping: which chunks of each actor are stored, which rows each request was given, and statistics of both.
 
 pub(crate) mod actors;
 pub(crate) mod requests;

@@ -1,14 +1,14 @@
-//! Which rows each client was given last, so that those of a batch that did not arrive can be taken back.
+//! The rows that each client was given last, so that the rows of a batch that did not arrive can be refunded.
 //! It neither draws rows nor counts them.
 
 use std::collections::VecDeque;
 
 use driml_protocol::RequestId;
 
-/// Clients that are remembered; a learner has one for each batch on its way, and nothing is taken back from one forgotten.
+/// Maximum clients remembered. A learner uses one client per batch in flight. Rows of a forgotten client are not refunded.
 const CLIENTS_MAX: usize = 1024;
 
-/// The last request of each client, of the one whose request is oldest first.
+/// The last request of each client, the oldest request first.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Requests {
     last: VecDeque<Request>,
@@ -17,14 +17,13 @@ pub(crate) struct Requests {
 #[derive(Clone, Debug)]
 struct Request {
     id: RequestId,
-    /// The k of each row that it was given; none before.
+    /// The k of each row that the request was given; `None` before.
     given: Option<Vec<u32>>,
 }
 
 impl Requests {
-    /// Takes note of a request; the same one may come here any number of times until it is given rows. Gives the k of the rows that it
-    /// was given by an earlier attempt and did not receive. `None`: it was answered already, or its client has sent it again or another
-    /// since.
+    /// Registers a request; it may be repeated until it is given rows. Returns the k of the rows that an earlier attempt was given and that
+    /// did not arrive. `None` if the request was already answered, or its client has sent a later attempt or request since.
     pub(crate) fn begin(&mut self, id: RequestId) -> Option<Vec<u32>> {
         let mut last = self.last.iter();
         let known = last.position(|it| it.id.client_id == id.client_id);
@@ -47,7 +46,7 @@ impl Requests {
         lost
     }
 
-    /// The request of this client that was begun last is given rows with these `ks`.
+    /// Records that the last request of this client was given rows with these `ks`.
     pub(crate) fn complete(&mut self, client_id: u64, ks: Vec<u32>) {
         if let Some(request) = self.last.iter_mut().find(|it| it.id.client_id == client_id) {
             request.given = Some(ks);

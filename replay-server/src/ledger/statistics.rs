@@ -7,30 +7,30 @@ use serde::{Deserialize, Serialize};
 
 use super::actors::Difference;
 
-/// Ended episodes that are kept for clients; of more the oldest are dropped.
+/// Maximum ended episodes kept for clients. Beyond it the oldest are dropped.
 const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
-/// The same in a snapshot on disk, where a recorder fetches them: those that it has not fetched yet.
+/// The same for a snapshot on disk, which has only the episodes that the recorder has not fetched yet.
 const EPISODES_LOGGED_MAX: usize = 1_024;
 
-/// What is counted beside the ring's and the limiter's own counts.
+/// The counters, besides those of the ring and the limiter.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Statistics {
-    /// As the status says it; what is known elsewhere is at its default here.
+    /// The counters that the status reports. Fields that are known elsewhere keep their defaults.
     pub(crate) counted: ReplayStatus,
-    /// Messages by which an actor's own count differed.
+    /// Messages in which an actor's count differed from ours.
     differences: u64,
-    /// The newest of the episodes that ended.
+    /// The newest ended episodes, oldest first.
     newest: VecDeque<EndedEpisode>,
-    /// How many the process that records them had when it asked last; none before it asks.
+    /// How many ended episodes the recording process had at its last request; `None` before its first.
     #[serde(skip)]
     recorded: Option<u64>,
-    /// That process is the run's launcher.
+    /// Whether the recording process is the run's launcher.
     #[serde(skip)]
     is_launched: bool,
 }
 
 impl Statistics {
-    /// Zeros, for k in 0..=`k_max` and actions below `num_actions`.
+    /// Creates counters at zero, for k in 0..=`k_max` and actions below `num_actions`.
     pub(crate) fn new(k_max: u32, num_actions: u32) -> Self {
         Self {
             counted: ReplayStatus {
@@ -42,7 +42,7 @@ impl Statistics {
         }
     }
 
-    /// Without what is counted of messages that change nothing, which no log knows of.
+    /// Resets the counters that the log cannot restore: retried and rejected messages, and waiting times.
     pub(crate) fn of_changes(mut self) -> Self {
         let counted = &mut self.counted;
         (counted.chunks_retried, counted.messages_refused) = (0, 0);
@@ -50,15 +50,14 @@ impl Statistics {
         self
     }
 
-    /// Takes the ended episodes that `before` keeps, if these counts are of the same moment: a snapshot has those alone that were not
-    /// recorded.
+    /// Takes the ended episodes that `before` keeps, if both have counted the same number: a snapshot has only those not yet recorded.
     pub(crate) fn keep_newest_of(&mut self, before: &mut Self) {
         if self.counted.episodes == before.counted.episodes {
             self.newest = std::mem::take(&mut before.newest);
         }
     }
 
-    /// What is counted of transitions stored, without what is counted of rows drawn.
+    /// Also resets the counters of rows drawn, so that only those of transitions stored remain.
     pub(crate) fn of_stored(self) -> Self {
         let mut stored = self.of_changes();
         let counted = &mut stored.counted;
@@ -68,7 +67,7 @@ impl Statistics {
         stored
     }
 
-    /// Counts how an actor's count differs from ours; whether this is worth a line in the log: ever more seldom.
+    /// Counts a difference between an actor's count and ours. Returns whether to log it: the 1st, 2nd, 4th, 8th and so on.
     pub(crate) fn count(&mut self, Difference { lost, duplicated }: Difference) -> bool {
         if lost == 0 && duplicated == 0 {
             return false;
@@ -87,7 +86,7 @@ impl Statistics {
         }
     }
 
-    /// Counts rows that [`Statistics::served`] counted as not served.
+    /// Subtracts rows that [`Statistics::served`] counted, and counts a retried batch.
     pub(crate) fn refund(&mut self, ks: &[u32]) {
         self.counted.batches_retried += 1;
         for &k in ks {
@@ -95,7 +94,7 @@ impl Statistics {
         }
     }
 
-    /// Counts an episode that ended; its return counts if all of it was seen.
+    /// Counts an ended episode, and its return if all of the episode was seen.
     pub(crate) fn episode_ended(&mut self, episode: EndedEpisode) {
         self.counted.episodes += 1;
         if self.newest.len() == EPISODES_KEPT_MAX {
@@ -124,7 +123,7 @@ impl Statistics {
         }
     }
 
-    /// A recorder has the first so many of them: the launcher, or, where none records, one that watches the run.
+    /// Notes that a recorder has the first `episodes` ended episodes. Once the launcher records, other clients no longer count.
     pub(crate) fn note_recorded(&mut self, episodes: u64, is_launcher: bool) {
         if is_launcher || !self.is_launched {
             self.recorded = Some(episodes.min(self.counted.episodes));
@@ -144,10 +143,10 @@ impl Statistics {
         }
     }
 
-    /// What a log keeps of a moment.
+    /// Returns the statistics for a snapshot: without connected actors, and with unrecorded episodes only.
     pub(crate) fn logged(&self) -> Self {
         let mut logged = self.clone();
-        // Who is connected is not counted.
+        // Connections do not outlive the process.
         logged.counted.actors = 0;
         let recorded = logged.recorded.take();
         let unrecorded = recorded.map_or(0, |it| self.counted.episodes - it);
@@ -183,7 +182,7 @@ mod tests {
         assert!(frames.eq(most..most + 5));
         assert_eq!(second.up_to(), second.ended);
         assert_eq!(statistics.episodes_since(second.up_to()).episodes, []);
-        // One who knows of more knows another server's.
+        // A client that has more episodes than ended here counts those of another server.
         assert_eq!(statistics.episodes_since(u64::MAX).before, most + 5);
 
         let all = EPISODES_KEPT_MAX as u64 + 7;

@@ -1,5 +1,5 @@
-//! The folder of a log: one server alone uses it, it says whose replay is in it, and it holds the log's segments.
-//! How segments are written is for `journal`, what they hold for `recover`.
+//! The folder of a log: locked for one server, with a file that identifies the replay, and the log's segments.
+//! `journal` writes the segments; `recover` reads them.
 
 use std::{
     ffi::OsStr,
@@ -13,14 +13,14 @@ use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
 
-/// Form of the log, and of the messages in it, in thousands and ones; one of another form is refused.
+/// Format of the log (thousands) and of the messages in it (ones). A log of another format is rejected.
 pub(super) const FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
-/// The file that says which log it is.
+/// The file that identifies the log.
 const ID: &str = "log.toml";
-/// Highest number of a segment; files of higher ones are none of a log's.
+/// Maximum number of a segment. Files with higher numbers do not belong to a log.
 const NUMBER_MAX: u64 = 1 << 60;
 
-/// What keeps a replay from its folder.
+/// Why a replay cannot be read from or written to its folder.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum PersistError {
@@ -32,11 +32,11 @@ pub enum PersistError {
     },
     #[error("another replay server keeps its replay in {}: end it first, or choose another --replay-dir", .0.display())]
     InUse(PathBuf),
-    /// What is in this file or folder is not this run's, is of another version, or makes no sense although its checksum is right: why,
-    /// and what to do.
+    /// The content of this file or folder belongs to another run or version, or is invalid although its checksum is right. The text says
+    /// why, and what to do.
     #[error("{path} {1}", path = .0.display())]
     Unusable(PathBuf, String),
-    /// The log does not reach back to a mark, which is this file.
+    /// The log cannot be rolled back to a mark: this file, its segment, is missing or damaged.
     #[error("{} is missing or damaged: the replay cannot go back to where the checkpoint was made", .0.display())]
     NoMark(PathBuf),
     #[error("it was told to end while it read its replay back; what is kept was not changed")]
@@ -57,7 +57,7 @@ pub(super) fn io_error(
     }
 }
 
-/// A moment in the life of a replay that is kept on disk: the segment that begins there.
+/// A moment of a replay on disk to which its log can be rolled back: the number of the segment that begins there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Mark(pub(super) u64);
 
@@ -70,23 +70,23 @@ pub(super) struct LogId {
     pub(super) shard: (u32, u32),
 }
 
-/// What a segment says first.
+/// The body of a segment's first record.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct SegmentHeader {
     pub(super) log: LogId,
     pub(super) number: u64,
-    /// The state before its first record.
+    /// The replay's state where the segment begins.
     pub(super) snapshot: Snapshot,
 }
 
-/// A folder that is in use by this process.
+/// A folder that this process has locked.
 pub(super) struct LogFolder {
     pub(super) path: PathBuf,
     _lock: File,
 }
 
 impl LogFolder {
-    /// Makes the folder if it is not there, and keeps other servers out of it.
+    /// Creates the folder if it does not exist, and locks it against other servers.
     pub(super) fn open(path: &Path) -> Result<Self, PersistError> {
         fs::create_dir_all(path).map_err(io_error("making", path))?;
         let lock = path.join(".lock");
@@ -109,7 +109,7 @@ impl LogFolder {
             let name = name.to_str();
             let digits = name.and_then(|it| it.strip_prefix("segment-")?.strip_suffix(".log"));
             let number = digits.and_then(|digits| digits.parse().ok());
-            // A copy named without the zeros is none of the log's: its number is another segment's.
+            // Ignores a copy named without the leading zeros, as its number is another segment's.
             let is_own = |&number: &u64| {
                 let own = self.segment(number);
                 number <= NUMBER_MAX && own.file_name().and_then(OsStr::to_str) == name

@@ -1,5 +1,5 @@
-//! The writing side of the log of a replay that is in use: records at the end of the newest segment, new segments, marks, and the oldest
-//! segments removed. When a record is due is for `upkeep`; it reads nothing back.
+//! Writes the log of a running replay: appends records to the newest segment, begins segments, sets marks and removes the oldest segments.
+//! `upkeep` decides when a record is written. Nothing is read back here.
 
 use std::{
     collections::VecDeque,
@@ -21,47 +21,47 @@ use super::{
 };
 use crate::storage::pack::PackedChunk;
 
-/// A segment is at least this many times as long as the state that it begins with.
+/// The minimum length of a segment, in multiples of the snapshot that it begins with.
 const SNAPSHOTS: u64 = 4;
-/// How long the newest segment grows once another could not be begun, before that is tried again.
+/// Time until a retry after a new segment could not be begun. Meanwhile the newest segment grows.
 const RETRY: Duration = Duration::from_secs(1);
-/// Marks that hold: if the newest is of a checkpoint that was not written whole, the one before it is wanted.
+/// Number of marks kept. If the newest belongs to a checkpoint that was not written completely, the one before it is needed.
 const MARKS: usize = 2;
 
-/// One segment of the log that is in the folder.
+/// A segment of the log that is in the folder.
 #[derive(Debug)]
 pub(super) struct Segment {
     pub(super) number: u64,
     pub(super) first_row: u64,
     pub(super) bytes: u64,
-    /// Those of the state that it begins with; 0 where they do not matter any more.
+    /// Bytes of the snapshot that the segment begins with; 0 for a segment that was read back, to which nothing more is written.
     pub(super) snapshot_bytes: u64,
 }
 
-/// Where a log is continued.
+/// The position at which a log is continued.
 #[derive(Default)]
 pub(super) struct Place {
-    /// The segments that are of use.
+    /// The usable segments.
     pub(super) segments: VecDeque<Segment>,
     pub(super) number: u64,
     pub(super) ordinal: u64,
-    /// The mark to which the log went back, and the oldest transition that was held then.
+    /// The mark to which the log was rolled back, and the oldest transition that was held then.
     pub(super) mark: Option<(Mark, u64)>,
 }
 
-/// How a log is written, and how much it may take.
+/// The size limits of a log, and how often it is flushed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LogLimits {
-    /// From this size on, a segment is followed by another.
+    /// Size from which a segment is followed by another.
     pub(super) segment_bytes: u64,
     pub(super) disk_bytes_max: Option<u64>,
-    /// How often it is flushed; zero after each write.
+    /// Period between flushes of the log; zero flushes after each write.
     pub(super) fsync: Duration,
 }
 
 struct Failing {
     since: Instant,
-    /// What it said last.
+    /// The text of the last error.
     why: String,
 }
 
@@ -69,21 +69,21 @@ struct Failing {
 pub(crate) struct Journal {
     folder: LogFolder,
     id: LogId,
-    /// All in the folder, the oldest first; the last one is written.
+    /// All segments in the folder, oldest first. Records are written to the last one.
     segments: VecDeque<Segment>,
     pub(super) file: Arc<File>,
     ordinal: u64,
     limits: LogLimits,
-    /// Bytes of the largest record so far, by which a segment may become larger than it should.
+    /// Bytes of the largest record so far. A segment may exceed its length by this much.
     largest: u64,
     syncer: Syncer,
-    /// Records that the disk has refused so far; nothing is written before them.
+    /// Records that the disk has rejected so far. No other record is written before them.
     pending: Vec<u8>,
     failing: Option<Failing>,
-    /// When another segment could not be begun, if none was since.
+    /// When a new segment could not be begun; `None` if one was begun since.
     not_begun: Option<Instant>,
     said: LogLimiter,
-    /// The last two marks that were not given up, the newest last, each with the oldest transition that was held: what they need stays.
+    /// The last two marks that were not given up, newest last, each with the oldest transition held then. Segments that they need are kept.
     marks: VecDeque<(Mark, u64)>,
 }
 
@@ -146,12 +146,12 @@ impl Journal {
         self.segments.iter().map(|it| it.bytes).sum()
     }
 
-    /// Whether the disk has refused what was to be written last.
+    /// Whether the last write to the disk failed.
     pub(crate) const fn is_failing(&self) -> bool {
         self.failing.is_some()
     }
 
-    /// Writes what the disk has refused before; whether all of it is written now.
+    /// Writes the records that the disk has rejected before. Returns whether all are written now.
     pub(crate) fn write_pending(&mut self) -> bool {
         let pending = std::mem::take(&mut self.pending);
         let is_written = pending.is_empty() || self.write(&pending, &[]);
@@ -161,7 +161,7 @@ impl Journal {
         is_written
     }
 
-    /// Appends a note of what has happened; if the disk refuses, it is the first to be written later.
+    /// Appends a note. If the disk rejects it, the note stays pending and is written before any other record.
     pub(super) fn append_note(&mut self, note: &Note) {
         let body = codec::encode_value(note).expect("a note is far below the codec's limit");
         let record = record::head(RecordKind::Note, self.ordinal, &body, 0);
@@ -170,7 +170,7 @@ impl Journal {
         self.write_pending();
     }
 
-    /// Appends a chunk that is to be stored. `false`: the disk refuses, and it must not be. An error: it makes no message.
+    /// Appends a chunk before it is stored. `false`: the disk rejects it, so do not store it. Error: it is too large for a message.
     pub(crate) fn append_chunk(&mut self, packed: &PackedChunk<'_>) -> Result<bool, String> {
         let head = packed.sealed.as_ref();
         let head = head.ok_or("the chunk is larger than a message may be")?;
@@ -187,7 +187,7 @@ impl Journal {
             .expect("a log always has the segment that it writes")
     }
 
-    /// Writes at the end of the newest segment; if the disk refuses, the segment ends where it did.
+    /// Writes at the end of the newest segment. If the write fails, the segment's end does not move.
     fn write(&mut self, record: &[u8], payload: &[u8]) -> bool {
         let &mut Segment {
             number, bytes: at, ..
@@ -231,7 +231,7 @@ impl Journal {
         }
     }
 
-    /// Whether another segment is due: the newest has its length, or may have lost what was written to it.
+    /// Whether a new segment is due: the newest has reached its length, or a failed flush may have lost data written to it.
     pub(super) fn is_full(&self) -> bool {
         let is_full = |it: &Segment| {
             it.bytes >= self.length(it.snapshot_bytes) || self.syncer.has_lost(it.number)
@@ -241,13 +241,13 @@ impl Journal {
             && self.segments.back().is_some_and(is_full)
     }
 
-    /// From how many bytes on a segment that begins with such a state is followed by another.
+    /// Returns the size from which a segment with such a snapshot is followed by another.
     fn length(&self, snapshot_bytes: u64) -> u64 {
         let least = SNAPSHOTS * snapshot_bytes;
         self.limits.segment_bytes.max(least)
     }
 
-    /// Where the disk budget does not allow another segment, with `snapshot`: the oldest transition that may stay.
+    /// If the disk budget has no room for a new segment with `snapshot`, returns the oldest transition that may stay.
     pub(super) fn over_budget(&self, snapshot: impl FnOnce() -> Snapshot) -> Option<u64> {
         let max = self.limits.disk_bytes_max?;
         let mut bytes = self.bytes() + self.length(snapshot().bytes()) + self.largest;
@@ -262,14 +262,14 @@ impl Journal {
         keep
     }
 
-    /// Begins another segment with `snapshot`. If the disk refuses, the newest one grows.
+    /// Begins a new segment with `snapshot`. If the disk rejects it, the newest segment keeps growing.
     pub(super) fn rotate(&mut self, snapshot: &Snapshot) {
-        // What waits to be written has its place before the end of the old one.
+        // Pending records belong before the end of the old segment.
         if !self.write_pending() {
             return;
         }
         let number = self.newest().number + 1;
-        // The record that closes the old one comes first.
+        // The record that closes the old segment gets the ordinal before this one.
         let begun = begin_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
         let (segment, file) = match begun {
             Ok(begun) => begun,
@@ -277,7 +277,7 @@ impl Journal {
         };
         let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
         if !self.write(&closed, &[]) {
-            // Without it the new one is one too many.
+            // Without that record, the new segment must not stay.
             remove(&self.folder.segment(number));
             return;
         }
@@ -299,7 +299,7 @@ impl Journal {
         }
     }
 
-    /// Begins another segment with `snapshot`, which is on the disk when this returns and stays.
+    /// Begins a new segment with `snapshot`. It is flushed when this returns, and kept as long as the mark.
     pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
         let before = self.newest().number;
         self.rotate(snapshot);
@@ -317,7 +317,7 @@ impl Journal {
         Ok(mark)
     }
 
-    /// Nothing will go back to `mark`.
+    /// Gives up `mark`: the log will not be rolled back to it.
     pub(super) fn give_up(&mut self, mark: Mark) {
         self.marks.retain(|(it, _)| *it != mark);
     }
@@ -342,7 +342,7 @@ impl Journal {
     }
 }
 
-/// A new segment whose only record has the number `ordinal`; nothing stays if it cannot be written.
+/// Creates a segment whose only record has the ordinal `ordinal`. Leaves no file if the write fails.
 fn begin_segment(
     folder: &LogFolder,
     log: LogId,
@@ -372,7 +372,7 @@ fn begin_segment(
     Ok((segment, Arc::new(file)))
 }
 
-/// Removes a file; if that fails it is tried again, or does no harm.
+/// Removes a file. Returns false on failure, which is harmless: either the caller retries, or the file does no damage.
 pub(crate) fn remove(path: &Path) -> bool {
     match fs::remove_file(path) {
         Err(e) if e.kind() != io::ErrorKind::NotFound => {

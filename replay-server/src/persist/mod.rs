@@ -1,15 +1,15 @@
-//! The replay on disk as it runs: after its process has died it has every transition again, exactly once, and each actor's place.
-//! How many rows were learned is not its business: the learner says it.
+//! Keeps a running replay on disk. After its process has died, the replay is restored with every transition, exactly once, and each actor's
+//! place. The number of rows learned is not restored: the learner reports it.
 //!
-//! The log in the folder holds the chunks as they came and, between them, who came and went. It lies in segments that begin with a
-//! snapshot: all of the replay's state but the transitions. A segment begins when the one before is full, when the learner has saved a
-//! checkpoint, and at marks. It is removed once all its transitions have left the ring. So the oldest segment's snapshot, and all records
-//! since, give the replay again, and a segment that is damaged costs its own transitions alone: the snapshot of the next one is whole.
-//! Between two snapshots batches, priorities and affinities are not written down: after a recovery transitions that came since have the
-//! largest priority, and the learner sends its affinity with its next update.
+//! The log in the folder holds the chunks as received and, between them, notes of joins and leaves. It consists of segments, each of which
+//! begins with a snapshot: the replay's state without the transitions. A segment begins when the one before is full, when the learner has
+//! saved a checkpoint, and at marks. It is removed once all its transitions have left the ring. So the oldest segment's snapshot and all
+//! later records restore the replay. A damaged segment costs only its own transitions, as the next segment has a complete snapshot.
+//! The log does not record batches, priorities and affinities between two snapshots. After a recovery, transitions stored since the last
+//! snapshot have the highest priority, and the learner sends its affinity with its next update.
 //!
-//! What was answered has been written: it survives the death of the process at any moment. What was flushed, once in
-//! `replay.fsync_ms`, survives a power cut too.
+//! The server writes before it replies, so all acknowledged data survives the death of the process at any moment. Flushed data survives a
+//! power cut too; `replay.fsync_ms` is the period between flushes.
 
 pub(crate) mod folder;
 pub(crate) mod journal;

@@ -1,30 +1,30 @@
-//! The bytes of the log: records one after the other, each with its number, its length and a checksum.
-//! What a record means is for `snapshot` and `folder`; where a segment ends is for `recover`.
+//! The bytes of the log: consecutive records, each with its ordinal, its length and a checksum.
+//! `snapshot` and `folder` define what a record means; `recover` decides where a segment ends.
 //!
 //! A record is a head of 32 bytes, little-endian, and a body:
 //! magic u32, kind u32, ordinal u64, length of the body u64, bytes of the body that the checksum covers u32, crc32 u32.
-//! The checksum covers the head before it too. Of a chunk, whose body is the message as it came, it covers the message's head; the
-//! message has another checksum over all of it.
+//! The checksum also covers the head before it. The body of a chunk record is the message as received: the checksum covers only the
+//! message's head, as the message has another checksum over all of it.
 
 const HEAD_BYTES: usize = 32;
 const MAGIC: [u8; 4] = *b"DRL1";
-/// Longest body: a message's, and some.
+/// Maximum bytes of a body: those of the largest message, and a margin.
 const BODY_BYTES_MAX: u64 = (1 << 29) + (1 << 21);
-/// Highest number of a record that is believed: no log has so many.
+/// Maximum valid ordinal of a record. No log reaches it.
 pub(super) const ORDINAL_MAX: u64 = 1 << 60;
-/// Places at which a record is looked for after one that is too long: those that look like one.
+/// Maximum places, of those that start with the magic number, at which a record is searched for after one that seems too long.
 const CANDIDATES_MAX: usize = 64;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(super) enum RecordKind {
-    /// The first of a segment: which one it is, and the replay's state where it begins.
+    /// The first record of a segment: the segment's number, and the replay's state where it begins.
     Segment = 1,
-    /// Who came or went.
+    /// An actor or learner that joined, or an actor that left or was forgotten.
     Note = 2,
     /// A chunk that was stored.
     Chunk = 3,
-    /// The last of a segment that another one follows.
+    /// The last record of a segment that is followed by another segment.
     Closed = 4,
 }
 
@@ -35,7 +35,7 @@ impl RecordKind {
     }
 }
 
-/// Head of a record whose body is `checked` and then `rest` more bytes.
+/// Returns the head of a record, followed by `checked`, the part of its body that the checksum covers. `rest` bytes of body come after it.
 pub(super) fn head(kind: RecordKind, ordinal: u64, checked: &[u8], rest: usize) -> Vec<u8> {
     let length = (checked.len() + rest) as u64;
     let mut head = Vec::with_capacity(HEAD_BYTES + checked.len());
@@ -67,7 +67,7 @@ impl Record<'_> {
 pub(super) enum Broken {
     /// The last record was not written whole.
     Torn,
-    /// Bytes that are not a record, with others after them.
+    /// Bytes that are not a record, followed by others.
     Damaged,
 }
 
@@ -77,7 +77,7 @@ impl Broken {
     }
 }
 
-/// The checksum of a record with this head, of whose body it covers `checked`.
+/// Returns the checksum of a record, over its head and `checked`, the first part of its body.
 fn checksum(head: &[u8], checked: &[u8]) -> u32 {
     let mut sum = crc32fast::Hasher::new();
     sum.update(&head[..HEAD_BYTES - 4]);
@@ -89,7 +89,7 @@ fn number(head: &[u8; HEAD_BYTES], at: usize) -> u32 {
     u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]])
 }
 
-/// The record at the beginning of a segment's rest.
+/// Reads the first record in `rest`, the remaining bytes of a segment.
 pub(super) fn first(rest: &[u8]) -> Result<Record<'_>, Broken> {
     let Some((head, after)) = rest.split_first_chunk::<HEAD_BYTES>() else {
         return Err(Broken::Torn);
@@ -103,11 +103,11 @@ pub(super) fn first(rest: &[u8]) -> Result<Record<'_>, Broken> {
         && body_bytes <= BODY_BYTES_MAX
         && u64::from(checked) <= body_bytes;
     let Some(kind) = RecordKind::of(number(4)).filter(|_| sane) else {
-        // A machine that lost its power leaves zeros where it had not written yet.
+        // A power cut leaves zeros where data was not written yet.
         return Err(Broken::torn_if(is_zero(rest)));
     };
     let Some((body, others)) = after.split_at_checked(body_bytes as usize) else {
-        // Where others follow, it is its length that is wrong.
+        // If another record follows, the length of this one is wrong.
         return Err(Broken::torn_if(!a_record_follows(after)));
     };
     if checksum(head, &body[..checked as usize]) != number(28) {

@@ -1,5 +1,5 @@
-//! Reads a log back: the replay as it was when the last whole record was written, and what of it is damaged or missing.
-//! Transitions come back through the code that stored them; what is gone leaves a gap that no row of a batch reaches into.
+//! Reads a log back: restores the replay as it was when the last complete record was written, and finds what is damaged or missing.
+//! Transitions are restored by the code that stored them. Lost transitions leave a gap that no row of a batch reaches into.
 
 use std::{
     borrow::Cow,
@@ -19,12 +19,12 @@ use super::{
 };
 use crate::{replay::Replay, storage::pack::Packer};
 
-/// What a segment's name ends in that cannot be used.
+/// The file extension of a segment that cannot be used.
 const UNUSABLE: &str = "unusable";
-/// How often it is logged how far the reading is.
+/// Period between log lines about the progress.
 const SAY: Duration = Duration::from_secs(5);
 
-/// How far a log has been read back, for those who ask meanwhile, and the word that it need not be read to its end. Threads share it by
+/// The progress of reading a log, for clients that ask meanwhile, and a flag that stops the reading early. Threads share it by
 /// reference.
 #[derive(Debug)]
 pub struct Reading {
@@ -35,7 +35,7 @@ pub struct Reading {
 }
 
 impl Reading {
-    /// Nothing is read yet; once `stop` is raised, nothing more need be.
+    /// Starts at nothing read. Raising `stop` stops the reading early.
     pub fn begin(stop: Shutdown) -> Self {
         Self {
             started: Instant::now(),
@@ -45,7 +45,7 @@ impl Reading {
         }
     }
 
-    /// How far it is now.
+    /// Returns the current progress.
     pub fn progress(&self) -> RecoveryProgress {
         RecoveryProgress {
             bytes_read: self.bytes_read.load(Ordering::Relaxed),
@@ -55,14 +55,14 @@ impl Reading {
     }
 }
 
-/// What was found in the folder of a log.
+/// The result of reading a log.
 #[derive(Clone, Debug, Default)]
 pub struct Recovery {
-    /// There was a replay.
+    /// Whether the folder held a replay.
     pub found: bool,
     /// Bytes of the log that were read.
     pub bytes: u64,
-    /// Damage, and what came of it: sentences for a person.
+    /// Damage and its consequences, as sentences for a person.
     pub warnings: Vec<String>,
 }
 
@@ -76,14 +76,14 @@ pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError
     let first = record::first(&bytes).ok();
     let first = first.filter(|it| it.kind == RecordKind::Segment);
     let first = first.ok_or_else(no_mark)?;
-    // The newest first: what is left at any moment is a log that ends earlier.
+    // The newest first: if this is interrupted, the remaining log is valid and ends earlier.
     for later in numbers.into_iter().rev().filter(|it| *it > mark.0) {
         folder.remove(later)?;
     }
     folder.cut_off(mark.0, first.bytes())
 }
 
-/// Which log the newest segment in `folder` that can be read is of; none if there is none.
+/// Returns the identity of the log in `folder`, from the newest segment that can be read; `None` if none can.
 pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
     for number in folder.segments()?.into_iter().rev() {
         if let Ok(record) = record::first(&folder.read(number)?)
@@ -95,8 +95,8 @@ pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError>
     Ok(None)
 }
 
-/// Rebuilds `replay`, which is empty, from the segments of log `id` in `folder`. With a `mark`, which is the last that the log says, all
-/// of the replay's state is taken from there.
+/// Restores `replay`, which must be empty, from the segments of log `id` in `folder`. With `mark`, which must be the end of the log, all of
+/// the replay's state is taken from the mark's snapshot.
 pub(super) fn recover(
     folder: &LogFolder,
     id: LogId,
@@ -150,7 +150,7 @@ pub(super) fn recover(
     reader.finish()
 }
 
-/// A log on its way back into a replay.
+/// Reads a log into a replay.
 struct Reader<'a> {
     folder: &'a LogFolder,
     id: LogId,
@@ -159,13 +159,13 @@ struct Reader<'a> {
     pool: BufferPool,
     place: Place,
     recovery: Recovery,
-    /// The oldest transition that was held, as far as records say.
+    /// The oldest transition that was held, by the last snapshot.
     oldest: u64,
-    /// Whether which transitions are held follows from their number, as it did before.
+    /// Whether the ring has the capacity that it had before and no limit in bytes, so that the number stored tells which are held.
     same_capacity: bool,
-    /// The last record of the log, if it is a mark: then everything is restored.
+    /// The mark at which the log ends, if any: then all state is restored.
     mark: Option<Mark>,
-    /// Segments that cannot be used: they get another name once it is known that others can.
+    /// Segments that cannot be used. They are renamed once it is known that others can.
     aside: Vec<PathBuf>,
 }
 
@@ -183,7 +183,7 @@ impl Reader<'_> {
         let path = self.folder.segment(number);
         let name = file_name(&path);
         let first = match record::first(bytes) {
-            // The server ended while it began this one; nothing is in it.
+            // The server died while it began this segment, which is empty.
             Err(Broken::Torn) if is_last => return self.folder.remove(number),
             first => first.ok().filter(|it| it.kind == RecordKind::Segment),
         };
@@ -247,7 +247,7 @@ impl Reader<'_> {
             Err(_) if !is_last => self.warn(format!(
                 "{name} is damaged at byte {at}: {cut} bytes of it are of no use"
             )),
-            // No actor was told that it is stored.
+            // No actor was told that this record is stored.
             Err(Broken::Torn) => tracing::info!(
                 "the last record of {name} was not written whole: its {cut} bytes are cut off"
             ),
@@ -267,8 +267,8 @@ impl Reader<'_> {
         self.aside.push(path);
     }
 
-    /// Takes the records of a segment from byte `at` on. Gives where the last one ends that is of use, and whether it says that another
-    /// segment follows, or why the rest is of no use.
+    /// Applies the records of a segment from byte `at` on. Returns the end of the last usable record, and whether that record closes the
+    /// segment, or why the rest is unusable.
     fn read_records(&mut self, segment: &[u8], mut at: usize) -> (usize, Result<bool, Broken>) {
         let mut is_closed = false;
         while at < segment.len() {
@@ -329,7 +329,7 @@ impl Reader<'_> {
             let why = self.recovery.warnings.join("; ");
             return unusable(format!("no segment can be read ({why})"));
         }
-        // What is written next must be readable too.
+        // The records written next must be readable too.
         if self.place.ordinal > ORDINAL_MAX / 2 {
             let last = self.place.ordinal - 1;
             return unusable(format!(
@@ -356,7 +356,7 @@ impl Reader<'_> {
         let replay = self.replay;
         replay.quiet = false;
         if self.recovery.found && self.mark.is_none() {
-            // What was drawn since the last snapshot is not known: the learner says it, and other numbers are drawn from here on.
+            // Draws since the last snapshot are unknown: the learner reports their number, and another random stream is used from here on.
             replay.awaits_learner = replay.state.learner.is_some();
             replay.state.draw_anew(replay.origin.shard, end);
         }

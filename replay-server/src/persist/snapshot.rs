@@ -1,5 +1,5 @@
-//! All of the replay but the transitions themselves, as a value that is written and taken back, and what changes it between two chunks.
-//! When one is written is for the facade; where it lies, for `journal`.
+//! The state of the replay without the transitions, as a value that is saved and restored, and the notes that change it between two chunks.
+//! `upkeep` decides when to save a snapshot; `journal` decides where.
 
 use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec, codec};
 use rand::SeedableRng;
@@ -13,35 +13,35 @@ use crate::{
     sampling::{horizon::Affinity, rows::RowsState},
 };
 
-/// Most of anything that a run counts.
+/// Maximum of any count of a run.
 pub(crate) const COUNT_MAX: u64 = 1 << 60;
 
-/// The replay server's own stream of the run's seed, so that no other process draws the same numbers.
+/// The replay server's random stream under the run's seed, so that no other process draws the same numbers.
 const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
 
-/// Who came and went: what the log holds beside chunks and snapshots.
+/// A process that joined or left: the records of the log besides chunks and snapshots.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Note {
     ActorJoined(ActorJoin),
-    /// Actors that made room for others.
+    /// Actors that were forgotten to make room for others.
     Forgotten(Vec<u32>),
     Leave(Leave),
     LearnerJoined(LearnerJoin),
 }
 
-/// What a replay knows beside its transitions: a snapshot takes all of it and brings all of it back.
+/// The part of a replay's state that a snapshot saves and restores unchanged.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ReplayState {
     pub(crate) actors: Actors,
     /// The learner that is served, as it joined.
     pub(crate) learner: Option<LearnerJoin>,
     pub(crate) learned: Learned,
-    /// Updates after which the run was resumed without this replay.
+    /// Updates done when the run was resumed without this replay; 0 if it never was.
     pub(crate) resumed_after: u64,
     pub(crate) affinity: Affinity,
     pub(crate) rng: ChaCha8Rng,
     pub(crate) statistics: Statistics,
-    /// The learner found no anchor: one chunk may pass the limiter, or both sides would wait for each other.
+    /// Set if the last draw found no anchor: one chunk may then pass the limiter, as otherwise both sides would wait for each other.
     pub(crate) starving: bool,
 }
 
@@ -61,7 +61,7 @@ impl ReplayState {
         }
     }
 
-    /// Draws other numbers in this shard than at the start of the run, after `resumed` transitions or updates.
+    /// Switches to another random stream, for a shard that was resumed after `resumed` transitions or updates.
     pub(crate) fn draw_anew(&mut self, shard: u32, resumed: u64) {
         let beyond = resumed.wrapping_mul(u64::from(SHARDS_MAX));
         let stream = RNG_STREAM + u64::from(shard);
@@ -69,10 +69,10 @@ impl ReplayState {
     }
 }
 
-/// The replay without the transitions that it holds.
+/// The state of a replay without its transitions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Snapshot {
-    /// Transitions stored since the start: the number of the next one.
+    /// Transitions stored since the start, which is the index of the next one.
     pub(crate) inserted: u64,
     pub(crate) oldest: u64,
     pub(crate) capacity: u64,
@@ -82,13 +82,13 @@ pub(crate) struct Snapshot {
 }
 
 impl Snapshot {
-    /// How many it takes where it is written.
+    /// Returns the encoded size in bytes.
     pub(crate) fn bytes(&self) -> u64 {
         codec::encode_value(self).map_or(0, |it| it.len() as u64)
     }
 
-    /// Checks that this is of a replay like `ours`, whatever its checksum says; the error says why not. One that is taken can be counted
-    /// on from: no count overflows, and none becomes less than nothing.
+    /// Checks the content of a snapshot, even if its checksum is right. It must fit a replay like `ours`, and counting on from it must not
+    /// overflow or underflow any count. The error says what is wrong.
     pub(crate) fn check(&self, ours: &ReplayState) -> Result<(), &'static str> {
         let (inserted, counts, state) = (self.inserted, &self.counts, &self.state);
         let (counted, expected) = (&state.statistics.counted, &ours.statistics.counted);

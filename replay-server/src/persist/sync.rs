@@ -1,5 +1,5 @@
 //! Flushes the log to the disk once a period, on a separate thread.
-//! What the process has written survives its death without this; what the machine has flushed survives a power cut too.
+//! Written data survives the death of the process without a flush; flushed data survives a power cut too.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -12,22 +12,31 @@ use std::{
 
 use driml_protocol::{LogLimiter, Shutdown, fail_point, lock};
 
-/// Segments that wait to be flushed; with one more they are flushed before anything else is written.
+/// Maximum segments that wait for a flush. One more causes a flush before anything else is written.
 const WAITING_MAX: usize = 32;
 
 struct Unflushed {
     segments: BTreeMap<u64, Arc<File>>,
-    /// The folder, if a segment was made in it.
+    /// The folder, if a segment was created in it since the last flush.
     folder: Option<Arc<File>>,
     /// Segments of which a flush failed. The system says so once, and may then take what it has lost for written.
     lost: BTreeSet<u64>,
+    /// Segments with smaller numbers were removed, perhaps during a flush.
+    oldest: u64,
     /// When the last flush began that succeeded while no segment was lost.
     flushed: Instant,
 }
 
+impl Unflushed {
+    fn forget_removed(&mut self) {
+        self.segments = self.segments.split_off(&self.oldest);
+        self.lost = self.lost.split_off(&self.oldest);
+    }
+}
+
 struct Shared {
     unflushed: Mutex<Unflushed>,
-    /// One flush at a time: a caller that asks for another one gets it done, not only begun.
+    /// Allows one flush at a time, so that a caller's flush is complete when it returns.
     flushing: Mutex<()>,
 }
 
@@ -46,10 +55,11 @@ impl Shared {
             .and_then(|()| folder.as_ref().map_or(Ok(()), |folder| folder.sync_all()));
         let mut unflushed = lock(&self.unflushed);
         if flushed.is_err() {
-            // Due the next time again.
+            // To be flushed again next time.
             unflushed.segments.extend(segments);
             unflushed.folder = unflushed.folder.take().or(folder);
             unflushed.lost.extend(lost);
+            unflushed.forget_removed();
         } else if unflushed.lost.is_empty() {
             unflushed.flushed = begun;
         }
@@ -57,7 +67,7 @@ impl Shared {
     }
 }
 
-/// The thread; dropping this flushes once more and ends it.
+/// The thread that flushes. Dropping this ends the thread and flushes once more.
 pub(super) struct Syncer {
     shared: Arc<Shared>,
     folder: Arc<File>,
@@ -66,13 +76,14 @@ pub(super) struct Syncer {
 }
 
 impl Syncer {
-    /// Flushes every `period`, or, where that is zero, whenever [`Syncer::written`] is called.
+    /// Starts to flush every `period`, or, if `period` is zero, at each call of [`Syncer::written`].
     pub(super) fn start(folder: File, period: Duration) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             unflushed: Mutex::new(Unflushed {
                 segments: BTreeMap::new(),
                 folder: None,
                 lost: BTreeSet::new(),
+                oldest: 0,
                 flushed: Instant::now(),
             }),
             flushing: Mutex::default(),
@@ -103,7 +114,7 @@ impl Syncer {
         }
     }
 
-    /// Seconds since a flush began that succeeded; 0 where each write is flushed and all were.
+    /// Returns the seconds since the last successful flush began; 0 if each write is flushed and none has failed.
     pub(super) fn flushed_s(&self) -> f64 {
         let unflushed = lock(&self.shared.unflushed);
         match self.thread.is_none() && unflushed.segments.is_empty() {
@@ -112,19 +123,19 @@ impl Syncer {
         }
     }
 
-    /// Segment `number` is gone, and need not be flushed.
+    /// Segment `number`, the oldest, was removed and need not be flushed.
     pub(super) fn removed(&self, number: u64) {
         let mut unflushed = lock(&self.shared.unflushed);
-        unflushed.segments.remove(&number);
-        unflushed.lost.remove(&number);
+        unflushed.oldest = number + 1;
+        unflushed.forget_removed();
     }
 
-    /// Whether a flush of segment `number` failed. Where each write is flushed, one that fails is written again.
+    /// Whether a flush of segment `number` failed. Always false if each write is flushed, as a failed write is then repeated.
     pub(super) fn has_lost(&self, number: u64) -> bool {
         self.thread.is_some() && lock(&self.shared.unflushed).lost.contains(&number)
     }
 
-    /// Something was written to segment `number`; where each write is flushed, the disk may refuse.
+    /// Notes a write to segment `number`. If each write is flushed, flushes it and returns the disk's error.
     pub(super) fn written(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
         let mut unflushed = lock(&self.shared.unflushed);
         let segments = &mut unflushed.segments;
@@ -140,7 +151,7 @@ impl Syncer {
         self.shared.flush()
     }
 
-    /// Flushes now; a disk that refuses is a warning.
+    /// Flushes now. A failure is logged as a warning.
     pub(super) fn flush(&self) {
         if let Err(e) = self.flushed() {
             tracing::warn!("the replay's log was not flushed: {e}");
@@ -185,12 +196,15 @@ mod tests {
         let begun = Instant::now();
         syncer.opened(1, file("/dev/null".as_ref()));
         assert!(syncer.flushed().is_err());
-        // The system says it once.
+        // The system reports the failure once.
         syncer.opened(1, file(folder.path()));
         assert!(syncer.flushed().is_ok());
         let least = begun.elapsed().as_secs_f64();
         assert!(syncer.flushed_s() >= least);
         syncer.removed(1);
+        // As if the failing flush had begun before it was removed.
+        syncer.opened(1, file("/dev/null".as_ref()));
+        assert!(syncer.flushed().is_err());
         let asked = Instant::now();
         assert!(syncer.flushed().is_ok());
         assert!(syncer.flushed_s() <= asked.elapsed().as_secs_f64());

@@ -1,4 +1,4 @@
-//! Logs whose disk refuses for a while, and actors that are forgotten: what comes back is what was there.
+//! Logs whose disk rejects writes for a while, and forgotten actors: recovery restores all that was stored.
 
 use std::{
     fs::{self, File},
@@ -34,7 +34,7 @@ const fn join(actor: u32, incarnation: u64) -> ActorJoin {
     ActorJoin { actor, incarnation }
 }
 
-/// A replay in its folder, which an actor has joined.
+/// Creates a replay in a new folder, with an actor that has joined.
 fn begin(sampling: Sampling) -> (TempDir, Replay) {
     let folder = tempfile::tempdir().unwrap();
     let (mut replay, _) = open(folder.path(), sampling).unwrap();
@@ -42,7 +42,7 @@ fn begin(sampling: Sampling) -> (TempDir, Replay) {
     (folder, replay)
 }
 
-/// The segment that is written refuses, as on a full disk; gives what to put back.
+/// Makes writes to the newest segment fail, as on a full disk. Returns the file to put back.
 fn refuse(replay: &mut Replay) -> Arc<File> {
     let log = replay.log.as_mut().unwrap();
     let full = Arc::new(File::open("/dev/null").unwrap());
@@ -74,7 +74,7 @@ fn save_checkpoint(replay: &mut Replay) {
     replay.note_learned(learned).unwrap();
 }
 
-/// Ends it, and opens its folder again: what was stored is there.
+/// Drops the replay and opens its folder again: all that was stored must be restored.
 fn check_comes_back(replay: Replay, dir: &Path) {
     let stored = replay.stored_bytes().unwrap();
     drop(replay);
@@ -100,7 +100,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     replay.leave(&leave);
     assert!(replay.is_refused_by_disk());
     replay.log.as_mut().unwrap().file = file;
-    // The learner's checkpoint is the first that there is room for.
+    // The learner's checkpoint begins the first segment after the disk accepts writes again.
     save_checkpoint(&mut replay);
     replay.join_actor(join(1, 1)).unwrap();
     let bytes = |replay: &Replay| replay.log.as_ref().unwrap().bytes();
@@ -152,7 +152,7 @@ fn a_segment_that_cannot_be_begun_stops_nothing() {
     check_comes_back(replay, folder.path());
 }
 
-/// With priorities a state has 8 bytes for each transition held.
+/// With priorities, a snapshot has 8 bytes for each transition held.
 #[test]
 fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
     let sampling = Sampling::Prioritised {
@@ -167,9 +167,9 @@ fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
         store(&mut replay, sequence);
         most = most.max(replay.log.as_ref().unwrap().bytes());
     }
-    // The 2,000 transitions held take 34 kB in chunks, and a state 16 kB.
+    // The 2,000 transitions held take 34 kB in chunks, and a snapshot takes 16 kB.
     assert!(most < 200_000, "{most}");
-    // One that could not be written is refused at the start.
+    // A capacity whose snapshot could not be written is rejected at the start.
     let fits = |capacity| {
         let unlimited = Config::unlimited(capacity);
         Config {

@@ -1,5 +1,5 @@
-//! What a replay does with its log: opening its folder, snapshots, segments and marks while it runs, and taking a snapshot back.
-//! How the log is written is for `journal`, how it is read for `recover`. A replay in memory has none, and does nothing here.
+//! Connects a replay to its log: opens the folder, begins segments and sets marks as the replay runs, takes and restores snapshots.
+//! `journal` writes the log; `recover` reads it. A replay in memory has no log, and these methods do nothing.
 
 use std::{
     borrow::Cow,
@@ -23,28 +23,28 @@ use crate::{
     storage::ring::{Link, Step},
 };
 
-/// How often the log is flushed unless the settings say so.
+/// Default period between flushes of the log.
 const FSYNC_DEFAULT: Duration = Duration::from_secs(1);
-/// Largest segment unless its size is given: small enough that little is kept beyond what the ring holds.
+/// Maximum segment size unless it is given: small enough that the log keeps little beyond the content of the ring.
 const SEGMENT_BYTES_MAX: u64 = 1 << 26;
-/// Segments that the ring, or the disk budget, is to span at least.
+/// Number of segments that the ring or the disk budget should span at least.
 const SEGMENTS: u64 = 16;
 
-/// Where a replay is kept, and which process of the run it is.
+/// Where a replay is kept on disk, and which shard of the run it is.
 #[derive(Clone, Debug)]
 pub struct PersistArgs {
     /// The folder, for this replay alone.
     pub dir: PathBuf,
-    /// Which of the replay's shards it is.
+    /// The number of the shard, from 0.
     pub shard: u32,
-    /// Size from which a segment is followed by another, if not what suits the ring.
+    /// Size from which a segment is followed by another. Default: a size that suits the ring.
     pub segment_bytes: Option<u64>,
-    /// Go back to this mark: what the log says after it is removed.
+    /// The mark to which the log is rolled back: all records after it are removed.
     pub mark: Option<Mark>,
 }
 
 impl Replay {
-    /// The replay of a run that is kept in a folder: as it was, if it was kept there before, else an empty one.
+    /// Opens the replay of a run in a folder: restores it if it was kept there before, otherwise creates an empty one.
     pub fn open(
         args: &PersistArgs,
         spec: &RunSpec,
@@ -57,7 +57,7 @@ impl Replay {
     }
 }
 
-/// The folder of a replay, which no other process uses any more and which is this run's. What is kept there is not read yet.
+/// The folder of a replay of this run, locked for this process. Its log is not read yet.
 pub struct KeptReplay {
     mark: Option<Mark>,
     id: LogId,
@@ -66,7 +66,7 @@ pub struct KeptReplay {
 }
 
 impl KeptReplay {
-    /// Takes the folder and looks whose replay is in it, if any: at once, however much there is.
+    /// Locks the folder, and checks that a log in it belongs to this run. Does not read the log, which may take long.
     pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
         config.check_on_disk()?;
         let folder = LogFolder::open(&args.dir)?;
@@ -94,11 +94,11 @@ impl KeptReplay {
         &self.folder.path
     }
 
-    /// Reads what is kept into `replay`, which is empty.
+    /// Reads the log into `replay`, which must be empty.
     ///
     /// # Errors
-    /// A folder that cannot be read or written; [`PersistError::Stopped`] if `reading` is told so. Damage is not an error: what is left
-    /// is used, and what was lost is in the warnings.
+    /// The folder cannot be read or written, nothing in it is usable, or `reading` was stopped ([`PersistError::Stopped`]). Damage alone is
+    /// not an error: the rest is used, and the warnings name the losses.
     pub fn read(
         self,
         mut replay: Replay,
@@ -120,7 +120,7 @@ impl KeptReplay {
     }
 }
 
-/// How large a segment is, what all may take, and how often they are flushed.
+/// Returns the size of a segment, the disk budget of the shard, and the period between flushes.
 fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> LogLimits {
     let shards = u64::from(config.shards);
     let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
@@ -142,22 +142,22 @@ pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
     }
 }
 
-/// What is written, and what is reported of it.
+/// Writing to the log.
 impl Replay {
-    /// Writes notes that the disk refused before; until all are written, joins and `Leave`s get no answer.
+    /// Writes notes that the disk rejected before. Returns whether all are written; until then joins and `Leave`s get no reply.
     pub(crate) fn write_pending(&mut self) -> bool {
         let log = self.log.as_mut();
         log.is_none_or(Journal::write_pending)
     }
 
-    /// Whether the disk refused what was to be written last.
+    /// Whether the last write to the disk failed.
     pub fn is_refused_by_disk(&self) -> bool {
         let log = self.log.as_ref();
         log.is_some_and(Journal::is_failing)
     }
 
-    /// Marks this moment in the log, on the disk. The log can be opened there again, also after it was continued: then all of the
-    /// replay is the same as now, to the last bit. The last two marks hold, without those that were given up.
+    /// Marks this moment in the log, flushed to disk. The log can be opened at the mark even after it has grown, which restores the replay
+    /// bit for bit. The last two marks are kept, not counting those given up. `None` if the replay is in memory.
     pub fn mark(&mut self) -> Result<Option<Mark>, PersistError> {
         let snapshot = self.snapshot();
         let marked = self.log.as_mut().map(|log| log.mark(&snapshot));
@@ -165,8 +165,8 @@ impl Replay {
         marked.transpose()
     }
 
-    /// Nothing will go back to `mark`, as the checkpoint that was to name it could not be saved: it does not take the place of one
-    /// to which a checkpoint goes back.
+    /// Gives up `mark`, as the checkpoint that should refer to it could not be saved. So it does not displace a mark to which a saved
+    /// checkpoint refers.
     pub fn give_up_mark(&mut self, mark: Mark) {
         if let Some(log) = &mut self.log {
             log.give_up(mark);
@@ -180,7 +180,7 @@ impl Replay {
         self.tidy();
     }
 
-    /// Begins another segment when one is full, and removes those that are not needed any more.
+    /// Begins a new segment if the newest is full, and removes segments that are no longer needed.
     pub(crate) fn tidy(&mut self) {
         if self.log.as_ref().is_some_and(Journal::is_full) {
             self.next_segment();
@@ -188,7 +188,7 @@ impl Replay {
         self.prune();
     }
 
-    /// Begins another segment; where the disk budget does not allow it, the oldest transitions go first.
+    /// Begins a new segment. If the disk budget has no room for it, drops the oldest transitions first.
     pub(crate) fn next_segment(&mut self) {
         let log = self.log.as_ref();
         if let Some(oldest) = log.and_then(|log| log.over_budget(|| self.snapshot())) {
@@ -212,9 +212,9 @@ impl Replay {
     }
 }
 
-/// What is read back.
+/// Snapshots of the state.
 impl Replay {
-    /// All of it but the transitions.
+    /// Returns the replay's state without the transitions.
     pub(crate) fn snapshot(&self) -> Snapshot {
         Snapshot {
             inserted: self.ring.inserted(),
@@ -229,8 +229,8 @@ impl Replay {
         }
     }
 
-    /// Takes back a snapshot. The transitions between what is stored and those that the snapshot knows are gone: they leave a gap, or,
-    /// where it is larger than the ring, an empty ring. The error says for a person why the snapshot is not of this run.
+    /// Restores a snapshot. Transitions that it counts beyond those stored are gone: they leave a gap, or an empty ring if the gap
+    /// is as large as the ring. The error says why the snapshot is not of this run, for a person.
     pub(super) fn restore(&mut self, snapshot: Snapshot) -> Result<(), String> {
         snapshot.check(&self.state)?;
         let (inserted, oldest) = (snapshot.inserted, snapshot.oldest);
@@ -261,7 +261,7 @@ impl Replay {
         Ok(())
     }
 
-    /// Takes the place of `count` transitions that are gone, which hang together with nothing and cannot be anchors.
+    /// Fills the places of `count` lost transitions with steps that have no links and cannot be anchors.
     fn push_gone(&mut self, count: u64) {
         let chunk = Chunk::zeroed(ChunkHeader {
             streams: 1,
@@ -277,14 +277,14 @@ impl Replay {
         }
     }
 
-    /// All but the transitions, as bytes that are the same where it is: what a mark brings back. For tests.
+    /// Encodes the state without the transitions, for tests. Equal states give equal bytes. A mark restores all of this state.
     pub fn state_bytes(&self) -> Result<Vec<u8>, CodecError> {
         let mut snapshot = self.snapshot();
         snapshot.state.statistics = snapshot.state.statistics.of_changes();
         codec::encode_value(&snapshot)
     }
 
-    /// The same without what was drawn: what a log brings back after its server died at any moment. For tests.
+    /// Encodes the state without transitions and draws, for tests: the part that a log restores after its server died at any moment.
     pub fn stored_bytes(&self) -> Result<Vec<u8>, CodecError> {
         let snapshot = self.snapshot();
         let (counts, state) = (snapshot.counts, snapshot.state);

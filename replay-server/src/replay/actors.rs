@@ -1,5 +1,5 @@
 //! The actors of a replay, and the chunks that they send.
-//! Which chunk is the next of its actor is the ledger's to say, and when one may come in the limiter's.
+//! The ledger decides which chunk of an actor comes next; the rate limiter decides when a chunk may be stored.
 
 use std::borrow::Cow;
 
@@ -15,15 +15,15 @@ use crate::{
     },
 };
 
-/// Transitions that one life of an actor can have produced, by its own account: three years at three million a second.
+/// Maximum transitions that one incarnation of an actor may report: three years at three million per second.
 const TRANSITIONS_MAX: u64 = 1 << 48;
 
 impl Replay {
-    /// Takes part from now on: chunks of this life of the actor are stored, those of an earlier one no longer. Gives the number
-    /// of earlier ones.
+    /// Admits an incarnation of an actor: from now on its chunks are stored, and those of earlier incarnations are not. Returns the number
+    /// of earlier incarnations.
     ///
     /// # Errors
-    /// Too many actors, or a life that another one has replaced; the reason, for a person.
+    /// Too many actors, or an incarnation that another one has replaced; the reason, for a person.
     pub fn join_actor(&mut self, join: ActorJoin) -> Result<u32, String> {
         let before = self.actor_incarnation(join.actor);
         let earlier_incarnations = self.state.actors.join(join)?;
@@ -33,7 +33,7 @@ impl Replay {
         Ok(earlier_incarnations)
     }
 
-    /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors, and names them.
+    /// If the run has its maximum number of actors, forgets those that never sent a chunk and are not connected. Returns their numbers.
     pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
         let absent = self.state.actors.absent(is_connected);
         if !absent.is_empty() {
@@ -43,12 +43,12 @@ impl Replay {
         absent
     }
 
-    /// The life of `actor` whose chunks are stored; none before it joins.
+    /// Returns the incarnation of `actor` whose chunks are stored; `None` before the actor joins.
     pub fn actor_incarnation(&self, actor: u32) -> Option<u64> {
         self.state.actors.current_incarnation(actor)
     }
 
-    /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
+    /// Returns a packer that compresses chunks for this replay. It can be used without a lock on the replay.
     pub(crate) fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
@@ -56,20 +56,20 @@ impl Replay {
         }
     }
 
-    /// Stores a chunk, whole, or says why not.
+    /// Stores a whole chunk, or replies why not.
     pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
         self.insert_packed(&self.packer().pack(Cow::Borrowed(chunk)))
     }
 
-    /// [`Replay::insert`] of a chunk that this replay's packer packed.
+    /// Does the same as [`Replay::insert`] for a chunk that this replay's packer has packed.
     pub(crate) fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         self.settle(packed).unwrap_or_else(|| self.admit(packed))
     }
 
-    /// The answer to a chunk that is not to be stored, now or ever: it is stored already, is not the next of its actor, makes no
-    /// sense, or comes after the end of the run. `None`: it is for [`Replay::admit`].
+    /// Returns the reply to a chunk that must not be stored: it is already stored, out of order, invalid, or comes after the end of the
+    /// run. `None` if [`Replay::admit`] has to decide.
     ///
-    /// A retry is answered `Stored`, whatever the limiter says; a chunk that is not next is never stored.
+    /// A retry is answered `Stored`, whatever the limiter allows. An out-of-order chunk is stored only if its actor insists on it.
     pub(crate) fn settle(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
         let chunk = &*packed.chunk;
         let verdict = self.check_chunk(chunk);
@@ -87,8 +87,8 @@ impl Replay {
         }
     }
 
-    /// Stores a chunk that [`Replay::settle`] has nothing to say of, on disk before in memory, if the limiter lets it pass or its actor
-    /// leaves; else, and while the disk refuses, the answer is to wait.
+    /// Stores a chunk for which [`Replay::settle`] returned `None`, on disk before in memory. Replies `Wait` while the disk rejects writes,
+    /// and if the limiter has no room, unless the actor is leaving or the last draw found no anchor.
     pub(crate) fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         let is_leaving = packed.chunk.header.leaving;
         if !(self.limiter.may_insert() || self.state.starving || is_leaving) {
@@ -105,7 +105,7 @@ impl Replay {
         self.stored()
     }
 
-    /// What became of a chunk: stored, not wanted any more, or never to be stored; none where it is still to come.
+    /// Returns what became of a chunk: stored, no longer wanted, or never to be stored. `None` if the chunk has not arrived or is parked.
     pub fn poll(&mut self, poll: &ChunkPoll) -> Option<InsertReply> {
         match self.state.actors.is_stored(poll) {
             Ok(true) => Some(self.stored()),
@@ -114,7 +114,7 @@ impl Replay {
         }
     }
 
-    /// The answer that a chunk has to wait; `kept` says whether it waits here.
+    /// Returns the reply that a chunk has to wait. `kept` tells whether the server keeps the chunk meanwhile.
     pub(crate) fn wait(&self, kept: bool) -> InsertReply {
         InsertReply::Wait {
             inserted_total: self.inserted_total(),
@@ -142,7 +142,7 @@ impl Replay {
         }
     }
 
-    /// Checks that a chunk can be one of this run at all, by its sizes and counts alone; the error says why not.
+    /// Checks the sizes, counts, rewards and actions of a chunk against the run's settings. The error says what is wrong.
     pub(crate) fn check_chunk(&self, chunk: &Chunk) -> Result<(), String> {
         let (spec, capacity) = (&self.spec, self.ring.capacity());
         let header = &chunk.header;
@@ -191,7 +191,7 @@ impl Replay {
         }
     }
 
-    /// Stores a chunk that is the next of its actor.
+    /// Stores an accepted chunk in memory, and counts it.
     pub(crate) fn store(&mut self, packed: &PackedChunk<'_>) {
         let chunk = &*packed.chunk;
         let header = chunk.header;
@@ -199,7 +199,7 @@ impl Replay {
         let (streams, difference) = self.state.actors.accept(&header);
         self.limiter.inserted(header.transitions() as u64);
         let steps = header.steps as usize;
-        // In all shards, by their last reports.
+        // The count of all shards, by their last reports.
         let frames = self.limiter.inserted_total();
         for (number, stream) in streams.iter_mut().enumerate() {
             let rows = number * steps..(number + 1) * steps;
@@ -233,7 +233,7 @@ impl Replay {
 
     fn count(&mut self, actor: u32, difference: Difference) {
         let Difference { lost, duplicated } = difference;
-        // An actor that sends nonsense could make the line come at any rate.
+        // `Statistics::count` limits the rate of this line, which a faulty actor could trigger with every message.
         if self.state.statistics.count(difference) && !self.quiet {
             tracing::warn!(
                 "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
@@ -241,8 +241,8 @@ impl Replay {
         }
     }
 
-    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice. One of a life
-    /// that never joined, or with a count that no run reaches, is refused: gives the reason.
+    /// Takes an actor's `Leave`. Transitions that it produced and that are not stored count as lost, the reverse as duplicated. Returns the
+    /// reason if the message is rejected: its incarnation never joined, or its count is impossible.
     pub fn leave(&mut self, leave: &Leave) -> Option<String> {
         let said = match leave.produced {
             0..=TRANSITIONS_MAX => self.state.actors.leave(leave),

@@ -1,5 +1,5 @@
-//! The learner of a replay, and the batches that it is served.
-//! How rows are drawn and put together is for `sampling`.
+//! The learner of a replay, and the batches that are served to it.
+//! `sampling` draws and assembles the rows.
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, NotReady, PriorityUpdate,
@@ -14,14 +14,14 @@ use crate::{
     sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
 
-/// Who learns, and what it says it has learned.
+/// The learner, its progress and the data it sends.
 impl Replay {
-    /// Serves this learner from now on, and it alone. How many rows were learned is what it says: what was served beyond them counts as
-    /// not sampled. A replay that is empty counts on from where its checkpoint stands, and fills again before the next row is sampled.
-    /// Gives the number of updates that are learned again.
+    /// Admits a learner; from now on only this learner is served. Its count of learned rows is decisive: rows served beyond it count as not
+    /// sampled. An empty replay continues the counts of the learner's checkpoint, and refills before it samples the next row. Returns the
+    /// number of updates that the learner repeats.
     ///
     /// # Errors
-    /// Another learner has learned in this run, and this one has no checkpoint of it; what to do, for a person.
+    /// Another learner has learned in this run, and this one has no checkpoint of it, or has impossible counts. The text says what to do.
     pub fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, String> {
         let counted = join.counts + join.other_shards;
         if join.updates.max(counted.inserted).max(counted.rows_sampled) > COUNT_MAX {
@@ -32,7 +32,7 @@ impl Replay {
         }
         let done = self.state.learned.updates;
         match self.state.learner {
-            // It did not receive the answer.
+            // The learner did not receive the reply and retries.
             Some(known) if known.learner == join.learner => return Ok(0),
             Some(known) if known.run == join.run || join.restart => {}
             Some(_) if done == 0 && join.updates == 0 => {}
@@ -66,7 +66,7 @@ impl Replay {
         Ok(again)
     }
 
-    /// Counts on from a learner's checkpoint, if nothing is stored here.
+    /// Continues the counts of a learner's checkpoint, if nothing is stored here.
     fn resume_empty(&mut self, join: &LearnerJoin) {
         if join.updates == 0 || self.ring.inserted() > 0 {
             return;
@@ -78,7 +78,7 @@ impl Replay {
             .min(config.capacity_transitions)
             .max(config.warmup_transitions);
         let refill = refill.div_ceil(config.shards.into());
-        // All shards' credit decides whether anything is left to fill it for.
+        // `RateLimiter::resume_empty` needs the counts of all shards to decide whether the run still has rows to sample.
         self.limiter.counts.other_shards = join.other_shards;
         self.limiter
             .resume_empty(join.counts, refill, self.batch_size);
@@ -86,17 +86,17 @@ impl Replay {
         self.state.draw_anew(self.origin.shard, join.updates);
     }
 
-    /// The learner that is served.
+    /// Returns the learner that is served.
     pub fn learner(&self) -> Option<u64> {
         self.state.learner.map(|it| it.learner)
     }
 
-    /// Updates after which the run was resumed without its replay; 0 if it never was, or before its learner has joined.
+    /// Returns the updates done when the run was resumed without its replay; 0 if it never was, or before its learner has joined.
     pub const fn resumed_after(&self) -> u64 {
         self.state.resumed_after
     }
 
-    /// Takes what the learner says it has done. If it has saved a checkpoint, so does a replay that is kept on disk.
+    /// Takes the learner's progress. If the learner has saved a checkpoint, a replay on disk begins a new segment with a snapshot.
     pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
         let (updates, rows) = (learned.updates, learned.rows_received);
         if updates.max(learned.saved_updates).max(rows) > COUNT_MAX {
@@ -137,30 +137,30 @@ impl Replay {
         affinity.update(update).map_err(|e| e.to_string())
     }
 
-    /// Takes the priorities of rows that were drawn here; those of other shards are none of its business. An update that has come
-    /// before changes nothing, nor does a row whose transition was overwritten meanwhile: both are counted.
+    /// Sets the priorities of rows that this shard drew; those of other shards are ignored. A repeated update changes nothing, nor does a
+    /// row whose transition has been overwritten: both are counted.
     ///
     /// # Errors
-    /// A run that draws uniformly, or a transition that was never stored; the reason, for a person. Nothing has then changed.
+    /// The run draws uniformly, or a transition was never stored; the reason, for a person. In these cases nothing has changed.
     pub fn set_priorities(&mut self, update: &PriorityUpdate) -> Result<(), String> {
         self.sampler.rows.update(&self.ring, update, self.origin)
     }
 
-    /// What became of the priorities that came; none where rows are drawn uniformly.
+    /// Returns what became of the priorities received; `None` if rows are drawn uniformly.
     pub fn priority_counts(&self) -> Option<PriorityCounts> {
         self.sampler.rows.priority_counts()
     }
 }
 
-/// The batches that it is served.
+/// The batches that are served to the learner.
 impl Replay {
     /// Makes a batch: [`Replay::draw`] and [`PackedBatch::unpack`] in one.
     pub fn sample(&mut self, rows: u32) -> Result<Batch, NotReady> {
         self.draw(rows, Buffer::zeroed).map(PackedBatch::unpack)
     }
 
-    /// [`Replay::draw`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it does not
-    /// count as sampled.
+    /// Draws a batch for request `id`, as [`Replay::draw`] does. Rows that an earlier attempt of this request was given did not arrive, and
+    /// no longer count as sampled.
     ///
     /// # Errors
     /// As [`Replay::draw`]; a request that its client has given up is told to wait.
@@ -183,12 +183,12 @@ impl Replay {
         Ok(draft)
     }
 
-    /// A batch of `rows` rows, anchors drawn with replacement by the rule of `replay.sampling`, or why there is none. With
-    /// compression its frames are left to be unpacked, which needs the replay no more. `memory` gives so many bytes, all of which are
-    /// written by then.
+    /// Draws a batch of `rows` rows, or returns why there is none. Anchors are drawn with replacement by the rule of `replay.sampling`.
+    /// Compressed frames are unpacked later by [`PackedBatch::unpack`], which does not need the replay. `memory` returns a buffer of the
+    /// given size; the finished batch overwrites all of it.
     ///
     /// # Errors
-    /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
+    /// The client has to wait, as the limiter has no credit or no anchor is valid; the run is over; or such a batch can never be served.
     pub fn draw(
         &mut self,
         rows: u32,

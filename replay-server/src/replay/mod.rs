@@ -1,6 +1,5 @@
-//! The replay server's core: chunks in, batches out, who takes part, and its account of itself.
-//! It keeps no time and starts no thread: the service around it does. What it writes to disk is in `persist`, how rows are drawn in
-//! `sampling`, what is counted in `ledger` and `rate_limiter`.
+//! The replay server's core: it stores chunks, serves batches, admits actors and a learner, and reports its status.
+//! It has no clock and no threads: `service` has them. `persist` writes to disk, `sampling` draws rows, `ledger` and `rate_limiter` count.
 
 mod actors;
 mod learner;
@@ -19,11 +18,11 @@ use crate::{
     storage::{frame_store::Frames, ring::Ring},
 };
 
-/// How far the version of an affinity matrix may be ahead of the rows served, and that of weights that acted ahead of the newest: a
-/// replay that was started anew may not know all.
+/// Maximum lead of a version: of an affinity matrix over the rows served, and of the weights that acted over the newest weights. Not 0, as
+/// a restarted replay may not know all rows and weights.
 pub(crate) const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
-/// Everything the replay server knows. Kept in memory alone, or, with a log, on disk too: [`KeptReplay`](crate::KeptReplay).
+/// The state of the replay server. It is in memory, and with a log also on disk: see [`KeptReplay`](crate::KeptReplay).
 pub struct Replay {
     pub(crate) spec: RunSpec,
     pub(crate) config: Config,
@@ -33,20 +32,20 @@ pub struct Replay {
     pub(crate) sampler: BatchSampler,
     pub(crate) state: ReplayState,
     requests: Requests,
-    /// Who draws, as batches say it that are drawn by priority: priorities of rows that another one drew change nothing. A replay server
-    /// that is started again numbers its transitions anew, or has lost some, and so draws another incarnation.
+    /// The identity of this sampler, which prioritised batches carry. Priorities of rows from another origin are ignored: a restarted
+    /// replay server numbers its transitions anew, or has lost some, and so has another incarnation.
     pub(crate) origin: Origin,
-    /// It is being read back: what is counted was logged when it happened.
+    /// Set while the log is read back: differences counted then were logged when they happened.
     pub(crate) quiet: bool,
-    /// It was read back: how many rows the learner has, it says with its next request.
+    /// Set after the log was read back: the learner's next request tells how many rows it has received.
     pub(crate) awaits_learner: bool,
     pub(crate) log: Option<Journal>,
 }
 
-/// An empty replay, and who draws from it.
+/// Constructors.
 impl Replay {
-    /// An empty replay in memory for batches of `batch_size` rows; its draws follow from `spec.seed` and the order of calls. Of several
-    /// shards it is the first: [`Replay::shard`].
+    /// Creates an empty replay in memory for batches of `batch_size` rows. `spec.seed` and the order of calls determine its draws. With
+    /// several shards this is shard 0; [`Replay::shard`] creates any shard.
     ///
     /// # Errors
     /// Settings that cannot work, or more memory than the system grants.
@@ -54,7 +53,7 @@ impl Replay {
         Self::shard(spec, config, batch_size, 0)
     }
 
-    /// Shard `shard` of `config.shards`, which holds its share of the capacity and draws its own numbers.
+    /// Creates shard `shard` of `config.shards`, with its share of the capacity and a separate random stream.
     pub fn shard(
         spec: &RunSpec,
         config: &Config,
@@ -98,29 +97,29 @@ impl Replay {
     }
 }
 
-/// What it says of itself, and what the service around it tells it to count.
+/// Status, and the counters that the service updates.
 impl Replay {
-    /// What is counted of messages, waits and connections.
+    /// Returns the counters of messages, waits and connections.
     pub(crate) const fn counted(&mut self) -> &mut ReplayStatus {
         &mut self.state.statistics.counted
     }
 
-    /// Transitions of the run that were stored, in all shards by their last reports.
+    /// Returns the transitions that all shards have stored; those of the other shards are from their last reports.
     pub fn inserted_total(&self) -> u64 {
         self.limiter.inserted_total()
     }
 
-    /// What was counted here since the start of the run.
+    /// Returns this shard's counts since the start of the run.
     pub const fn counts(&self) -> ShardCounts {
         self.limiter.counts()
     }
 
-    /// Takes what the replay's other shards have counted.
+    /// Sets the counts of the other shards. Impossible counts are an error: the reason, for a person.
     pub fn set_other_shards(&mut self, other_shards: ShardCounts) -> Result<(), String> {
         self.limiter.set_other_shards(other_shards)
     }
 
-    /// Who waits for whom now, for batches of the size that the replay was made for.
+    /// Returns which side waits now, for batches of the `batch_size` that the replay was created for.
     pub fn waiting(&self) -> Waiting {
         match self.limiter.waiting(self.batch_size) {
             Waiting::ActorsWaitForLearner | Waiting::Neither if self.state.starving => {
@@ -130,7 +129,7 @@ impl Replay {
         }
     }
 
-    /// The account of itself; what the service alone knows is left at its default.
+    /// Returns the status. Fields that only the service knows keep their defaults.
     pub fn status(&self) -> ReplayStatus {
         let counts = self.limiter.counts;
         ReplayStatus {
@@ -151,19 +150,19 @@ impl Replay {
         }
     }
 
-    /// The episodes that are asked for, by one that has those before.
+    /// Notes that the client has the first `request.since` ended episodes, and returns the next ones.
     pub(crate) fn episodes(&mut self, request: EpisodesRequest) -> EpisodesReply {
         let EpisodesRequest { since, is_launcher } = request;
         self.state.statistics.note_recorded(since, is_launcher);
         self.episodes_since(since)
     }
 
-    /// Episodes that ended after the first `since`, at most as many as one answer holds.
+    /// Returns the ended episodes after the first `since`, at most as many as one reply holds.
     pub fn episodes_since(&self, since: u64) -> EpisodesReply {
         self.state.statistics.episodes_since(since)
     }
 
-    /// The launcher has the first so many episodes that ended.
+    /// Notes that the launcher has the first `episodes` ended episodes.
     pub fn note_recorded(&mut self, episodes: u64) {
         self.state.statistics.note_recorded(episodes, true);
     }

@@ -1,6 +1,6 @@
-//! Draws the rows of a batch and puts it together: anchors by `rows`, each row by `episodes`, and the frames that they need, each once.
-//! Frames that are compressed leave the replay so, and are unpacked while nothing is locked.
-//! Whether a batch may be drawn is for the rate limiter.
+//! Draws and assembles a batch: `rows` draws the anchors, `episodes` computes each row, and stacked states share their frames.
+//! Compressed frames leave the replay compressed, and are unpacked without a lock.
+//! The rate limiter decides whether a batch may be drawn.
 
 use std::{collections::HashMap, iter, ops::Range, sync::Arc};
 
@@ -18,7 +18,7 @@ use crate::storage::{
     ring::Ring,
 };
 
-/// Everything that drawing needs beside the ring and the generator.
+/// The state that drawing needs besides the ring and the random generator.
 pub(crate) struct BatchSampler {
     pub(crate) rows: Box<dyn RowSampler>,
     episodes: Episodes,
@@ -28,7 +28,7 @@ pub(crate) struct BatchSampler {
 }
 
 impl BatchSampler {
-    /// The sampler of a ring of `capacity` transitions; an error gives the bytes that the system refuses to reserve.
+    /// Creates the sampler of a ring of `capacity` transitions. An error holds the bytes that the system does not grant.
     pub(crate) fn new(spec: &RunSpec, sampling: &Sampling, capacity: u64) -> Result<Self, u64> {
         let episodes = Episodes::new(spec);
         let rows: Box<dyn RowSampler> = match *sampling {
@@ -46,7 +46,7 @@ impl BatchSampler {
         })
     }
 
-    /// A batch of as many rows as `header` says, whose mean age and weights are filled in here; none if there is no anchor.
+    /// Draws a batch of `header.rows` rows. Sets the header's mean age and weights versions. `None` if no anchor exists.
     pub(crate) fn draw(
         &mut self,
         ring: &Ring,
@@ -57,7 +57,7 @@ impl BatchSampler {
     ) -> Option<PackedBatch> {
         let rows = header.rows as usize;
         let (mut scalars, mut anchors) = (Vec::with_capacity(rows), Vec::with_capacity(rows));
-        // Of all rows, each row's in the order of `BatchStatesMut::of_row`.
+        // The states of all rows; those of a row are in the order of `BatchStatesMut::of_row`.
         let mut states: Vec<RowState> = Vec::new();
         let mut age_total = 0;
         for row in 0..rows {
@@ -86,7 +86,7 @@ impl BatchSampler {
             shared
         });
         let mut batch = Batch::of_rows(header, &scalars, memory);
-        // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
+        // Computed after all draws: a draw that finds an invalid anchor zeroes its mass, which makes the others more likely.
         let probability = |anchor| {
             let probability = self.rows.probability(anchor)? as f32;
             Some((anchor, probability.clamp(f32::MIN_POSITIVE, 1.0)))
@@ -121,17 +121,17 @@ impl BatchSampler {
     }
 }
 
-/// A state that a row has, by where the ring holds its newest frame.
+/// A state of a row, with the ring index of its newest frame.
 struct RowState {
     row: usize,
     index: u64,
 }
 
-/// The distinct frames of stacked states, in the order in which rows need them: states of a row share them, and now and then rows do.
-/// A frame is known by where the ring holds it: two that look the same are two.
+/// The distinct frames of stacked states, in the order in which rows need them. States of a row share frames, and sometimes rows do.
+/// The ring index identifies a frame: frames at two indices are distinct even if they look the same.
 struct SharedFrames {
     frames: Vec<NeededFrame>,
-    /// The frames of each state, oldest first, by their places.
+    /// The places of each state's frames in the batch, oldest first.
     stacks: Vec<u32>,
 }
 
@@ -153,25 +153,25 @@ impl SharedFrames {
     }
 }
 
-/// A batch, complete but for frames that are still to be unpacked.
+/// A batch that is complete except for frames still to be unpacked.
 #[must_use]
 pub struct PackedBatch {
     pub(crate) batch: Batch,
     layout: Layout,
-    /// Row by row; none if the batch has its frames.
+    /// The frames to unpack, row by row; empty if the batch has all its frames.
     packed: Vec<PackedFrame>,
-    /// k of each row, of several the furthest; 0 where there is none.
+    /// The k of each row, the largest if there are several; 0 if there is none.
     pub(crate) ks: Vec<u32>,
 }
 
-/// A frame that a batch needs: the first row that needs it, where the ring holds it, and its place in the batch.
+/// A frame that a batch needs: the first row that needs it, its ring index, and its place in the batch.
 struct NeededFrame {
     row: usize,
     index: u64,
     place: usize,
 }
 
-/// A needed frame that is compressed, by its number in its block.
+/// A needed frame that is compressed: its block, and its position there.
 struct PackedFrame {
     row: usize,
     place: usize,
@@ -179,7 +179,7 @@ struct PackedFrame {
     number: usize,
 }
 
-/// Writes frames into their places where the ring holds them plain; takes what is needed to write them later where they are compressed.
+/// Writes plain frames to their places in the batch. Of compressed frames returns what is needed to write them later.
 fn write_or_take(
     ring: &Ring,
     needed: &[NeededFrame],
@@ -209,7 +209,7 @@ fn write_or_take(
 }
 
 impl PackedBatch {
-    /// The batch; with compression this is where most of the work is.
+    /// Unpacks the frames and returns the batch. With compression, most of the work is here.
     pub fn unpack(self) -> Batch {
         let Self {
             mut batch,
@@ -223,7 +223,7 @@ impl PackedBatch {
             parts: Vec::new(),
             bytes: Vec::new(),
         };
-        // Each part once a row: rows seldom share them.
+        // Unpacks a part once per row, as rows seldom share parts.
         for row in packed.chunk_by(|one, next| one.row == next.row) {
             unpacked.parts.clear();
             for frame in row {
@@ -239,11 +239,11 @@ impl PackedBatch {
     }
 }
 
-/// Parts of blocks, unpacked one after the other.
+/// A cache of unpacked parts of blocks.
 struct Unpacked<'a> {
     layout: Layout,
     parts: Vec<Part<'a>>,
-    /// Longer than the parts are, where there were others before.
+    /// The unpacked parts, one after the other. May be longer, as rows reuse the buffer.
     bytes: Vec<u8>,
 }
 
@@ -254,7 +254,7 @@ struct Part<'a> {
 }
 
 impl<'a> Unpacked<'a> {
-    /// Where a part of a block begins; it is unpacked if it was not before.
+    /// Returns where a part of a block begins in `bytes`, and unpacks the part if it is not there yet.
     fn part(&mut self, block: &'a Block, number: usize) -> usize {
         let is_it = |it: &&Part<'_>| std::ptr::eq(it.block, block) && it.number == number;
         if let Some(known) = self.parts.iter().find(is_it) {

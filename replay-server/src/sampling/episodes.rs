@@ -1,5 +1,5 @@
-//! From a stored episode to a row of a batch: which transitions can be an anchor, the steps that follow it, the frames of a state,
-//! and what the row has beside them: a_t, a_{t+1}, the n-step return, and how far ahead s_{t+n} and s_{t+k} are, with each k drawn here.
+//! Makes a row of a batch from a stored episode: decides which transitions can be anchors, finds an anchor's steps and a state's frames,
+//! and computes the row's scalars: a_t, a_{t+1}, the n-step return, and the distances to s_{t+n} and s_{t+k}. Draws each k.
 //! It does not choose the anchor and reads no frame.
 
 use driml_protocol::{End, FRAME_STACK_MAX, Horizon, NO_ACTION, RowScalars, RunSpec, TimeoutRule};
@@ -11,33 +11,33 @@ use crate::{
     storage::ring::{Previous, Ring, Step},
 };
 
-/// An anchor t and what follows it: s_t, .., s_{t+m}, where m is the reach or the episode ends at s_{t+m}. Never empty.
+/// An anchor t and the steps after it: t, .., t+m, where m is the reach, or the episode ends with step t+m.
 #[derive(Default)]
 pub(crate) struct Window {
     steps: Vec<(u64, Step)>,
 }
 
 impl Window {
-    /// Index of s_{t+i} in the ring; i must not pass the end of the window.
+    /// Returns the ring index of s_{t+i}; i must not pass the end of the window.
     pub(crate) fn index(&self, i: usize) -> u64 {
         self.steps[i].0
     }
 
-    /// Step t+i; i must not pass the end of the window.
+    /// Returns step t+i; i must not pass the end of the window.
     pub(crate) fn step(&self, i: usize) -> &Step {
         &self.steps[i].1
     }
 
-    /// Steps t, t+1, .. to the end of the window.
+    /// Returns the steps t, t+1, .. to the end of the window.
     pub(crate) fn steps(&self) -> impl Iterator<Item = &Step> {
         self.steps.iter().map(|(_, step)| step)
     }
 }
 
-/// What a transition needs around it to be an anchor, and how its states are put together.
+/// The rules that decide which transitions can be anchors and which frames make a state.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Episodes {
-    /// Steps that must follow an anchor in its episode.
+    /// Steps that must follow an anchor, unless its episode ends before.
     pub(crate) reach: usize,
     pub(crate) frame_stack: usize,
     timeout: TimeoutRule,
@@ -54,8 +54,8 @@ impl Episodes {
 
     /// Whether the held transition `t` can be an anchor; if so, `window` is its window.
     ///
-    /// It can if its stack's frames are held and `reach` steps follow it or its episode ends before. With
-    /// `TimeoutRule::Bootstrap` a timed-out transition has no return at all, so it cannot.
+    /// `t` can be an anchor if its stack's frames are held, and `reach` steps follow it or its episode ends before. With
+    /// `TimeoutRule::Bootstrap` a timed-out transition has no return, so it cannot be an anchor.
     pub(crate) fn walk(&self, ring: &Ring, t: u64, window: &mut Window) -> bool {
         window.steps.clear();
         let mut index = t;
@@ -73,7 +73,7 @@ impl Episodes {
         self.is_whole(ring, t)
     }
 
-    /// Whether the held transition `t` has all but the steps that follow it: its stack's frames, and a return.
+    /// Whether the held transition `t` can be an anchor apart from the steps after it: it has a return, and its stack's frames are held.
     pub(crate) fn is_whole(&self, ring: &Ring, t: u64) -> bool {
         let timed_out = ring.step(t).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
         !timed_out && self.stack_is_held(ring, t)
@@ -91,10 +91,10 @@ impl Episodes {
         true
     }
 
-    /// The frames that make the state at `index`, as indices in the ring, oldest first.
+    /// Returns the ring indices of the frames that make the state at `index`, oldest first.
     ///
-    /// At the start of a level its first frame fills the slots of the frames before it. The stack must be held, which it is
-    /// for every state of a window: it reaches back to the anchor's stack at most.
+    /// At the start of a level, the level's first frame also takes the places of the frames before it. The stack must be held. That is true
+    /// for every state of a window, as no state's stack reaches further back than the anchor's.
     pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> impl Iterator<Item = u64> {
         let mut indices = [index; FRAME_STACK_MAX as usize];
         for slot in (0..self.frame_stack - 1).rev() {
@@ -111,7 +111,7 @@ impl Episodes {
     }
 }
 
-/// The rules of return and positive, and scratch space so that a row allocates nothing.
+/// Computes the scalars of a row, among them the return and k. Its scratch space saves an allocation per row.
 pub(crate) struct Assembler {
     horizon: Horizon,
     timeout: TimeoutRule,
@@ -131,7 +131,7 @@ impl Assembler {
         }
     }
 
-    /// The row of the anchor that `window` begins with, and the i of the state s_{t+i} that it bootstraps from, if it does.
+    /// Computes the row of the anchor of `window`. Also returns the i of the state s_{t+i} to bootstrap from, if any.
     pub(crate) fn row(
         &mut self,
         affinity: &Affinity,
@@ -145,7 +145,7 @@ impl Assembler {
             NO_ACTION
         };
         let (n_step_return, follows) = n_step_return(&self.discounts, self.timeout, window.steps());
-        // A state that counts for nothing does not travel.
+        // A bootstrap state with discount 0 is not sent.
         let bootstrap = follows.filter(|&i| self.discounts[i] as f32 != 0.0);
         self.actions.clear();
         let same_level = window.steps().take_while(|step| step.end == End::Running);
@@ -172,22 +172,22 @@ impl Assembler {
     }
 }
 
-/// Largest error of a return that is sent, as a share of it (of 1.2e-38, the least normal number, if that is larger): an f32's last
-/// place.
+/// Maximum relative error of a return in a batch, from the rounding to f32. For returns below 1.2e-38, the smallest normal f32, it is
+/// relative to 1.2e-38.
 pub const RETURN_ERROR: f64 = 6.1e-8;
 
-/// Largest error of the sum of `n` terms beside that, as a share of the sum of their sizes, as they may cancel: the rounding in f64 of
-/// each power of gamma, product and sum.
+/// Returns the maximum error of a return of `n` terms before that rounding, relative to the sum of their absolute values, as terms may
+/// cancel. The causes are the f64 roundings of each power of gamma, product and sum.
 pub fn return_sum_error(n: usize) -> f64 {
     (2 * n + 2) as f64 * f64::EPSILON / 2.0
 }
 
-/// Sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, unless the episode ended before.
-/// `discounts` are gamma^0 to gamma^n. The sum is f64, so that rewards of very different sizes cancel as they should: it is right to
+/// Returns the sum of gamma^i r_{t+i} over i < n, and the i of the state to bootstrap from: n, or none if the episode ended before.
+/// `discounts` are gamma^0 to gamma^n. The sum is f64, so that rewards of very different sizes cancel correctly. Its error is
 /// [`return_sum_error`].
 ///
-/// After a terminal step nothing follows. A time-out counts as one (`TimeoutRule::Terminal`), or cuts the return short
-/// of the step that timed out and bootstraps from its state (`TimeoutRule::Bootstrap`).
+/// A time-out counts as a terminal step (`TimeoutRule::Terminal`), or it ends the return before the step that timed out and bootstraps
+/// from that step's state (`TimeoutRule::Bootstrap`).
 fn n_step_return<'a>(
     discounts: &[f64],
     timeout: TimeoutRule,
@@ -207,8 +207,8 @@ fn n_step_return<'a>(
     (sum, Some(n))
 }
 
-/// A return as it travels. One beyond the finite f32, as rewards at their limit may round to, is the largest there is: the
-/// projection takes both for the end of the support, and a learner refuses what is not finite. Right to [`RETURN_ERROR`].
+/// Rounds a return to f32, with the error [`RETURN_ERROR`], and clamps it to the finite range, which rewards at their limit may exceed by
+/// rounding. A learner rejects returns that are not finite; the projection maps both values to the end of the support.
 fn return_f32(sum: f64) -> f32 {
     sum.clamp(f32::MIN.into(), f32::MAX.into()) as f32
 }
@@ -217,7 +217,7 @@ fn return_f32(sum: f64) -> f32 {
 mod tests {
     use super::*;
 
-    /// Rewards at the limit that the replay server sets, whose sum rounds to more than a float can be for some n.
+    /// For some n, the sum of the largest rewards that the replay server accepts rounds to more than the largest f32.
     #[test]
     fn a_return_is_a_number_whatever_the_rewards() {
         for n in 1..=1000u16 {

@@ -1,4 +1,4 @@
-//! From the transitions held to a batch: anchors, the episode around each, the row made of it, and k.
+//! Makes batches from the transitions held: draws anchors, walks the episode around each, and computes the row and its k.
 //! Nothing here changes what is stored or decides whether a batch may be served.
 
 pub(crate) mod batch;

@@ -1,5 +1,5 @@
-//! Requests for batches as they arrive: parked until the limiter allows them, then served, several at a time.
-//! Which rows a batch has is the core's choice.
+//! Requests for batches: parked on arrival until the limiter allows them, then served, several in parallel.
+//! The core chooses the rows of a batch.
 
 use std::time::Instant;
 
@@ -13,7 +13,7 @@ use super::{
 };
 use crate::sampling::batch::PackedBatch;
 
-/// A request that waits, and who for.
+/// A parked request with its responder.
 type Parked = ParkedRequest<Responder<BatchReply>>;
 
 impl Service {
@@ -43,7 +43,7 @@ impl Service {
         self.changed.notify_all();
     }
 
-    /// Takes what the learner says of itself and of the other shards; an error says why it gets no batch.
+    /// Takes the learner's progress and the counts of the other shards from a request. An error says why the request is rejected.
     fn note_learner(&self, state: &mut State, request: &BatchRequest) -> Result<(), String> {
         state.check_learner(request.learner)?;
         let (rows, most) = (request.rows, self.limits.batch_rows);
@@ -66,7 +66,7 @@ impl Service {
         }
     }
 
-    /// Serves parked requests as the limiter allows them. The thread's whole work until the end of the process.
+    /// Serves parked requests as the limiter allows them, until the shutdown. Each thread of this kind does nothing else.
     pub(super) fn serve_parked(&self) {
         while !self.shutdown.is_set() {
             fail_point::reach("sample");
@@ -94,7 +94,7 @@ impl Service {
 }
 
 impl State {
-    /// The first parked request that can be answered now, with its answer in memory of `pool`.
+    /// Removes the first parked request that can be answered now, and returns it with its answer, in memory of `pool`.
     fn next_answer(
         &mut self,
         now: Instant,

@@ -1,5 +1,5 @@
-//! Chunks as they arrive: stored at once, or parked until the limiter opens, and answered either way.
-//! What is stored is the core's decision; the order of those that wait is the order in which they came.
+//! Chunks on arrival: stored at once, or parked until the limiter allows them, and answered either way.
+//! The core decides what is stored. Parked chunks are stored in the order of arrival.
 
 use std::{borrow::Cow, time::Instant};
 
@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{replay::VERSION_AHEAD_MAX, storage::pack::PackedChunk};
 
-/// Answers that are to be sent once the lock is free.
+/// Replies to send once the lock is released.
 type Answers = Vec<(Question, InsertReply)>;
 
 impl Service {
@@ -59,8 +59,8 @@ impl Service {
         self.answer_all(answers);
     }
 
-    /// Stores parked chunks as the limiter lets them in, and tells those that wait for long that they still do. The thread's
-    /// whole work until the end of the process.
+    /// Stores parked chunks as the limiter allows, and replies `Wait` to queries that have been held for long, until the shutdown. Its
+    /// thread does nothing else.
     pub(super) fn admit_parked(&self) {
         while !self.shutdown.is_set() {
             fail_point::reach("admit");
@@ -97,7 +97,7 @@ impl State {
         self.participants.seen(actor, Some(version), arrived);
         let reply = match self.replay.settle(&packed) {
             Some(reply) => reply,
-            // Those that came before go first.
+            // Parked chunks, which came before, go first.
             None if !self.chunks.line.is_empty() && !header.leaving => self.replay.wait(false),
             None => {
                 let reply = self.replay.admit(&packed);
@@ -128,7 +128,7 @@ impl State {
         answers
     }
 
-    /// Says what became of a chunk, or notes who asks about a parked one; that of an actor that leaves is stored.
+    /// Replies what became of a chunk, or keeps the query with the parked chunk. If the actor is leaving, stores its parked chunk.
     fn take_poll(&mut self, poll: &ChunkPoll, question: Question) -> Answers {
         if let Some(reply) = self.replay.poll(poll) {
             if let InsertReply::Refused { why } = &reply {
@@ -139,7 +139,7 @@ impl State {
         let Some(parked) = self.chunks.polled(poll) else {
             return vec![(question, self.replay.wait(false))];
         };
-        // An older question about it was given up.
+        // The actor has given up an older query about this chunk.
         (parked.asked, parked.question) = (question.arrived, Some(question));
         if !poll.leaving {
             return Answers::new();
@@ -153,11 +153,11 @@ impl State {
         answer.into_iter().collect()
     }
 
-    /// Deals with the parked chunks from the first on, up to one that still has to wait.
+    /// Stores or rejects the parked chunks in order, up to the first that still has to wait.
     fn admit(&mut self, now: Instant) -> Answers {
         let mut answers = Answers::new();
         while let Some(parked) = self.chunks.line.front() {
-            // Its actor may have started anew meanwhile, or the run may have ended.
+            // The actor may have restarted meanwhile, or the run may have ended.
             let reply = self.replay.insert_packed(&parked.chunk);
             if matches!(reply, InsertReply::Wait { .. }) {
                 break;
@@ -171,7 +171,7 @@ impl State {
         answers
     }
 
-    /// The answer about a chunk that is parked no more.
+    /// Returns the reply about a chunk that has left the line, and records its times if it was stored.
     fn leave_line(
         &mut self,
         parked: ParkedChunk<Question>,

@@ -1,5 +1,5 @@
-//! Processes that join: what they learn about the run, and whether they are admitted.
-//! `participants` knows which are connected.
+//! Processes that join: the information that they receive about the run, and whether they are admitted.
+//! `participants` tracks which processes are connected.
 
 use std::time::Instant;
 
@@ -22,7 +22,7 @@ impl Service {
             ProcessName::Actor(actor) => state.replay.actor_incarnation(actor),
             ProcessName::Learner => state.replay.learner(),
         };
-        // A process that joined this server's predecessor, whose replay it has, does not join again.
+        // A process that joined before the server restarted with its replay does not join again.
         if joined.is_some_and(|number| Alive::of(who.process, number) == who) {
             state.participants.joined(who, now);
         }
@@ -52,7 +52,7 @@ impl Service {
         self.join(incoming, State::join_learner);
     }
 
-    /// Answers a process that joins: how many incarnations it had before, or why it is rejected. No answer while the disk cannot
+    /// Answers a process that joins: its number of earlier incarnations, or why it is rejected. No reply while the disk cannot
     /// record it.
     fn join<J: Request<Reply = JoinReply>>(
         &self,
@@ -90,7 +90,7 @@ impl State {
         self.replay.counted().actors = self.participants.actors_connected();
     }
 
-    /// Checks that `learner` is the one that is served; if not, the error says to a person what happened.
+    /// Checks that `learner` is the learner that is served. If not, the error says what happened, for a person.
     pub(super) fn check_learner(&self, learner: u64) -> Result<(), String> {
         match self.replay.learner() {
             Some(served) if served == learner => Ok(()),
@@ -113,14 +113,14 @@ impl State {
             );
             return Err(JoinReply::Taken { why });
         }
-        // Else a process that joins under one number after the other would use them up.
+        // Otherwise a process that joins under one number after another would use up all numbers.
         let absent = self.replay.forget_absent(is_connected);
         participants.forget(&absent);
         let earlier_incarnations = self.replay.join_actor(join).map_err(refused)?;
         participants.joined(Alive::actor(actor, incarnation), Instant::now());
         self.count_actors();
         if other.is_some() {
-            // A chunk that was left behind.
+            // Drops a parked chunk of the earlier incarnation.
             self.chunks.take(actor);
         }
         Ok(earlier_incarnations)

@@ -1,4 +1,4 @@
-//! Limits that follow from a run's settings: the longest message of each kind, as longer ones are foreign, and shared memory.
+//! Limits that follow from a run's settings: the maximum bytes of each kind of message (longer ones are foreign) and of shared memory.
 
 use anyhow::Context;
 use driml_protocol::{
@@ -10,26 +10,26 @@ use driml_protocol::{
 
 use crate::config::Config;
 
-/// What stands before a payload, the prefix and the header: all of a message that has none.
+/// Maximum bytes of a message without its payload: prefix and header.
 pub(super) const HEAD_BYTES_MAX: usize = 1 << 12;
 
-/// Lives of actors that may send through shared memory. A reader keeps what it has mapped until it exits, also after the
-/// writer has exited (zenoh issue 2571): about 3 MiB and two descriptors a life. Later ones send through sockets.
+/// Maximum actor incarnations that may send through shared memory; later ones use sockets. A reader keeps its mappings until it exits,
+/// even if the writer has exited (zenoh issue 2571): about 3 MiB and two descriptors per incarnation.
 pub(super) const SHARED_LIVES_MAX: u32 = 128;
 
-/// Sessions of others at each replay server, which make no messages in shared memory: learner, launcher, and some that look.
+/// Other sessions at each replay server, which send nothing through shared memory: learner, launcher, and some status clients.
 const OTHER_SESSIONS: usize = 4;
 
 const PRIORITY_BYTES_MAX: usize = 9 + 4;
 
-/// Bytes of the longest message of each kind.
+/// Maximum bytes of each kind of message.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
     pub(super) chunk: usize,
     pub(super) weights: usize,
-    /// An affinity matrix, which is its header.
+    /// An affinity matrix, which is part of the header.
     pub(super) affinity: usize,
-    /// Priorities of a batch's rows, which are their header.
+    /// Priorities of a batch's rows, which are part of the header.
     pub(super) priorities: usize,
     pub(super) batch_rows: u32,
 }
@@ -41,7 +41,7 @@ impl Limits {
         weights_bytes: usize,
     ) -> anyhow::Result<Self> {
         let actor = |key| number(settings, "actor", key);
-        // Not there: it bounds nothing.
+        // A missing setting sets no limit.
         let round = actor("round_transitions_max").ok().map(u64::from);
         let transitions = transitions_max(actor("envs")?, actor("steps_per_chunk")?, round);
         let transition_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64;
@@ -50,7 +50,7 @@ impl Limits {
         let batch_rows = number(settings, "learner", "batch_size")?;
         Ok(Self {
             chunk: chunk.saturating_add(HEAD_BYTES_MAX),
-            // Room for a learner that writes the same numbers at greater length.
+            // Twice as many, for a learner that encodes the same numbers at greater length.
             weights: weights_bytes
                 .saturating_mul(2)
                 .saturating_add(HEAD_BYTES_MAX),
@@ -66,7 +66,7 @@ impl Limits {
     }
 }
 
-/// One whole number of another process's settings.
+/// Reads an integer from the settings of another process.
 pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
     let values: toml::Table = settings.table(table)?;
     let value = values.get(key).and_then(toml::Value::as_integer);
@@ -74,8 +74,7 @@ pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> any
     u32::try_from(value).with_context(|| format!("{table}.{key} = {value} cannot work"))
 }
 
-/// Bytes of shared memory that so many replay servers of a run take on one host, with all of its actors, as far as the settings know
-/// of them.
+/// Returns the bytes of shared memory that `servers` replay servers of a run use on one host, with all actors that the settings name.
 pub fn shared_memory_bytes(settings: &Settings, servers: u32) -> anyhow::Result<usize> {
     let spec: RunSpec = settings.table("run")?;
     let config: Config = settings.table("replay")?;
@@ -89,7 +88,7 @@ pub fn shared_memory_bytes(settings: &Settings, servers: u32) -> anyhow::Result<
     Ok(servers.saturating_add(sharing.saturating_mul(actor)))
 }
 
-/// Bytes of each actor's pool where there are so many, as actors reckon how long their chunks are.
+/// Returns the bytes of each actor's pool if `actors` actors run. Computes the length of chunks as actors do.
 fn chunk_pool_bytes(settings: &Settings, spec: &RunSpec, actors: usize) -> anyhow::Result<usize> {
     let actor = |key| anyhow::Ok(number(settings, "actor", key)? as usize);
     let a_step = actor("envs")?;

@@ -1,8 +1,8 @@
-//! The replay server as a process: zenoh around the core, who takes part, and the last word to everyone.
-//! What is stored, sampled and allowed is the core's; here is only who asks and when the answer goes out.
+//! The replay server as a process: messages over zenoh around the core, the connected processes, and the shutdown.
+//! The core decides what is stored, sampled and allowed. This module receives queries and decides when replies are sent.
 //!
-//! No thread that answers waits for the limiter: a chunk or a request that is too early is parked, and a thread that does
-//! nothing else deals with it when the limiter opens. Compressing and unpacking frames is done outside the lock on the core.
+//! No thread that receives queries waits for the limiter: a chunk or request that comes too early is parked, and a separate thread serves
+//! it when the limiter allows. Frames are compressed and unpacked without a lock on the core.
 //!
 //! A chunk goes from `chunks` through `storage::pack` to `replay::actors`, which stores it, or waits in `parked`. A request waits in
 //! `parked` until `batches` serves it: `replay::learner` decides that a batch may be drawn, and `sampling::batch` makes it.

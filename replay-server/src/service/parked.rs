@@ -1,5 +1,5 @@
-//! What has to wait until the rate limiter opens: one chunk an actor and one request a client, each with its question.
-//! It neither stores, draws nor answers; `Q` is the question to be answered.
+//! Chunks and requests that wait for the rate limiter: one chunk per actor and one request per client, each with its query.
+//! It does not store, draw or answer. `Q` is the query to answer.
 
 use std::{
     collections::VecDeque,
@@ -10,19 +10,19 @@ use driml_protocol::{BatchRequest, ChunkHeader, ChunkPoll};
 
 use crate::storage::pack::PackedChunk;
 
-/// Bytes of the chunks kept; an actor that sends one more is told to send it again later.
+/// Maximum bytes of parked chunks. Beyond it an actor must send its chunk again later.
 const CHUNK_BYTES_MAX: usize = 1 << 28;
-/// Requests kept; the one that has waited longest gives way to one more, and its client retries.
+/// Maximum parked requests. One more replaces the oldest, whose client retries.
 const REQUESTS_MAX: usize = 1024;
 
-/// How long a request waits before it is told to come back: far below every learner's time-out.
+/// How long a request is parked before the reply `Wait`: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
-/// The same for a part of a batch: this shard does not learn meanwhile what another one counts.
+/// The same for a part of a batch: shorter, as this shard learns the counts of the others only from the next request.
 const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 
 pub(super) struct ParkedChunk<Q> {
     pub(super) chunk: PackedChunk<'static>,
-    /// Where the answer goes; none between a `Wait` and the actor's poll.
+    /// The query to answer; `None` between a `Wait` and the actor's next poll.
     pub(super) question: Option<Q>,
     pub(super) arrived: Instant,
     pub(super) asked: Instant,
@@ -34,7 +34,7 @@ impl<Q> ParkedChunk<Q> {
     }
 }
 
-/// The chunks that wait, at most one an actor: the newest copy. They stand in the order in which their actors' first copies came.
+/// The parked chunks, at most one per actor: its newest copy. They are in the order in which their actors' first copies arrived.
 pub(super) struct ParkedChunks<Q> {
     pub(super) line: VecDeque<ParkedChunk<Q>>,
 }
@@ -53,13 +53,13 @@ impl<Q> ParkedChunks<Q> {
         self.line.iter().position(|it| it.header().actor == actor)
     }
 
-    /// When the chunk of an actor came that waits.
+    /// Returns when the parked chunk of an actor arrived.
     pub(super) fn arrived(&self, actor: u32) -> Option<Instant> {
         self.place(actor).map(|at| self.line[at].arrived)
     }
 
-    /// Keeps a chunk in the place of an older one of its actor, or at the end of the line; gives the question back if there is
-    /// no room for it.
+    /// Parks a chunk in the place of an older one of its actor, or at the end of the line. Returns the question as an error if the
+    /// chunk has no room.
     pub(super) fn park(
         &mut self,
         chunk: PackedChunk<'static>,
@@ -68,7 +68,7 @@ impl<Q> ParkedChunks<Q> {
     ) -> Result<(), Q> {
         let place = self.place(chunk.chunk.header.actor);
         let others = self.bytes() - place.map_or(0, |at| self.line[at].chunk.bytes());
-        // One chunk of any size is kept, or an actor with large ones would retry forever.
+        // A single chunk of any size is kept, as an actor with large chunks would otherwise retry forever.
         if others > 0 && others + chunk.bytes() > CHUNK_BYTES_MAX {
             return Err(question);
         }
@@ -95,7 +95,7 @@ impl<Q> ParkedChunks<Q> {
         self.line.remove(self.place(actor)?)
     }
 
-    /// Takes the older copy of a chunk that has been stored out of the line; a later chunk of its actor stays.
+    /// Removes the older copy of a chunk that has been stored. A later chunk of its actor stays.
     pub(super) fn take_copy(&mut self, stored: &ChunkHeader) -> Option<ParkedChunk<Q>> {
         let parked = self.line[self.place(stored.actor)?].header();
         let is_copy =
@@ -103,14 +103,14 @@ impl<Q> ParkedChunks<Q> {
         is_copy.then(|| self.take(stored.actor)).flatten()
     }
 
-    /// Takes the questions that have been held for `hold_max`; the chunks stay.
+    /// Removes the questions that have been held for `hold_max`. Their chunks stay.
     pub(super) fn overdue(&mut self, now: Instant, hold_max: Duration) -> Vec<Q> {
         let held = |it: &ParkedChunk<Q>| now.saturating_duration_since(it.asked);
         let late = self.line.iter_mut().filter(|it| held(it) >= hold_max);
         late.filter_map(|it| it.question.take()).collect()
     }
 
-    /// How long until a question has been held for `hold_max`; none where none is.
+    /// Returns the time until the next question has been held for `hold_max`; `None` if no question is held.
     pub(super) fn due_in(&self, now: Instant, hold_max: Duration) -> Option<Duration> {
         let held = self.line.iter().filter(|it| it.question.is_some());
         let left = held.map(|it| hold_max.saturating_sub(now.saturating_duration_since(it.asked)));
@@ -125,7 +125,7 @@ pub(super) struct ParkedRequest<Q> {
 }
 
 impl<Q> ParkedRequest<Q> {
-    /// How long it may wait from now on.
+    /// Returns how much longer the request may stay parked.
     pub(super) fn left(&self, now: Instant) -> Duration {
         let is_part = self.request.other_shards.is_some();
         let hold_max = if is_part { SHARD_HOLD_MAX } else { HOLD_MAX };
@@ -133,7 +133,7 @@ impl<Q> ParkedRequest<Q> {
     }
 }
 
-/// Keeps a request in the place of an older one of its client, which was given up; the oldest is first.
+/// Appends a request, and removes an older one of its client, which the client has given up. The oldest request is first.
 pub(super) fn park_request<Q>(line: &mut VecDeque<ParkedRequest<Q>>, parked: ParkedRequest<Q>) {
     let client_id = parked.request.id.client_id;
     line.retain(|it| it.request.id.client_id != client_id);
@@ -194,7 +194,7 @@ mod tests {
             assert!(parked.polled(&other).is_none(), "{other:?}");
         }
         assert!(parked.polled(&poll(1, 0)).is_some());
-        // Of another actor, of an earlier one, and it.
+        // A chunk of another actor, an earlier chunk, and the parked chunk itself.
         for (actor, sequence, copy) in [(3, 0, None), (4, 6, None), (4, 7, Some("d"))] {
             let taken = parked.take_copy(&chunk(actor, sequence, 1).chunk.header);
             assert_eq!(taken.and_then(|it| it.question), copy);

@@ -1,5 +1,5 @@
 //! The state of each process beyond its counts: whether it is connected, since when, when it was last seen, what it reports.
-//! It decides nothing. The replay knows which processes have joined, and all counts.
+//! It decides nothing. The replay holds all counts and knows which processes have joined.
 
 use std::{
     collections::{BTreeMap, HashSet},
@@ -11,23 +11,23 @@ use driml_protocol::{Alive, ProcessName, ProcessStatus, Report, WARNINGS_MAX, Wa
 
 use crate::ledger::actors::ACTORS_MAX;
 
-/// Most processes that count as connected at a time, far more than a run has; further ones count as absent.
+/// Maximum processes that count as connected at a time, far more than a run has. Further ones count as absent.
 const CONNECTED_MAX: usize = 4 * ACTORS_MAX;
 
 /// All processes that have joined, and the connections.
 pub(super) struct Participants {
     started: Instant,
     waiting: (Waiting, Instant),
-    /// Those that have not joined too.
+    /// All connected incarnations, including those that have not joined.
     connected: HashSet<Alive>,
     processes: BTreeMap<ProcessName, Account>,
 }
 
-/// One participant, over all its lives.
+/// A participant, over all its incarnations.
 struct Account {
     alive: Alive,
     lives: u32,
-    /// When it was connected, or went.
+    /// When the process last joined, connected or disconnected.
     changed: Instant,
     last_seen: Option<Instant>,
     weights_version: Option<u64>,
@@ -60,14 +60,14 @@ impl Participants {
         self.processes.insert(who.process, account);
     }
 
-    /// Forgets actors that do not take part any more.
+    /// Forgets actors that no longer take part.
     pub(super) fn forget(&mut self, actors: &[u32]) {
         for &actor in actors {
             self.processes.remove(&ProcessName::Actor(actor));
         }
     }
 
-    /// The participant of this life, if it takes part.
+    /// Returns the account of this incarnation, if it has joined and was not replaced.
     fn of(&mut self, who: Alive) -> Option<&mut Account> {
         let account = self.processes.get_mut(&who.process)?;
         (account.alive == who).then_some(account)
@@ -84,7 +84,7 @@ impl Participants {
         self.all(false).map(|account| account.lives).sum()
     }
 
-    /// Whether this incarnation of a process is connected, also if it has not joined.
+    /// Whether this incarnation of a process is connected, even if it has not joined.
     pub(super) fn is_connected(&self, who: Alive) -> bool {
         self.connected.contains(&who)
     }
@@ -109,7 +109,7 @@ impl Participants {
         processes.filter(|it| self.is_connected(it.alive)).count()
     }
 
-    /// A chunk came from an actor, in which weights of this version acted; or a request from the learner.
+    /// Notes that a chunk came from an actor, in which weights of this version acted, or a request from the learner.
     pub(super) fn seen(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
         if let Some(account) = self.of(who) {
             account.last_seen = Some(now);
@@ -117,12 +117,12 @@ impl Participants {
         }
     }
 
-    /// A process reports what it does; `false` if it has not joined.
+    /// Stores the report of a process; `false` if the process has not joined.
     pub(super) fn reported(&mut self, mut report: Report, now: Instant) -> bool {
         let Some(account) = self.of(report.who.alive()) else {
             return false;
         };
-        // One that was under way meanwhile does not undo it.
+        // A late report from before the end of the run does not undo `finished`.
         let said = account.report.as_ref().and_then(|(it, _)| it.finished);
         report.finished = report.finished.or(said);
         account.report = Some((report, now));
@@ -136,23 +136,23 @@ impl Participants {
         self.waiting.0 = waiting;
     }
 
-    /// Who waits at the limiter, and for how many seconds.
+    /// Returns which side waits at the limiter, and for how many seconds.
     pub(super) fn waiting(&self, now: Instant) -> (Waiting, f64) {
         (self.waiting.0, seconds(now, self.waiting.1))
     }
 
-    /// Seconds since the server started.
+    /// Returns the seconds since the server started.
     pub(super) fn up_s(&self, now: Instant) -> f64 {
         seconds(now, self.started)
     }
 
-    /// Whether the learner said that it has learned from every batch, and has saved.
+    /// Whether the learner has reported that it has learned from every batch and saved a checkpoint.
     pub(super) fn is_over(&self) -> bool {
         let mut reports = self.all(true).filter_map(|it| it.report.as_ref());
         reports.any(|(report, _)| report.finished.is_some())
     }
 
-    /// Which process the run cannot continue without and does not have, for a person; `finished` says whether all transitions are in.
+    /// Returns the missing process that the run needs, as a text for a person; `finished` tells whether all transitions are stored.
     pub(super) fn missing(&self, finished: bool) -> Option<&'static str> {
         let lacks = |learner, gone, not_yet| {
             let mut processes = self.all(learner).peekable();
@@ -165,8 +165,8 @@ impl Participants {
         learner.or(actors.filter(|_| !finished))
     }
 
-    /// All processes; `held_since` says since when a process's chunk or request has been waiting. Of many processes only the newest
-    /// warnings are passed on.
+    /// Returns the status of all processes. `held_since` gives the time since which a process's chunk or request waits. Only the newest
+    /// `WARNINGS_MAX` warnings are included.
     pub(super) fn processes(
         &self,
         now: Instant,
@@ -309,7 +309,7 @@ mod tests {
             let incarnation = 1;
             let who = Participant::Actor { actor, incarnation };
             participants.joined(who.alive(), now);
-            // The higher the number the newer, and many of one age.
+            // Warnings of actors with higher numbers are newer, and many have the same age.
             let age = f64::from((200 - actor) / 50);
             let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));
             assert!(participants.reported(report, now));

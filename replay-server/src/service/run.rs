@@ -1,5 +1,5 @@
-//! Starts the replay server and ends it: settings, session, everything that it answers, and the threads that do.
-//! What an answer is, is in the files named for the messages.
+//! Starts and stops the replay server: its settings, session, queries and threads.
+//! The files named after the messages handle them.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -34,47 +34,47 @@ use crate::{
     replay::Replay,
 };
 
-/// Threads that make batches: one assembles while another's reply is being sent.
+/// Threads that serve batches: one assembles a batch while the other sends its reply.
 const BATCH_THREADS: usize = 2;
-/// Threads that send weights: an actor that stands still holds one of them until its link is given up.
+/// Threads that send weights. An actor that stops reading blocks one of them until its connection is closed.
 const WEIGHTS_THREADS: usize = 4;
 
-/// Most that a question about a chunk is held.
+/// Maximum time that a query about a chunk is held before its reply.
 const HOLD_MAX: Duration = Duration::from_secs(2);
 
-/// Pieces of memory kept for later chunks and batches.
+/// Buffers kept for reuse by later chunks and batches.
 const SPARE_MAX: usize = 8;
 
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
-/// What a replay server is told at its start.
+/// The arguments of a replay server process.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
     /// Endpoints to listen on.
     pub listen: Vec<String>,
     /// Routers to connect to, if any.
     pub connect: Vec<String>,
-    /// With which certificate it takes part; none without TLS.
+    /// The TLS certificate and key of the process; `None` without TLS.
     pub credentials: Option<Arc<Credentials>>,
     /// Prefix of the run's keys.
     pub namespace: String,
-    /// Which of the replay's shards this is, from 0.
+    /// The number of this shard of the replay, from 0.
     pub shard: u32,
-    /// Bytes of a version of the weights, of which the replay server itself knows nothing; longer uploads are refused.
+    /// Bytes of one version of the weights, which the replay server cannot compute. Uploads of more than about twice as many are rejected.
     pub weights_bytes_max: usize,
-    /// The folder in which the replay is kept, if it is kept on disk. Each of several shards has its own folder in it.
+    /// The folder of a replay that is kept on disk. Each of several shards has a subfolder in it.
     pub dir: Option<PathBuf>,
-    /// Stay when the run is over, to be asked, until `ending` or `shutdown`.
+    /// Whether to keep answering after the run is over, until `ending` or `shutdown`.
     pub keep_alive: bool,
-    /// Raised when this process is to exit once the other processes have delivered what they have and left: its launcher has died,
-    /// which ends them too. It waits for them no longer than 10 s. To end it at once, raise this and `shutdown`.
+    /// Raised when the launcher has died, which also stops the other processes. This process then waits up to 10 s until they have
+    /// delivered their data and left, and exits. To stop at once, raise this and `shutdown`.
     pub ending: Shutdown,
     /// The run's resolved settings, which it sends to each process that joins.
     pub config_toml: String,
 }
 
-/// Runs the replay server until its run is over, `args.ending` or `shutdown`.
-pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
+/// Runs the replay server until its run is over, `args.ending` or `shutdown`, and returns whether the run is over.
+pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let settings = Settings::parse(&args.config_toml)?;
     let spec: RunSpec = settings.table("run")?;
     spec.validate()?;
@@ -94,7 +94,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let kept = kept.transpose()?;
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
-    // Of the whole run: where it does not fit, all go through sockets.
+    // Computed for the whole run: if shared memory is too small, all messages go through sockets.
     let needed = shared_memory_bytes(&settings, 1)?;
     let is_granted =
         transport.shared_memory && shared_memory::is_granted(shared_memory::check_room(needed));
@@ -141,18 +141,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let (mut replay, weights) = match read {
         Ok(read) => read,
         Err(e) => {
-            // So that those who wait for the replay notice at once that the server is gone.
+            // Closes the session, so that clients that wait for the replay notice at once that the server is gone.
             let closed = close(&client, queryables, threads);
             return match e {
                 PersistError::Stopped => {
                     tracing::info!("replay server stops: {e}");
-                    closed
+                    closed.map(|()| false)
                 }
                 e => Err(e.into()),
             };
         }
     };
-    // Of this process alone, so that priorities of rows that an earlier one drew do not count for other rows.
+    // Unique to this process, so that priorities of rows that an earlier process drew are not set on other rows.
     replay.origin.incarnation = rand::random();
     let service = Arc::new(Service {
         limits,
@@ -182,7 +182,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     threads.extend(service.clone().start_working()?);
     threads.push(members);
     service.wait_until_over(&args.ending, args.keep_alive);
-    // Its threads wait for that.
+    // The threads of the service wait for this flag.
     shutdown.set();
     service.changed.notify_all();
     tracing::info!(
@@ -203,10 +203,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             counts.repeated
         );
     }
-    closed
+    closed.map(|()| state.participants.is_over())
 }
 
-/// Ends the answers: without the queryables no more comes, without the session none is sent to a slow client, and the threads end.
+/// Stops answering: without the queryables no query comes, without the session no reply to a slow client is sent, and the threads end.
 fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow::Result<()> {
     drop(queryables);
     let closed = client.session().close().wait();
@@ -214,7 +214,7 @@ fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// Reads what is kept into `empty`, with the newest weights that were handed over to that replay, and logs what was found.
+/// Reads the kept replay into `empty`, and the newest weights kept with it. Logs what was found.
 fn read(
     kept: KeptReplay,
     empty: Replay,
@@ -252,7 +252,7 @@ fn read(
 type Queryables = Vec<Queryable<()>>;
 type Threads = Vec<JoinHandle<()>>;
 
-/// Everything that the replay server answers: each kind of message by separate threads.
+/// The queries that the replay server answers. Each kind of message has separate threads.
 struct Queries<'a> {
     client: &'a RunClient,
     admission: &'a Arc<Admission>,
@@ -261,8 +261,8 @@ struct Queries<'a> {
 }
 
 impl<'a> Queries<'a> {
-    /// Declares all of it, where rows are drawn by `sampling`. Until the admission is open every query is answered with "retry". Dropping
-    /// the queryables ends the answers, and with them the threads.
+    /// Declares all queries; `sampling` decides whether priorities are among them. Before `admission` has its service, every query is
+    /// answered with "retry". Dropping the queryables ends the threads.
     fn declare(
         client: &'a RunClient,
         admission: &'a Arc<Admission>,
@@ -296,7 +296,7 @@ impl<'a> Queries<'a> {
         Ok((this.queryables, this.threads))
     }
 
-    /// Answers requests `R` of at most `bytes_max` bytes with `answer`, on so many threads of this name.
+    /// Answers requests `R` of at most `bytes_max` bytes with `answer`, on `threads` threads named `name`.
     fn answer<R: Request + 'static>(
         &mut self,
         name: &'static str,
@@ -322,8 +322,8 @@ impl<'a> Queries<'a> {
     }
 }
 
-/// Keeps track of who is connected, on a thread that ends when the subscriber is dropped: the one that reads the socket must not wait for
-/// the replay.
+/// Tracks the connected processes on a separate thread, as the thread that reads the socket must not wait for the replay. The thread ends
+/// when the subscriber is dropped.
 fn watch_members(
     client: &RunClient,
     service: &Arc<Service>,
@@ -346,7 +346,7 @@ fn watch_members(
         .history(true)
         .callback(move |sample| {
             if let Some(who) = keys.alive(sample.key_expr().as_str()) {
-                // It ends after this.
+                // The receiving thread ends only after this callback is dropped.
                 let _ = noted.send((who, sample.kind()));
             }
         })

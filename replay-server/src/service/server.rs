@@ -1,5 +1,5 @@
-//! What the threads of the replay server share, and how they read a message, reply to it and wait for a change.
-//! What each message does is in the file named for it.
+//! The state that the threads of the replay server share, and how they read a message, reply to it and wait for a change.
+//! The file named after a message handles it.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -29,33 +29,33 @@ pub(super) struct Service {
     pub(super) shard: (u32, u32),
     pub(super) config_toml: String,
     pub(super) shared_memory: bool,
-    /// How long a question about a chunk is held before it is answered `Wait`: far below the actors' time-out, so that an actor
-    /// can tell a server that makes it wait from an unresponsive one.
+    /// How long a query about a chunk is held before the reply `Wait`: far below the actors' time-out, so that an actor can tell a server
+    /// that makes it wait from an unresponsive one.
     pub(super) hold_max: Duration,
     /// Memory for chunks that arrive and batches that leave.
     pub(super) pool: BufferPool,
     pub(super) packer: Packer,
     pub(super) state: Mutex<State>,
-    /// Something was stored, sampled or parked: what waits for the limiter is looked at again.
+    /// Signalled when something was stored, sampled or parked: threads then check the parked chunks and requests again.
     pub(super) changed: Condvar,
     pub(super) weights: Mutex<WeightsStore>,
     pub(super) announcements: Announcer<WeightsVersion>,
     pub(super) shutdown: Shutdown,
 }
 
-/// What changes, under one lock.
+/// The mutable state, under one lock.
 pub(super) struct State {
     pub(super) replay: Replay,
     pub(super) participants: Participants,
     pub(super) chunks: ParkedChunks<Question>,
-    /// At most one a client: the newest attempt.
+    /// The parked requests, at most one per client: the newest attempt.
     pub(super) requests: VecDeque<ParkedRequest<Responder<BatchReply>>>,
     pub(super) timings: Timings,
-    /// By their kind, lines about what was refused, which a stranger could make come at any rate.
+    /// Rate limiters for log lines about rejected messages, by kind. Without them a foreign process could fill the log.
     pub(super) said: HashMap<&'static str, LogLimiter>,
 }
 
-/// Who asks about a chunk, and since when.
+/// A query about a chunk that was not answered yet.
 pub(super) struct Question {
     pub(super) responder: Responder<InsertReply>,
     pub(super) arrived: Instant,
@@ -72,7 +72,7 @@ impl Service {
         self.state().refuse(what, &line);
     }
 
-    /// Counts and logs a message that is longer than any of its kind.
+    /// Counts and logs a message that is longer than any valid message of its kind.
     pub(super) fn refuse_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
         let line = format!(
             "a message of {bytes} bytes to {kind:?} was refused: it has more than a message of this kind can have in this run, {bytes_max}"
@@ -80,7 +80,7 @@ impl Service {
         self.state().refuse(kind, &line);
     }
 
-    /// Reads a request without payload, or counts it as refused.
+    /// Reads a request without payload. If that fails, counts and logs the message as rejected.
     pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
         let refuse = |e: &CodecError| {
             let line = format!("a message of kind {} was refused: {e}", R::NAME);
@@ -89,7 +89,7 @@ impl Service {
         incoming.read().inspect_err(refuse).ok()
     }
 
-    /// Answers a request without payload with what `answer` makes of it, once the lock is free again: nothing if it makes nothing.
+    /// Answers a request without payload with the reply that `answer` returns, after unlocking the state. `None` sends no reply.
     pub(super) fn answer<R: Request>(
         &self,
         incoming: Incoming<R>,
@@ -104,7 +104,7 @@ impl Service {
         }
     }
 
-    /// Waits until something has changed, or for `due_in`, after which something that is parked is due.
+    /// Waits until something has changed, or for `due_in`, the time until a parked item is due.
     pub(super) fn wait(&self, mut state: MutexGuard<'_, State>, due_in: Option<Duration>) {
         state.note_waiting(Instant::now());
         let waited = self.changed.wait_timeout(state, due_in.unwrap_or(IDLE));
@@ -118,20 +118,20 @@ impl State {
         self.participants.note_waiting(waiting, now);
     }
 
-    /// Whether a chunk or a request waits for what the replay holds; if not, the threads that serve them have nothing to look at, and
-    /// what they would note is noted here. Waking them costs six changes of threads a chunk.
+    /// Whether a chunk or a request is parked. If not, the threads that serve them need not wake, which saves six context switches per
+    /// chunk. Notes which side waits, as those threads would do.
     pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
         self.note_waiting(now);
         !self.chunks.line.is_empty() || !self.requests.is_empty()
     }
 
-    /// Counts a message that was refused, and logs a line of this kind.
+    /// Counts a rejected message, and logs a line of this kind.
     pub(super) fn refuse(&mut self, kind: &'static str, line: &str) {
         self.replay.counted().messages_refused += 1;
         self.say(kind, line);
     }
 
-    /// Logs a line of this kind, or counts it where one was logged a short while ago.
+    /// Logs a line of this kind, or only counts it if one was logged recently.
     pub(super) fn say(&mut self, kind: &'static str, line: &str) {
         if let Some(more) = self.said.entry(kind).or_default().due() {
             tracing::warn!("{line}{more}");
@@ -139,9 +139,9 @@ impl State {
     }
 }
 
-/// Admits queries to the service: until the replay is read back from disk each is answered with the progress.
+/// Passes queries to the service. Until the replay is read back from disk, each query is answered with the progress.
 pub(super) struct Admission {
-    /// Set once the replay is there.
+    /// Set once the replay has been read back.
     pub(super) service: OnceLock<Arc<Service>>,
     pub(super) reading: Reading,
     pub(super) config_toml: String,

@@ -1,4 +1,4 @@
-//! The smaller messages: an actor's `Leave`, the learner's affinity, reports and the status.
+//! The smaller messages: an actor's `Leave`, the learner's affinity and priorities, reports, episodes and the status.
 
 use std::{
     collections::HashSet,
@@ -13,11 +13,11 @@ use driml_protocol::{
 use super::server::{Service, State};
 use crate::persist::journal::Journal;
 
-/// How often it checks whether a process is missing.
+/// Period between checks for missing processes and for the end of the run.
 const LOOK: Duration = Duration::from_secs(1);
-/// How long a replay server waits for processes that do not leave when the run is over.
+/// How long a replay server waits for the other processes to leave when the run is over.
 const FAREWELL_MAX: Duration = Duration::from_secs(30);
-/// How long it waits when its launcher has died, for processes that notice this too and deliver what they have.
+/// The same if its launcher has died: the other processes notice that too and deliver their data.
 const ABANDONED_MAX: Duration = Duration::from_secs(10);
 /// How long a process may be missing before it is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
@@ -28,7 +28,7 @@ impl Service {
             if let Some(why) = state.replay.leave(&leave) {
                 state.say("leave", &format!("a `Leave` was refused: {why}"));
             }
-            // Also if it was refused: the actor ends.
+            // A rejected `Leave` is acknowledged too, as the actor exits anyway.
             state.replay.write_pending().then_some(Ack)
         });
     }
@@ -44,7 +44,7 @@ impl Service {
         let most = self.limits.batch_rows as usize;
         self.take(incoming, "priorities were", |state, update| {
             state.check_learner(update.learner)?;
-            // Those of a batch's rows.
+            // One priority per row of a batch.
             if update.rows() > most {
                 return Err(format!(
                     "of {} rows; a batch of this run has {most} (learner.batch_size)",
@@ -55,7 +55,7 @@ impl Service {
         });
     }
 
-    /// Takes what the learner tells, or counts and logs why not.
+    /// Takes a message of the learner and acknowledges it, or counts and logs why it is rejected.
     fn take<R: Request<Reply = Ack>>(
         &self,
         incoming: Incoming<R>,
@@ -74,7 +74,7 @@ impl Service {
     pub(super) fn report(&self, incoming: Incoming<Report>) {
         self.answer(incoming, |state, report| {
             let finished = report.finished;
-            // Otherwise its process has been replaced, or is about to join: the end of the run is reported again.
+            // If not, the process was replaced or is about to join. It repeats a report of the end of the run until it gets an `Ack`.
             let has_joined = state.participants.reported(report, Instant::now());
             if has_joined {
                 state.replay.note_updates(finished.unwrap_or(0));
@@ -111,10 +111,10 @@ impl Service {
         incoming.into_responder().reply(&status);
     }
 
-    /// Logs which process the run waits for, if it cannot continue without: after some seconds, then ever more seldom. This is the
-    /// thread's whole work until the process ends.
+    /// Logs which missing process the run waits for: after `SILENT_MAX`, then at doubling intervals. Its thread does nothing else until the
+    /// shutdown.
     pub(super) fn say_who_is_missing(&self) {
-        // Which, since when, and after how long it is logged next.
+        // The missing process, since when, and after how long it is logged next.
         let mut missing: Option<(&str, Instant, Duration)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
             fail_point::reach("missing");
@@ -134,8 +134,8 @@ impl Service {
         }
     }
 
-    /// Waits until the run is over or this process `ending`, and the other processes have left; or for a shutdown. With `keep_alive` the end
-    /// of the run does not end it.
+    /// Waits for a shutdown, or until the run is over or `ending` is raised and the other processes have left, for a limited time. With
+    /// `keep_alive` the end of the run does not count.
     pub(super) fn wait_until_over(&self, ending: &Shutdown, keep_alive: bool) {
         let mut waits: Option<(bool, Instant)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
@@ -174,7 +174,7 @@ impl Service {
         let state = self.state();
         let mut status = state.replay.status();
         status.learner_finished = state.participants.is_over();
-        // Actors of which a chunk has come, those that have ended too.
+        // Actors that have delivered a chunk, including those that have exited.
         let mut acting: HashSet<u32> = state.replay.state.actors.delivered().collect();
         acting.extend(state.chunks.line.iter().map(|it| it.header().actor));
         status.actors_acting = acting.len() as u32;

@@ -1,4 +1,4 @@
-//! How long chunks wait and how old the weights are that acted, as distributions in fixed memory.
+//! Distributions of how long chunks wait and how old the weights are that acted, in fixed memory.
 
 use std::{
     collections::VecDeque,
@@ -8,11 +8,11 @@ use std::{
 use driml_protocol::{Quantiles, ReplayStatus, WeightsHeader};
 use hdrhistogram::Histogram;
 
-/// Decimal digits to which quantiles are right.
+/// Accuracy of quantiles in decimal digits.
 const DIGITS: u8 = 2;
-/// Largest value that is told from larger ones: in microseconds 12 days.
+/// Maximum value that is recorded; larger ones count as this one. In microseconds it is 12 days.
 const VALUE_MAX: u64 = 1 << 40;
-/// Versions of weights whose times are remembered; what acted with older ones counts as behind by the oldest of them.
+/// Maximum versions of weights whose arrival is remembered. Older versions count as replaced when the oldest of these arrived.
 const VERSIONS_MAX: usize = 4096;
 
 /// Distributions since the start; times in microseconds.
@@ -21,7 +21,7 @@ pub(super) struct Timings {
     inserts: Histogram<u64>,
     behind: Histogram<u64>,
     behind_updates: Histogram<u64>,
-    /// Versions of the weights that came, the updates behind them, and when: oldest first.
+    /// The version of each weights upload, its number of updates, and when it arrived; oldest first.
     versions: VecDeque<(u64, u64, Instant)>,
 }
 
@@ -60,7 +60,7 @@ impl Timings {
         add(&mut self.answers, after);
     }
 
-    /// A chunk that weights of `version` chose was stored.
+    /// Notes that a chunk was stored whose actions were chosen by weights of `version`.
     pub(super) fn stored(&mut self, version: u64, arrived: Instant, now: Instant) {
         add(&mut self.inserts, now.saturating_duration_since(arrived));
         let Some(&(_, newest_updates, _)) = self.versions.back() else {
@@ -85,13 +85,13 @@ impl Timings {
             .push_back((weights.version, weights.updates, now));
     }
 
-    /// Seconds since the newest weights came.
+    /// Returns the seconds since the newest weights arrived.
     pub(super) fn weights_age_s(&self, now: Instant) -> Option<f64> {
         let (_, _, came) = self.versions.back()?;
         Some(now.saturating_duration_since(*came).as_secs_f64())
     }
 
-    /// Fills in what a status says of them.
+    /// Sets the timing fields of a status.
     pub(super) fn report(&self, status: &mut ReplayStatus) {
         status.answer_ms = quantiles(&self.answers, 1e3);
         status.insert_ms = quantiles(&self.inserts, 1e3);

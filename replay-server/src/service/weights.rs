@@ -1,4 +1,4 @@
-//! Weights on their way: taken from the learner once a version, announced, and given to actors in pieces.
+//! Distributes weights: receives each version from the learner, announces it, and sends it to actors in pieces.
 
 use std::{sync::MutexGuard, time::Instant};
 
@@ -15,7 +15,7 @@ impl Service {
     }
 
     pub(super) fn take_weights(&self, incoming: Incoming<WeightsUpload>) {
-        // Weights are kept for long, so their memory is not the pool's.
+        // Weights are kept for long, so they do not use the memory of the pool.
         let (upload, safetensors) = match incoming.receive(&BufferPool::new(0)) {
             Ok(read) => read,
             Err(e) => return self.refuse("an upload of weights", &e),
@@ -35,7 +35,7 @@ impl Service {
                     tracing::warn!("weights {version} were not announced: {why}");
                 }
             }
-            // They came again.
+            // A repeated upload.
             Ok(false) => {}
             Err(why) => {
                 let line = format!("weights were refused: {why}");

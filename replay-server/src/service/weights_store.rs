@@ -1,4 +1,4 @@
-//! The newest weights and the older ones that actors still pull, whole, as they came.
+//! Stores the newest weights, and older versions that actors still pull.
 
 use std::{
     fs, io,
@@ -15,30 +15,30 @@ use crate::persist::journal::remove;
 
 const FILE: &str = "weights.message";
 
-/// Versions that are kept while actors pull them. When so many are being pulled, one that begins gets the newest of these: many
-/// actors that pull slowly are served to the end, with weights that are a little older.
+/// Maximum versions kept while actors pull them. At the limit, an actor that begins to pull gets the newest of these versions. So even many
+/// slow actors are served to the end, with slightly older weights.
 const KEPT_MAX: usize = 8;
-/// How long a version is kept after its last piece was asked for.
+/// How long a version is kept after the last request for a piece of it.
 const KEPT_FOR: Duration = Duration::from_secs(5);
-/// Most versions that one upload may be ahead of the one before: a learner does not count so far.
+/// Maximum increase of the version from one upload to the next. No learner reaches it.
 const VERSION_STEP_MAX: u64 = 1 << 20;
-/// Highest version of the first upload: of a run that is resumed without its replay, it may be any that a run reaches.
+/// Maximum version of the first upload. If a run is resumed without its replay, this may be any version that a run reaches.
 const FIRST_VERSION_MAX: u64 = 1 << 53;
 
 /// The newest weights, and older ones that are being pulled.
 #[derive(Default)]
 pub(super) struct WeightsStore {
-    /// Where the newest are kept, if the replay is kept on disk, and the hash of the run's spec.
+    /// The file for the newest weights, if the replay is kept on disk, and the hash of the run spec.
     file: Option<(PathBuf, u64)>,
     newest: Option<Arc<Weights>>,
-    /// Those that are being pulled, oldest version first, and when each was last asked for.
+    /// The versions that are being pulled, oldest first, and when each was last requested.
     pulled: Vec<(Arc<Weights>, Instant)>,
 }
 
 impl WeightsStore {
-    /// Weights that are kept beside the replay in `dir`, from now on and, where it `was_kept`, before: actors that start after a
-    /// restart need some before the learner publishes again. Those of a replay that is gone are removed: with them actors would store
-    /// chunks before the learner joins.
+    /// Returns a store that keeps the newest weights on disk beside the replay in `dir`. If the replay `was_kept`, reads the weights from
+    /// there: actors that start after a restart need some before the learner publishes again. Otherwise removes old weights, as with them
+    /// actors would store chunks before the learner joins.
     pub(super) fn kept_in(dir: &Path, spec_hash: u64, was_kept: bool) -> Self {
         let path = dir.join(FILE);
         if !was_kept {
@@ -66,7 +66,7 @@ impl WeightsStore {
         }
     }
 
-    /// How to keep the newest weights on disk, if they are to be; done without this in use, as it takes a while.
+    /// Returns a function that writes the newest weights to disk, if they are kept. It is slow: call it without a lock on this store.
     pub(super) fn keeper(&self) -> Option<impl FnOnce() + use<>> {
         let ((path, spec_hash), weights) = (self.file.clone()?, self.newest.clone()?);
         Some(move || {
@@ -80,13 +80,13 @@ impl WeightsStore {
         })
     }
 
-    /// Version of the newest; 0 before the first.
+    /// Returns the version of the newest weights; 0 before the first.
     pub(super) fn version(&self) -> u64 {
         self.newest.as_ref().map_or(0, |it| it.header.version)
     }
 
-    /// Takes newer weights; the same ones may come again. Returns whether they are new; an error says why they cannot follow the
-    /// newest ones.
+    /// Takes newer weights; an upload may be repeated. Returns whether the weights are new. An error says why they cannot follow the
+    /// newest.
     pub(super) fn put(
         &mut self,
         header: WeightsHeader,
@@ -107,7 +107,7 @@ impl WeightsStore {
         Ok(true)
     }
 
-    /// The weights that `request` asks for, and where the piece starts.
+    /// Returns the weights that `request` asks for, and the offset of the piece.
     pub(super) fn find(
         &mut self,
         request: WeightsRequest,
@@ -131,7 +131,7 @@ impl WeightsStore {
         }
     }
 
-    /// The version that a client with `version` is to pull.
+    /// Returns the version that a client with `version` should pull.
     fn begin(&mut self, version: u64, now: Instant) -> Result<u64, WeightsReply> {
         let newest = self.newest.as_ref();
         let newest = newest.filter(|it| it.header.version > version);
@@ -155,8 +155,8 @@ impl WeightsStore {
     }
 }
 
-/// Writes weights in the place of those that are kept. They are not flushed: what a power cut leaves of them has a checksum, and the
-/// learner hands over newer ones.
+/// Replaces the weights on disk, without a flush: a checksum detects a file that a power cut has damaged, and the learner uploads newer
+/// weights.
 fn keep(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Result<()> {
     let upload = WeightsUpload {
         learner: 0,
@@ -189,7 +189,7 @@ mod tests {
     }
 
     impl WeightsStore {
-        /// What comes of a request: the version and the offset.
+        /// Returns the version and the offset that a request finds.
         fn found(
             &mut self,
             request: WeightsRequest,
@@ -211,7 +211,7 @@ mod tests {
             assert!(store.put(other, b"c").is_err(), "{version}");
         }
         assert_eq!(store.version(), 3);
-        // A run that is resumed without its replay begins with any.
+        // A run that is resumed without its replay may begin with any version.
         let first = |version| WeightsStore::default().put(header(version), b"a");
         assert_eq!(first(2 << 20), Ok(true));
         assert!(first(FIRST_VERSION_MAX + 1).is_err());
@@ -233,7 +233,7 @@ mod tests {
             assert!(store.pulled.len() <= KEPT_MAX);
         }
         assert_eq!(store.found(newer(19), at(20)), none);
-        // One that was pulled to the end, one that never was, and places where no piece begins.
+        // A version that was dropped, one that never existed, and offsets at which no piece begins.
         for (version, offset) in [(2, 0), (99, 0), (19, 1), (19, 3 * PIECE_BYTES)] {
             let gone = store.found(piece(version, offset), at(20));
             assert_eq!(gone, Err(WeightsReply::Gone), "{version}, {offset}");
@@ -250,7 +250,7 @@ mod tests {
             let newest_pulled = version.min(last);
             assert_eq!(begun, Ok((newest_pulled, 0)));
         }
-        // One that has it already gets the newest, in the place of the one that was asked for longest ago.
+        // A client that already has that version gets the newest, which replaces the version that was requested longest ago.
         let later = now + Duration::from_secs(1);
         for version in 2..=last {
             let pulled = store.found(piece(version, 0), later);

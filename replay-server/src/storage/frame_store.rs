@@ -1,5 +1,5 @@
-//! How the frames of the transitions held are kept: plain, or compressed without loss.
-//! It knows neither links, episodes nor stacks, and it never stores a frame twice.
+//! Stores the frames of the transitions held: plain, or compressed without loss.
+//! It knows no links, episodes or frame stacks, and it never stores a frame twice.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -15,8 +15,8 @@ pub(crate) enum Frames {
 }
 
 impl Frames {
-    /// Room for the frames of `capacity` transitions; compressed ones take `bytes_max` bytes at most, if there is a limit. An error
-    /// gives the bytes that the system refuses to reserve.
+    /// Creates a store for the frames of `capacity` transitions. Compressed frames take at most `bytes_max` bytes, if given. An error holds
+    /// the bytes that the system does not grant.
     pub(crate) fn new(
         compression: Compression,
         capacity: u64,
@@ -29,8 +29,8 @@ impl Frames {
         }
     }
 
-    /// Stores the frames of the next transitions, the first of which has this slot, and may drop those before `oldest`. Gives
-    /// the oldest that is held.
+    /// Stores the frames of the next transitions, the first in `slot`. May drop the frames before transition `oldest`. Returns the oldest
+    /// transition whose frame is held.
     pub(crate) fn push(&mut self, run: Run<'_>, slot: usize, oldest: u64) -> u64 {
         match (self, run) {
             (Self::Plain(frames), Run::Plain(run)) => {
@@ -49,29 +49,29 @@ impl Frames {
         }
     }
 
-    /// Lets go of all frames; the next one has the first slot.
+    /// Drops all frames. The next frame must go into slot 0.
     pub(crate) fn clear(&mut self) {
         match self {
             Self::Plain(frames) => frames.bytes.clear(),
-            // A block begins where the last ended, the first one at what `push` is told.
+            // Each block begins where the last one ends, the first one at the `oldest` that `push` is given.
             Self::Compressed(frames) => frames.forget_before(u64::MAX),
         }
     }
 
-    /// The frames before that of `oldest` are no longer wanted.
+    /// Drops the frames of transitions before `oldest`, if that frees memory.
     pub(crate) fn forget_before(&mut self, oldest: u64) {
         match self {
-            // Their places are taken again in turn.
+            // New frames overwrite them in turn.
             Self::Plain(_) => {}
             Self::Compressed(frames) => frames.forget_before(oldest),
         }
     }
 
-    /// Checks that the transitions `oldest..inserted`, of those from `first` on, have their frames; panics if not. Slow: for tests.
+    /// Panics unless the transitions `oldest..inserted` have their frames; `first` is the first that was ever stored. Slow: for tests.
     pub(crate) fn check_valid(&self, first: u64, oldest: u64, inserted: u64) {
         match self {
             Self::Plain(frames) => {
-                // One frame a transition, until they are overwritten.
+                // One frame per transition, until frames are overwritten.
                 let held = (inserted - first).min(frames.capacity);
                 assert_eq!(self.bytes_held(), held * frames.frame_bytes as u64);
             }
@@ -80,7 +80,7 @@ impl Frames {
     }
 }
 
-/// The newest `capacity` frames as they came, in one buffer, each in the slot of its transition.
+/// The newest `capacity` frames, uncompressed in one buffer, each in the slot of its transition.
 pub(crate) struct PlainFrames {
     capacity: u64,
     frame_bytes: usize,
@@ -88,7 +88,7 @@ pub(crate) struct PlainFrames {
 }
 
 impl PlainFrames {
-    /// An empty buffer for `capacity` frames. An error gives the bytes that the system refuses to reserve.
+    /// Creates an empty buffer for `capacity` frames. An error holds the bytes that the system does not grant.
     pub(crate) fn new(capacity: u64, frame_bytes: usize) -> Result<Self, u64> {
         Ok(Self {
             capacity,
@@ -97,7 +97,7 @@ impl PlainFrames {
         })
     }
 
-    /// Stores frames from `slot` on, over the oldest ones once the buffer is full.
+    /// Stores frames from `slot` on. Once the buffer is full, they overwrite the oldest ones.
     pub(crate) fn push(&mut self, mut frames: &[u8], slot: usize) {
         let capacity_bytes = self.capacity as usize * self.frame_bytes;
         let mut at = slot * self.frame_bytes;
@@ -118,7 +118,7 @@ impl PlainFrames {
     }
 }
 
-/// A block among those held.
+/// A block that is held, with the index of its first transition.
 struct Held {
     first: u64,
     block: Arc<Block>,
@@ -130,19 +130,19 @@ impl Held {
     }
 }
 
-/// The frames of the newest transitions as compressed blocks, the oldest first, which go in the order in which they came.
+/// The frames of the newest transitions as compressed blocks, oldest first. The oldest block is dropped first.
 ///
-/// Memory: the blocks held, of which the oldest may be overwritten in part, and at most 96 bytes for each.
-/// A block that would not become smaller is kept as it came, so noise takes no more than plain frames and that.
+/// Memory: the blocks held, and at most 96 bytes of overhead for each. Some frames of the oldest block may belong to dropped transitions.
+/// A part that would not shrink is stored uncompressed, so noise takes no more than plain frames and the overhead.
 pub(crate) struct CompressedFrames {
     bytes_max: u64,
-    /// Of all blocks.
+    /// The bytes of all blocks.
     bytes: u64,
     blocks: VecDeque<Held>,
 }
 
 impl CompressedFrames {
-    /// Nothing yet, and never more than `bytes_max` bytes, beside the 96 a block.
+    /// Creates an empty store for at most `bytes_max` bytes, plus 96 bytes per block.
     pub(crate) fn new(bytes_max: Option<u64>) -> Self {
         Self {
             bytes_max: bytes_max.unwrap_or(u64::MAX),
@@ -151,9 +151,9 @@ impl CompressedFrames {
         }
     }
 
-    /// Stores the next transitions' frames; those before `oldest` go, and as many more as the bytes allowed demand.
+    /// Stores the next transitions' frames. Drops those before `oldest`, and more of the oldest if `bytes_max` requires it.
     ///
-    /// Gives the oldest transition whose frame is held.
+    /// Returns the oldest transition whose frame is held.
     pub(crate) fn push(&mut self, run: &[Arc<Block>], mut oldest: u64) -> u64 {
         for block in run {
             let bytes = block.bytes.len() as u64;
@@ -180,7 +180,7 @@ impl CompressedFrames {
         }
     }
 
-    /// The block that holds the frame of `index`, and which of its frames that is.
+    /// Returns the block that holds the frame of transition `index`, and the frame's position in the block.
     pub(crate) fn block(&self, index: u64) -> (&Arc<Block>, usize) {
         let after = self.blocks.partition_point(|it| it.first <= index);
         let held = &self.blocks[after - 1];
@@ -188,7 +188,7 @@ impl CompressedFrames {
     }
 
     pub(crate) fn bytes_held(&self) -> u64 {
-        // Behind an `Arc` a block has two counts.
+        // An `Arc` adds two reference counts to a block.
         let block = size_of::<Block>() + 2 * size_of::<usize>();
         let queue = self.blocks.capacity() * size_of::<Held>();
         self.bytes + (self.blocks.len() * block + queue) as u64

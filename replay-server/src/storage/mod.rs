@@ -1,12 +1,12 @@
-//! What the replay holds: the transitions in a ring, and their frames, plain or compressed.
-//! Nothing here draws a sample or knows which actor sent what.
+//! The storage of the replay: the transitions in a ring, and their frames, plain or compressed.
+//! Nothing here draws samples or knows which actor sent a transition.
 
 pub(crate) mod frame_store;
 pub(crate) mod pack;
 pub(crate) mod ring;
 
-/// An empty vector with room for `count` values, of which memory is taken only as they come. An error gives the bytes that the system
-/// refuses to reserve.
+/// Reserves an empty vector for `count` values; the system provides memory only as values are written. An error holds the bytes that the
+/// system does not grant.
 pub(crate) fn reserve<T>(count: u64) -> Result<Vec<T>, u64> {
     let asked = count.saturating_mul(size_of::<T>() as u64);
     let mut values = Vec::new();

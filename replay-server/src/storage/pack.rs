@@ -1,10 +1,10 @@
-//! Compresses a chunk before it is stored, and unpacks frames after they are drawn, so that the replay is not locked meanwhile.
-//! It stores nothing and does not judge the chunk.
+//! Compresses a chunk before it is stored, and unpacks frames after they are drawn, both without a lock on the replay.
+//! It stores nothing and does not validate the chunk.
 //!
-//! What is compressed is a block: consecutive frames of one stream, of which the first is the key of the others.
-//! A block's parts are LZ4 blocks of their own: the key alone, then a few frames each with the key as LZ4's dictionary. To
-//! read a frame, its part and the key are unpacked and no more. Frames are not stored as differences: LZ4 finds what
-//! frames have in common also where the picture scrolls, where differences would destroy it.
+//! The unit of compression is a block: consecutive frames of one stream, the first of which is the key. Each part of a block is a separate
+//! LZ4 block: the key alone, then a few frames each, with the key as LZ4's dictionary. To read a frame, only its part and the key are
+//! unpacked. Frames are not stored as differences: LZ4 also finds common content if the picture scrolls, where differences would destroy
+//! it.
 
 use std::{borrow::Cow, ops::Range, sync::Arc};
 
@@ -16,40 +16,40 @@ use lz4_flex::block::{
 
 use crate::config::Compression;
 
-/// Longest part before compression, unless one frame is longer: three frames of Procgen.
+/// Maximum bytes of a part before compression, unless one frame is longer: three frames of Procgen.
 ///
-/// Longer parts compress better, shorter ones are faster to take a single frame from.
+/// Longer parts compress better; a single frame is faster to read from a shorter part.
 const PART_BYTES_MAX: usize = 36 << 10;
-/// Parts of a block beside its key: with three frames each, a block has 16 frames, as an actor's chunk has steps.
+/// Maximum parts of a block besides its key. With three frames each, a block has 16 frames, as many as an actor's chunk has steps.
 const PARTS_MAX: usize = 5;
 
 /// Prepares chunks for one replay.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Packer {
     pub(crate) compression: Compression,
-    /// Hash of the run spec where chunks are also kept on disk, as messages.
+    /// Hash of the run spec, if chunks are also written to disk, as messages.
     pub(crate) seal_for: Option<u64>,
 }
 
 /// A chunk with its frames as the replay will keep them.
 pub(crate) struct PackedChunk<'a> {
     pub(crate) chunk: Cow<'a, Chunk>,
-    /// With compression: of each stream.
+    /// The blocks of each stream; empty without compression.
     packed: Vec<Vec<Arc<Block>>>,
-    /// Where chunks are kept on disk: prefix and header of the message, if the chunk makes one.
+    /// Prefix and header of the chunk's message, if chunks are written to disk and this chunk fits into a message.
     pub(crate) sealed: Option<Vec<u8>>,
 }
 
 /// Consecutive frames of one stream, compressed.
 pub(crate) struct Block {
     pub(crate) frames: usize,
-    /// Bytes up to the end of each part, from its start; 0 for parts that it does not have.
+    /// The end of each part in `bytes`; 0 for parts that the block does not have.
     part_ends: [u32; 1 + PARTS_MAX],
-    /// Its parts, one after the other. A part is the frames themselves if it has as many bytes.
+    /// The parts in order. A part that has as many bytes as its frames is not compressed.
     pub(crate) bytes: Box<[u8]>,
 }
 
-/// One stream's frames, on their way into the replay.
+/// The frames of one stream, to be stored in the replay.
 #[derive(Clone, Copy)]
 pub(crate) enum Run<'a> {
     Plain(&'a [u8]),
@@ -57,7 +57,7 @@ pub(crate) enum Run<'a> {
 }
 
 impl Packer {
-    /// Compresses the chunk's frames, or leaves them as they are.
+    /// Compresses the chunk's frames if the replay compresses, and encodes the message's head if the replay is on disk.
     pub(crate) fn pack<'a>(&self, chunk: Cow<'a, Chunk>) -> PackedChunk<'a> {
         let packed = match self.compression {
             Compression::None => Vec::new(),
@@ -76,13 +76,13 @@ impl Packer {
 }
 
 impl PackedChunk<'_> {
-    /// Bytes of memory that it takes, roughly.
+    /// Returns the approximate bytes of memory that the chunk takes.
     pub(crate) fn bytes(&self) -> usize {
         let packed = self.packed.iter().flatten().map(|block| block.bytes.len());
         self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed.sum::<usize>()
     }
 
-    /// The frames of one of its streams.
+    /// Returns the frames of one of the chunk's streams.
     pub(crate) fn run(&self, stream: usize) -> Run<'_> {
         match self.packed.get(stream) {
             Some(blocks) => Run::Packed(blocks),
@@ -94,13 +94,13 @@ impl PackedChunk<'_> {
     }
 }
 
-/// The frames of each stream. A chunk of nothing, which will be refused, has none.
+/// Returns the frames of each stream. An empty chunk, which will be rejected, has none.
 fn runs(chunk: &Chunk) -> impl Iterator<Item = &[u8]> {
     let run_bytes = chunk.header.steps as usize * chunk.header.frame_bytes as usize;
     chunk.frames().chunks_exact(run_bytes.max(1))
 }
 
-/// A stream's frames as blocks, the first frame's first.
+/// Compresses a stream's frames into consecutive blocks.
 fn blocks(frames: &[u8], layout: Layout) -> Vec<Arc<Block>> {
     let blocks = frames.chunks(layout.block_frames_max() * layout.frame_bytes);
     let packed = blocks.map(|block| Arc::new(Block::new(block, layout)));
@@ -123,22 +123,22 @@ impl Layout {
         }
     }
 
-    /// Most frames of a block.
+    /// Returns the maximum frames of a block.
     const fn block_frames_max(&self) -> usize {
         1 + PARTS_MAX * self.part_frames
     }
 
-    /// Parts of a block of `frames` frames, key included.
+    /// Returns the number of parts of a block of `frames` frames, key included.
     const fn parts(&self, frames: usize) -> usize {
         1 + (frames - 1).div_ceil(self.part_frames)
     }
 
-    /// The part that holds a frame of the block; 0 is the key.
+    /// Returns the part that holds a frame of the block; 0 is the key.
     pub(crate) const fn part_of(&self, frame: usize) -> usize {
         frame.div_ceil(self.part_frames)
     }
 
-    /// The frames of one part of a block of `frames` frames.
+    /// Returns the frames of one part of a block of `frames` frames.
     pub(crate) fn frames_of(&self, part: usize, frames: usize) -> Range<usize> {
         match part {
             0 => 0..1,
@@ -167,7 +167,7 @@ impl Block {
             };
             bytes.extend_from_slice(match packed {
                 Ok(length) if length < plain.len() => &scratch[..length],
-                // It would not become smaller.
+                // Compression does not make this part smaller.
                 _ => plain,
             });
             *end = bytes.len() as u32;
@@ -175,12 +175,12 @@ impl Block {
         Self {
             frames: count,
             part_ends,
-            // A copy, so that it takes no more memory than it has bytes.
+            // A copy without the vector's spare capacity.
             bytes: bytes.as_slice().into(),
         }
     }
 
-    /// Unpacks a part into `to`, which has room for its frames alone. `key` is the block's first frame; for that itself it is not read.
+    /// Unpacks a part into `to`, which has exactly the size of its frames. `key` is the block's first frame, which part 0 does not need.
     pub(crate) fn unpack(&self, part: usize, key: &[u8], to: &mut [u8]) {
         let end = |part: usize| self.part_ends[part] as usize;
         let stored = &self.bytes[part.checked_sub(1).map_or(0, end)..end(part)];

@@ -1,26 +1,26 @@
-//! The transitions held: every frame once, with links along its episode.
-//! It does not know actors, sampling or stacks; how frames are kept is `frame_store`'s business.
+//! The ring of transitions, with links along each episode. Every frame is stored once.
+//! It knows no actors, sampling or frame stacks; `frame_store` stores the frames.
 
 use driml_protocol::End;
 use serde::{Deserialize, Serialize};
 
 use super::{frame_store::Frames, pack::Run, reserve};
 
-/// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
+/// How a transition continues its stream. `after` is the index of the transition just before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Link {
-    /// First of an episode: nothing before it counts.
+    /// First of an episode: nothing before it belongs to its states or returns.
     EpisodeStart,
-    /// First of a level: frames before it do not count, but the return runs on from `after`.
+    /// First of a level: its frame stack does not reach back, but returns of earlier transitions continue across it from `after`.
     LevelStart { after: u64 },
     /// Within a level.
     Within { after: u64 },
-    /// What came before was lost: neither frames nor return may reach back.
+    /// The transition before was lost: neither frame stacks nor returns may cross the gap.
     Lost,
 }
 
 impl Link {
-    /// The same where transitions from `first_lost` on are gone: what would reach back into them does not.
+    /// Returns `Lost` if the transition before is `first_lost` or later, and is therefore gone; otherwise returns the link unchanged.
     pub(crate) const fn without(self, first_lost: u64) -> Self {
         match self {
             Self::LevelStart { after } | Self::Within { after } if after >= first_lost => {
@@ -30,7 +30,7 @@ impl Link {
         }
     }
 
-    /// The transition that it follows, if there is one.
+    /// Returns the index of the transition just before, if there is one.
     pub(crate) const fn after(self) -> Option<u64> {
         match self {
             Self::LevelStart { after } | Self::Within { after } => Some(after),
@@ -38,7 +38,7 @@ impl Link {
         }
     }
 
-    /// The link of the transition that follows `index`, which ended `end`.
+    /// Returns the link of the transition that follows `index`, which ended with `end`.
     pub(crate) const fn following(index: u64, end: End) -> Self {
         match end {
             End::Running => Self::Within { after: index },
@@ -52,10 +52,10 @@ impl Link {
 const NO_NEXT: u64 = u64::MAX;
 /// No predecessor: this is the first of an episode or level.
 const LEVEL_START: u64 = u64::MAX;
-/// The predecessor was lost on the way.
+/// The predecessor was lost.
 const PREVIOUS_LOST: u64 = u64::MAX - 1;
 
-/// All of one transition but its frame: 32 bytes, so that a walk along an episode touches little memory.
+/// A transition without its frame: 32 bytes, so that a walk along an episode touches little memory.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Step {
     next: u64,
@@ -78,28 +78,28 @@ impl Step {
         }
     }
 
-    /// Index of the successor in the same episode; a successor is newer, so it is held whenever this step is.
+    /// Returns the index of the successor in the same episode. A successor is newer, so it is held whenever this step is.
     pub(crate) fn next(&self) -> Option<u64> {
         (self.next != NO_NEXT).then_some(self.next)
     }
 }
 
-/// What lies before a transition, as far as frames go.
+/// The predecessor of a transition in its level, which its frame stack needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Previous {
     /// Nothing: it is the first of its episode or level.
     Start,
     /// A transition that is held.
     Held(u64),
-    /// A transition that is overwritten or was lost.
+    /// A transition that was overwritten or lost.
     Gone,
 }
 
-/// The newest `capacity` transitions, or fewer if their frames may not take the memory; number `i` since the start lies in
-/// slot `(i - first) % capacity`.
+/// The newest `capacity` transitions, or fewer if their frames would exceed the memory limit. The transition with index `i`, counted from
+/// the start of the run, is in slot `(i - first) % capacity`.
 pub(crate) struct Ring {
     capacity: u64,
-    /// The first transition that was ever stored here; those before it were stored by an earlier process alone.
+    /// Index of the first transition stored in this ring; an earlier process stored those before it.
     first: u64,
     oldest: u64,
     inserted: u64,
@@ -108,7 +108,7 @@ pub(crate) struct Ring {
 }
 
 impl Ring {
-    /// An empty ring of `capacity` transitions with their `frames`. An error gives the bytes that the system refuses to reserve.
+    /// Creates an empty ring of `capacity` transitions with their `frames`. An error holds the bytes that the system does not grant.
     pub(crate) fn new(capacity: u64, frames: Frames) -> Result<Self, u64> {
         Ok(Self {
             capacity,
@@ -120,7 +120,7 @@ impl Ring {
         })
     }
 
-    /// Lets go of everything; the next transition has the number `first`.
+    /// Drops all transitions. The next one gets the index `first`.
     pub(crate) fn start_at(&mut self, first: u64) {
         self.steps.clear();
         (self.first, self.oldest, self.inserted) = (first, first, first);
@@ -136,9 +136,9 @@ impl Ring {
         self.frames.forget_before(self.oldest);
     }
 
-    /// Stores consecutive transitions of one stream, over the oldest ones once the ring is full.
+    /// Stores consecutive transitions of one stream. Once the ring is full, they overwrite the oldest ones.
     ///
-    /// `link` is the first one's; the result is the link of the one that will follow the last.
+    /// `link` is the link of the first one. Returns the link of the transition that will follow the last one.
     pub(crate) fn push_run(
         &mut self,
         frames: Run<'_>,
@@ -155,7 +155,7 @@ impl Ring {
         link
     }
 
-    /// Stores one transition whose frame is stored, and gives its index.
+    /// Stores one transition, whose frame is already stored, and returns its index.
     fn push(&mut self, step: Step, link: Link) -> u64 {
         let index = self.inserted;
         let previous = match link {
@@ -227,7 +227,7 @@ impl Ring {
     /// Checks sizes and every link; panics at the first that is wrong. Slow: for tests.
     pub(crate) fn check_valid(&self) {
         let (first, oldest, inserted) = (self.first, self.oldest, self.inserted);
-        // One step a transition, until they are overwritten.
+        // One step per transition, until steps are overwritten.
         let steps = (inserted - first).min(self.capacity);
         assert_eq!(self.steps.len() as u64, steps);
         assert!(inserted - oldest <= self.capacity, "more are held than fit");

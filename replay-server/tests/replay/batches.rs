@@ -1,4 +1,4 @@
-//! Batches against the reference, through wrap-around, restarts, losses, retries and strays.
+//! Compares batches with the reference, through wrap-around, restarts, losses, retries and stray chunks.
 //! It does not test how often each row or k comes: `rows` and `horizon` do.
 
 use std::collections::{HashMap, HashSet};
@@ -16,7 +16,7 @@ use crate::{
     history::{History, identity, spec},
 };
 
-/// Checks every row of `batch`, and what it says of itself, against the reference.
+/// Checks every row of `batch`, and the batch's header, against the reference.
 pub(crate) fn check_batch(batch: &Batch, history: &History) {
     let (mean_age, versions) = check_rows(batch, history);
     assert_eq!(batch.header.mean_age, mean_age);
@@ -25,7 +25,7 @@ pub(crate) fn check_batch(batch: &Batch, history: &History) {
     assert_eq!(batch.header.held, history.inserted - history.oldest());
 }
 
-/// Checks every row of `batch` against the reference; gives their mean age, and the newest and oldest weights that acted.
+/// Checks every row of `batch` against the reference. Returns the mean age, and the newest and oldest versions of the weights that acted.
 pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) {
     let spec = &history.spec;
     let (rows, bytes) = (batch.rows(), spec.state_bytes());
@@ -53,14 +53,14 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
             (discount - want.discount).abs() < 1e-6,
             "{context}: {discount}"
         );
-        // A state that counts for nothing does not travel.
+        // A bootstrap state with discount 0 is not sent.
         if let Some(i) = want.bootstrap.filter(|_| discounts[row] != 0.0) {
             let frame_n = next.next().expect("a row that bootstraps has its state");
             assert_eq!(frame_n, history.state(key, t + i), "{context}");
         }
         assert_eq!(batch.positives(), spec.horizon.positives());
         for p in 0..batch.positives() {
-            // Buffer of positives are [P, B].
+            // Positives are [P, B].
             let at = p * rows + row;
             let k = usize::from(batch.ks()[at]);
             let right = match (spec.horizon, want.steps_left) {
@@ -89,7 +89,7 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
     (ages as f64 / rows as f64, versions)
 }
 
-/// Checks that each frame of a stacked state travels once, and that no more of them do than were reckoned with.
+/// Checks that each frame of stacked states is sent once, and that the payload is at most as long as `BatchHeader::of` computes.
 fn check_frames(batch: &Batch, spec: &RunSpec) {
     let (header, payload) = batch.clone().into_payload();
     assert_eq!(&Batch::from_payload(header, payload).unwrap(), batch);
@@ -157,7 +157,7 @@ proptest! {
         }
         let mut replay = Replay::new(&spec, &config, 8).unwrap();
         let mut history = History::new(&spec, capacity);
-        // With the part of its life, which ends where transitions are lost.
+        // Each actor, with the part of its incarnation; a part ends where transitions are lost.
         let mut known: HashMap<u32, (Actor, u8)> = HashMap::new();
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {
@@ -171,7 +171,7 @@ proptest! {
             let (actor, part) = known.entry(number).or_insert_with(|| fresh(1));
             join(&mut replay, number, actor.next.incarnation);
             match rng.random_range(0..20) {
-                // The actor dies and starts anew; a straggler of its former life is refused.
+                // The actor dies and restarts. A late chunk of its former incarnation is rejected.
                 0 => {
                     let old = actor.next;
                     (*actor, *part) = fresh(old.incarnation + 1);
@@ -184,7 +184,7 @@ proptest! {
                         refused += 1;
                     }
                 }
-                // Transitions get lost before the next chunk.
+                // Transitions are lost before the next chunk.
                 1 if actor.next.sequence > 0 && *part < 200 => {
                     let count = rng.random_range(1..9);
                     actor.next.first_transition += count;
@@ -200,7 +200,7 @@ proptest! {
                     prop_assert_eq!(replay.insert(&chunk), stored(history.inserted));
                     retried += 1;
                 }
-                // A chunk that is ahead of its time.
+                // A chunk that is out of order.
                 3 => {
                     let sequence = actor.next.sequence + rng.random_range(1..4);
                     let chunk = Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
@@ -214,7 +214,7 @@ proptest! {
                     prop_assert_eq!(replay.insert(&chunk), stored(history.inserted));
                 }
                 _ if history.inserted == 0 => {}
-                // Memory that held something else: whatever is not written shows.
+                // The memory is not zeroed, so that a byte that is not written shows.
                 _ => match replay.draw(8, |bytes| vec![0xAB; bytes].into()).map(PackedBatch::unpack) {
                     Ok(batch) => {
                         check_batch(&batch, &history);

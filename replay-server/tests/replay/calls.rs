@@ -1,4 +1,4 @@
-//! What tests say to a replay, and its answers.
+//! Calls of tests to a replay, and the expected replies.
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Horizon, InsertReply, Learned, LearnerJoin,
@@ -12,12 +12,12 @@ pub(crate) fn small_spec() -> RunSpec {
     spec(3, 1, 1, Horizon::None {})
 }
 
-/// The first shard of a replay of `small_spec`, for batches of 8 rows.
+/// Creates a replay of `small_spec`, for batches of 8 rows.
 pub(crate) fn small(config: &Config) -> Replay {
     Replay::new(&small_spec(), config, 8).unwrap()
 }
 
-/// Of a chunk with frames as `small_spec` and other runs of three channels have them.
+/// Returns the header of a chunk with frames as in `small_spec` and other runs of three channels.
 pub(crate) fn header(
     actor: u32,
     incarnation: u64,
@@ -47,7 +47,7 @@ impl Actor {
         Self { next }
     }
 
-    /// The header of its next chunk, which counts as sent.
+    /// Returns the header of the actor's next chunk, and counts the chunk as sent.
     pub(crate) fn send(&mut self, streams: u32, steps: u32) -> ChunkHeader {
         (self.next.streams, self.next.steps) = (streams, steps);
         let sent = self.next;
@@ -95,7 +95,7 @@ pub(crate) const fn learned(updates: u64, saved_updates: u64, rows_received: u64
     }
 }
 
-/// Inserts a chunk; an actor that is new joins with it.
+/// Inserts a chunk. If its actor is new, the actor joins first.
 pub(crate) fn insert(replay: &mut Replay, header: ChunkHeader) -> InsertReply {
     if replay.actor_incarnation(header.actor).is_none() {
         join(replay, header.actor, header.incarnation);
@@ -128,7 +128,7 @@ pub(crate) fn is_refused(reply: &InsertReply) -> bool {
     matches!(reply, InsertReply::Refused { .. })
 }
 
-/// A learner of run 1 that has learned so many rows in so many updates, when `inserted` transitions were stored.
+/// Returns the join of a learner of run 1 with `updates` updates and `rows` rows learned, when `inserted` transitions were stored.
 pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> LearnerJoin {
     LearnerJoin {
         learner,

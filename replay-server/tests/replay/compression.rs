@@ -1,4 +1,4 @@
-//! A compressed replay gives the same batches as a plain one, bit for bit, and keeps within its memory.
+//! A compressed replay gives the same batches as a plain one, bit for bit, and respects its memory limit.
 //! It does not test what the batches hold: `batches` does, with and without compression.
 
 use driml_protocol::{Buffer, Chunk, Horizon, RunSpec, TimeoutRule};
@@ -12,16 +12,16 @@ use crate::{
     history::{random_end, spec},
 };
 
-/// What frames show.
+/// The content of frames.
 #[derive(Clone, Copy, Debug)]
 enum Content {
     Noise,
     Constant,
-    /// Two pictures in turn.
+    /// Two alternating pictures.
     Alternating,
-    /// One picture that scrolls by a byte a step.
+    /// One picture that scrolls by a byte per step.
     Scrolling,
-    /// Each of these for a while.
+    /// Each of the above for a while.
     All,
 }
 
@@ -64,7 +64,7 @@ fn sized(height: u32, width: u32, stack: u32) -> RunSpec {
     }
 }
 
-/// An actor that plays.
+/// An actor that generates frames.
 struct Player {
     actor: Actor,
     rng: ChaCha8Rng,
@@ -100,11 +100,11 @@ fn store(replay: &mut Replay, chunk: &Chunk) {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
 
-    /// Through wrap-around, ends of levels and episodes, lost chunks, and drafts that are unpacked only later.
+    /// Covers wrap-around, ends of levels and episodes, lost chunks, and drafts that are unpacked later.
     #[test]
     fn batches_are_the_same_bit_for_bit(
         seed in any::<u64>(),
-        // Blocks of a whole run, of 16 frames, and of frames that are longer than a part should be.
+        // Blocks that hold a whole chunk of a stream, blocks of 16 frames, and frames that are longer than the limit of a part.
         (height, width, capacity) in prop_oneof![
             Just((4, 3, 24u64)), Just((4, 3, 200)), Just((64, 64, 60)), Just((182, 181, 30)),
         ],
@@ -125,7 +125,7 @@ proptest! {
         let steps_max = (capacity / u64::from(streams)).min(21) as u32;
         for _ in 0..20 {
             if rng.random_bool(0.1) {
-                // Lost on the way.
+                // Three transitions are lost.
                 player.actor.next.first_transition += 3;
             }
             let late = (plain.draw(16, Buffer::zeroed), packed.draw(16, Buffer::zeroed));
@@ -141,8 +141,8 @@ proptest! {
     }
 }
 
-/// Memory of a full replay: of noise not more than plain frames and a little, of what compresses far less, even after noise. Where the
-/// bytes allowed do not suffice, the oldest go first, and what is held is sampled as ever.
+/// The memory of a full replay: noise takes little more than plain frames; compressible frames take far less, even after noise. If the
+/// limit in bytes is reached, the oldest transitions are dropped first, and the rest is sampled as before.
 #[test]
 fn memory_follows_what_is_held_and_the_bytes_allowed_are_kept() {
     const CAPACITY: u64 = 1000;
@@ -167,7 +167,7 @@ fn memory_follows_what_is_held_and_the_bytes_allowed_are_kept() {
         for content in [Content::Noise, Content::Alternating, Content::Noise] {
             for _ in 0..50 {
                 let mut chunk = player.chunk(2, 12, content);
-                // Every frame begins with its own number.
+                // Every frame begins with its number.
                 for row in 0..24 {
                     chunk.frame_mut(row)[..8].copy_from_slice(&number.to_le_bytes());
                     number += 1;

@@ -22,7 +22,7 @@ proptest! {
     #[test]
     fn delays_repeats_and_drops_change_nothing(seed in any::<u64>(), actors in 1u32..4, chunks in 1u64..30) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        // A limiter that blocks now and then; the learner below frees it.
+        // The limiter blocks now and then; the learner below frees it.
         let mut replay = small(&Config {
             replay_ratio: 1.0,
             slack_transitions: 16,
@@ -34,11 +34,11 @@ proptest! {
         let first = |actor: u32, sequence: u64| (0..sequence).map(|s| 2 * steps(actor, s)).sum::<u64>();
         while next.iter().any(|&sequence| sequence < chunks) {
             let actor = rng.random_range(0..actors);
-            // Send the chunk that the actor thinks is due, or one of the window after it.
+            // Sends the chunk that the actor thinks is due, or one of the next two.
             let sequence = (next[actor as usize] + rng.random_range(0..3)).min(chunks - 1);
             let header = header(actor, 9, sequence, first(actor, sequence));
             in_flight.push(ChunkHeader { steps: steps(actor, sequence) as u32, ..header });
-            // Any message of those in flight arrives; it may stay in flight and arrive again.
+            // Any message in flight arrives; it may stay in flight and arrive again.
             let at = rng.random_range(0..in_flight.len());
             let arrived = if rng.random_bool(0.7) { in_flight.swap_remove(at) } else { in_flight[at] };
             let reply = insert(&mut replay, arrived);
@@ -87,7 +87,7 @@ proptest! {
         let mut asked: Vec<_> = (0..clients).map(RequestId::first).collect();
         let mut ks = vec![0; 4];
         let (mut arrived, mut lost) = (0, 0);
-        // What was sent, overtaken requests too, in the order of its arrival.
+        // The requests sent, including overtaken ones. They arrive in random order.
         let mut in_flight: Vec<RequestId> = vec![];
         for _ in 0..20_000 {
             if arrived == batches {
@@ -119,18 +119,18 @@ proptest! {
     }
 }
 
-/// What an actor says, with its life.
+/// A message of an actor: actor, incarnation, and more.
 enum Said {
     Joins(u32, u64),
     Leaves(u32, u64, u64),
-    /// Its next chunk: the number, and the transitions that it says came before.
+    /// The next chunk: its sequence number, and the count of earlier transitions that it claims.
     Sends(u32, u64, u64, u64),
 }
 use Said::{Joins, Leaves, Sends};
-/// With (lost, duplicated, refused) after it, and what it is.
+/// Messages, each with the counters (lost, duplicated, refused) after it, and a description.
 type Story = [(Said, (u64, u64, u64), &'static str)];
 
-/// What was produced and never stored, or the reverse, is counted once.
+/// Counts once all transitions that were produced and never stored, or the reverse.
 #[test]
 fn what_was_lost_or_stored_twice_is_counted_once() {
     let absurd = u64::MAX;
@@ -198,7 +198,7 @@ fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     let unknown = insert(&mut replay, header(0, 2, 0, 0));
     assert!(is_refused(&unknown), "a life that has not joined");
-    // Nor does its `Leave` make it one.
+    // Nor does a `Leave` make the incarnation join.
     replay.leave(&last_word(0, 2, 6));
     join(&mut replay, 0, 2);
     let early = insert(&mut replay, header(0, 2, 1, 6));
@@ -239,7 +239,7 @@ fn a_poll_says_what_became_of_a_chunk() {
     assert_eq!(replay.status().chunks_retried, 0, "nothing was sent twice");
 }
 
-/// A replay after three chunks, whose ratio is 4.
+/// Returns a replay of ratio 4 after three chunks.
 fn with_three_chunks(transitions_max: Option<u64>) -> Replay {
     let mut replay = small(&Config {
         replay_ratio: 4.0,
@@ -253,7 +253,7 @@ fn with_three_chunks(transitions_max: Option<u64>) -> Replay {
     replay
 }
 
-/// A learner that died had learned from fewer rows than were served to it: they are served again to its successor.
+/// A learner learned from fewer rows than it was served, and died: the other rows are served again to its successor.
 #[test]
 fn rows_that_were_not_learned_from_do_not_count() {
     let mut replay = with_three_chunks(Some(18));
@@ -272,7 +272,7 @@ fn rows_that_were_not_learned_from_do_not_count() {
     assert_eq!((status.rows_sampled, status.rows_unlearned), (40, 32));
     assert_eq!((status.updates, status.updates_relearned), (5, 3));
     replay.set_affinity(&affinity(6, 0.25)).unwrap();
-    // The successor's counts, an older one does not.
+    // The successor's matrix is used; a matrix that is older than that is ignored.
     assert_eq!(replay.status().affinity_version, 6);
     replay.set_affinity(&affinity(5, 0.5)).unwrap();
     assert_eq!(replay.status().affinity_version, 6);
@@ -283,7 +283,7 @@ fn rows_that_were_not_learned_from_do_not_count() {
     replay.check_valid();
 }
 
-/// Who may take the place of a learner that has done 8 updates, and how many of these are learned again.
+/// Which learners may replace one that has done 8 updates, and how many of these updates they repeat.
 #[test]
 fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
     let rejected = "the run has learned 8 updates, and the learner has no checkpoint of it: start the learner with the --run-dir \
@@ -306,7 +306,7 @@ fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
     ];
     for (which, join, expected) in cases {
         let mut replay = with_three_chunks(None);
-        // A run in which nothing was learned takes any learner.
+        // A run without any update accepts any learner.
         replay.join_learner(learner(0, 0, 0, 0)).unwrap();
         replay.join_learner(learner(1, 0, 0, 0)).unwrap();
         for _ in 0..8 {

@@ -1,5 +1,5 @@
-//! The slow, obvious reference: everything that was ever stored, stream by stream, and what a row of it must hold.
-//! It knows nothing of rings, links or windows.
+//! The slow, obvious reference: every transition ever stored, stream by stream, and the expected content of rows.
+//! It has no rings, links or windows.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, Timeo
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-/// One transition, where it was stored and which weights chose its action.
+/// A transition, its index in the ring, and the version of the weights that chose its action.
 #[derive(Clone, Debug)]
 pub(crate) struct Record {
     pub(crate) index: u64,
@@ -17,10 +17,10 @@ pub(crate) struct Record {
     pub(crate) weights_version: u64,
 }
 
-/// (actor, incarnation, stream, part): a part ends where transitions were lost.
+/// (actor, incarnation, stream, part). A part ends where transitions were lost.
 pub(crate) type StreamKey = (u8, u8, u8, u8);
 
-/// Everything that was stored.
+/// All transitions that were stored.
 pub(crate) struct History {
     pub(crate) spec: RunSpec,
     pub(crate) capacity: u64,
@@ -30,7 +30,7 @@ pub(crate) struct History {
     pub(crate) streams: BTreeMap<StreamKey, Vec<Record>>,
 }
 
-/// What a row must hold; k is not determined, only how far it may go.
+/// The expected content of a row. k is random, so only its maximum is known.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Row {
     pub(crate) action: u8,
@@ -70,7 +70,7 @@ pub(crate) fn random_end(rng: &mut ChaCha8Rng) -> End {
     }
 }
 
-/// A frame that says which one it is: its identity, then bytes that depend on the identity and their place.
+/// Returns a frame that begins with its identity; the other bytes depend on the identity and their position.
 pub(crate) fn frame(spec: &RunSpec, key: StreamKey, step: usize) -> Vec<u8> {
     let id = [key.0, key.1, key.2, key.3, step as u8, (step >> 8) as u8];
     let hash = id.iter().fold(17u32, |hash, &b| {
@@ -82,7 +82,7 @@ pub(crate) fn frame(spec: &RunSpec, key: StreamKey, step: usize) -> Vec<u8> {
         .collect()
 }
 
-/// The identity of the newest frame of a state.
+/// Returns the identity of the newest frame of a state.
 pub(crate) fn identity(spec: &RunSpec, state: &[u8]) -> (StreamKey, usize) {
     let (channels, stack) = (spec.frame_channels as usize, spec.frame_stack as usize);
     let pixels = state.chunks(channels * stack);
@@ -109,7 +109,7 @@ impl History {
         self.inserted.saturating_sub(self.capacity)
     }
 
-    /// Makes the next chunk of an incarnation, `part` of it, and writes it down as if stored.
+    /// Makes the next chunk of part `part` of an incarnation, and records it as stored.
     pub(crate) fn next_chunk(
         &mut self,
         header: ChunkHeader,
@@ -147,13 +147,13 @@ impl History {
         chunk
     }
 
-    /// The first step of the level that step `t` belongs to.
+    /// Returns the first step of the level of step `t`.
     fn level_start(records: &[Record], t: usize) -> usize {
         let ended = (0..t).rev().find(|&i| records[i].end != End::Running);
         ended.map_or(0, |i| i + 1)
     }
 
-    /// The steps whose frames make the state of step `t`, oldest first.
+    /// Returns the steps whose frames make the state of step `t`, oldest first.
     fn stack_steps(&self, key: StreamKey, t: usize) -> Vec<usize> {
         let start = Self::level_start(&self.streams[&key], t);
         let stack = self.spec.frame_stack as usize;
@@ -185,7 +185,7 @@ impl History {
         if !held(&t) || timed_out || !self.stack_steps(key, t).iter().all(held) {
             return false;
         }
-        // After a loss it is not known what came before the part's first step.
+        // After a loss, the steps before the part's first step are unknown.
         let reaches_into_the_lost = t + 1 < self.spec.frame_stack as usize;
         if key.3 > 0 && reaches_into_the_lost && Self::level_start(records, t) == 0 {
             return false;
@@ -196,7 +196,7 @@ impl History {
         ends || t + reach < records.len()
     }
 
-    /// Every valid anchor.
+    /// Returns every valid anchor.
     pub(crate) fn valid_anchors(&self) -> Vec<(StreamKey, usize)> {
         let all = self
             .streams
@@ -205,7 +205,7 @@ impl History {
         all.filter(|&(key, t)| self.is_valid(key, t)).collect()
     }
 
-    /// What the row of anchor `t` must hold.
+    /// Returns the expected row of anchor `t`.
     pub(crate) fn row(&self, key: StreamKey, t: usize) -> Row {
         let records = &self.streams[&key];
         let n = self.spec.n_step as usize;
@@ -238,7 +238,7 @@ impl History {
         }
     }
 
-    /// Episodes that ended, and the mean return of the last 100 of those that were seen whole.
+    /// Returns the number of ended episodes, and the mean return of the last 100 that were seen completely.
     pub(crate) fn episodes(&self) -> (u64, Option<f64>) {
         let mut ended: Vec<(u64, Option<f64>)> = vec![];
         for (key, records) in &self.streams {

@@ -1,4 +1,4 @@
-//! The k that are drawn, against the closed form of each rule, as served.
+//! Compares the k in batches with the closed form of each rule.
 
 use std::collections::HashMap;
 
@@ -14,7 +14,7 @@ use crate::{
     rows::prioritised,
 };
 
-/// Row-wise softmax of random scores of the given spread.
+/// Returns the row-wise softmax of random scores of the given spread.
 fn random_affinity(num_actions: u32, spread: f32, rng: &mut ChaCha8Rng) -> AffinityUpdate {
     let mut matrix = vec![];
     for _ in 0..num_actions {
@@ -27,7 +27,7 @@ fn random_affinity(num_actions: u32, spread: f32, rng: &mut ChaCha8Rng) -> Affin
     affinity(1, num_actions, matrix)
 }
 
-/// P(k = 1), .., P(k = H): (1 - A_i) prod_{j<i} A_j for i < H, and prod_{j<H} A_j.
+/// Returns P(k = 1), .., P(k = H): (1 - A_i) prod_{j<i} A_j for i < H, and prod_{j<H} A_j.
 fn nhg_law(update: &AffinityUpdate, actions: &[u8]) -> Vec<f64> {
     let n = update.num_actions as usize;
     let at = |i: usize| usize::from(actions[i - 1]) * n + usize::from(actions[i]);
@@ -55,7 +55,7 @@ fn an_older_or_broken_affinity_is_not_taken() {
     }
 }
 
-/// k as it leaves the server, anchor by anchor: the walk must read the actions that follow that anchor, by whatever rule it was drawn.
+/// Tests the k in batches for each anchor: by whatever rule the anchor was drawn, the walk must read the actions that follow it.
 #[test]
 fn the_k_served_follow_the_law() {
     let mut rng = ChaCha8Rng::seed_from_u64(15);
@@ -89,7 +89,7 @@ fn filled(horizon: Horizon, config: &Config, rng: &mut ChaCha8Rng) -> (Replay, H
     (replay, history)
 }
 
-/// `law` gives the probability of each k from the actions that follow an anchor.
+/// Checks the k of batches against `law`, which gives the probability of each k from the actions that follow an anchor.
 fn check_ks(replay: &mut Replay, history: &History, law: impl Fn(&[u8]) -> Vec<f64>) {
     let mut counts: HashMap<_, Vec<u64>> = HashMap::new();
     for _ in 0..600 {

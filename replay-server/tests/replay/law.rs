@@ -1,8 +1,8 @@
-//! Whether counts follow a law: Pearson's chi-square test.
+//! Tests whether counts follow a law: Pearson's chi-square test.
 
-/// The chance that a right sampler fails one of these tests; seeds are fixed, so a pass stays a pass.
+/// The probability that a correct sampler fails one of these tests. Seeds are fixed, so results do not change.
 pub(crate) const SIGNIFICANCE: f64 = 1e-4;
-/// The quantile of the standard normal that belongs to [`SIGNIFICANCE`], one-sided.
+/// The quantile of the standard normal for [`SIGNIFICANCE`], one-sided.
 const Z: f64 = 3.719;
 
 /// Pearson's statistic, summed over independent experiments.
@@ -13,7 +13,7 @@ pub(crate) struct ChiSquare {
 }
 
 impl ChiSquare {
-    /// Adds one experiment: `counts` against `probabilities`, which sum to 1. Cells that expect less than 5 are pooled.
+    /// Adds one experiment: `counts` against `probabilities`, which sum to 1. Pools cells with expected counts below 5.
     pub(crate) fn add(&mut self, counts: &[u64], probabilities: &[f64]) {
         assert_eq!(counts.len(), probabilities.len());
         assert!(

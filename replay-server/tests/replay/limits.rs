@@ -1,5 +1,5 @@
-//! What a replay rejects or delays, settings that cannot work, and the end of a run: neither side waits forever.
-//! Rows are looked at where a replay holds the least, and no message is lost or repeated.
+//! Messages that a replay rejects or delays, settings that cannot work, and the end of a run: neither side waits forever.
+//! Rows are checked only for the smallest replay. No message is lost or repeated.
 
 use driml_protocol::{
     Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, ShardCounts, Waiting,
@@ -49,7 +49,7 @@ fn unfit_chunks_are_refused_with_a_reason() {
         chunk
     };
     let mut unfit = vec![(with(5, 0.0), "action 5; this run has 5")];
-    // Of rewards the sum of seven must be a float.
+    // The sum of seven rewards must be a finite f32.
     for reward in [3e38, -3e38, f32::MAX, f32::NAN] {
         unfit.push((with(0, reward), "scale the world's rewards"));
     }
@@ -112,10 +112,10 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert_eq!(replay.sample(8), Err(NotReady::Wait(HUNGRY)));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
-    // 6 ahead, of a slack of 6.
+    // 6 transitions ahead, with a slack of 6.
     assert_eq!(insert(&mut replay, header(1, 1, 0, 0)), stored(18));
     assert!(replay.status().finished);
-    // A retry is still a retry.
+    // A retry is still answered `Stored`.
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
     for sequence in [2, 7] {
         let reply = insert(&mut replay, header(0, 1, sequence, 12));
@@ -126,7 +126,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     }
     assert_eq!(replay.sample(8), Err(NotReady::Finished));
     assert_eq!(replay.waiting(), Waiting::Finished);
-    // 48 rows of 12 transitions after the warm-up.
+    // 48 rows for 12 transitions after the warm-up.
     assert_eq!(replay.status().replay_ratio(), Some(4.0));
     replay.leave(&last_word(0, 1, 12));
     assert_eq!(replay.status().transitions_lost, 0);
@@ -144,7 +144,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     let early = insert(&mut replay, header(0, 1, 2, 12));
     assert_eq!(early, InsertReply::OutOfOrder { expected: 1 });
     assert_eq!(replay.waiting(), Waiting::ActorsWaitForLearner);
-    // None, and more than slack * ratio.
+    // No rows, and more than slack * ratio.
     for rows in [0, 9] {
         let drawn = replay.sample(rows);
         assert!(matches!(drawn, Err(NotReady::Refused { .. })), "{drawn:?}");
@@ -164,7 +164,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     assert_eq!(replay.status().messages_refused, 2);
 }
 
-/// Nothing ends and no stream is long enough: both sides would wait for each other, were actors not let on.
+/// No episode ends and no stream is long enough for an anchor. Both sides would wait for each other if the limiter held the actors back.
 #[test]
 fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
     let config = Config {
@@ -206,7 +206,7 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     };
     let mut replay = small(&config);
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
-    // Rows: 4 for each of the 106 transitions that are stored, of a capacity of 1000 and of a slack of 100.
+    // The limit of rows: 4 for each of 106 transitions stored, a capacity of 1000 and a slack of 100.
     for (lie, bound) in [
         (counts(6001, 0), "at most 6000"),
         (counts(u64::MAX, u64::MAX), "at most 6000"),
@@ -229,7 +229,7 @@ fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
     insert(&mut replay, header(0, 1, 0, 0));
     replay.sample(8).unwrap();
     let affinity = |version| affinity(version, 5, vec![0.2; 25]);
-    // 2^32 ahead of the rows.
+    // 2^32 more than the rows.
     let most: u64 = 8 + (1 << 32);
     for version in [most + 1, u64::MAX] {
         let why = replay.set_affinity(&affinity(version)).unwrap_err();
@@ -249,7 +249,7 @@ proptest! {
         warmup in 0u64..3000,
         extra in 0u64..200,
         length in 0u64..5000,
-        // Where it was resumed with another warm-up, ratio or batch size: transitions and rows before.
+        // A resume with another warm-up, ratio or batch size: transitions and rows before it.
         resumed in prop::option::of((0u64..4000, 0u64..10_000)),
         moves in prop::collection::vec((any::<bool>(), 1u64..300), 1..400),
     ) {
@@ -268,10 +268,10 @@ proptest! {
         })
         .counting_on(counts(transitions, rows_before), ShardCounts::default());
         let (mut inserted, mut sampled) = (transitions, rows_before);
-        // Rows that the ratio has allowed, counted one transition at a time.
+        // The rows that the ratio allows, counted one transition at a time.
         let mut allowed = rows_before as f64;
         let mut moves = moves.into_iter();
-        // The moves first, then whatever is possible to the end.
+        // First the given moves, then all moves that are possible, to the end.
         loop {
             let next = moves.next();
             let (insert, chunk) = next.unwrap_or((limiter.may_insert(), 50));

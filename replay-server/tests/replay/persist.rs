@@ -1,5 +1,5 @@
-//! A replay that is kept on disk, stopped at any record and at any byte of its last write: what comes back is what was there.
-//! What damage costs is in `persist_damage`.
+//! A replay on disk, stopped at any record and at any byte of its last write: recovery restores all that was stored.
+//! `persist_damage` tests the cost of damage.
 
 use std::{
     fs,
@@ -22,11 +22,11 @@ use crate::{
 
 /// Rows of a batch.
 pub(crate) const ROWS: u32 = 4;
-/// Bytes of a record before its body, and where the body's length is.
+/// Bytes of a record before its body, and the offset of the body's length.
 const HEAD_BYTES: u64 = 32;
 const LENGTH_AT: usize = 16;
 
-/// A replay in a folder, everything that was stored in it, and those that talk to it.
+/// A replay in a folder, all transitions stored in it, and its actors and clients.
 pub(crate) struct StoredReplay {
     pub(crate) args: PersistArgs,
     pub(crate) config: Config,
@@ -49,7 +49,7 @@ pub(crate) fn open(
     Replay::open(args, &test_spec(), config, ROWS)
 }
 
-/// A replay of this capacity that is kept in `dir`, in segments of about `segment_bytes`.
+/// Returns the arguments of a replay in `dir`, with segments of about `segment_bytes`.
 pub(crate) fn args(dir: &Path, segment_bytes: u64) -> PersistArgs {
     PersistArgs {
         dir: dir.to_owned(),
@@ -59,7 +59,7 @@ pub(crate) fn args(dir: &Path, segment_bytes: u64) -> PersistArgs {
     }
 }
 
-/// The segments in a folder, by number.
+/// Returns the segments in a folder, ordered by number.
 pub(crate) fn segments(dir: &Path) -> Vec<PathBuf> {
     let mut all: Vec<_> = fs::read_dir(dir)
         .unwrap()
@@ -84,18 +84,18 @@ pub(crate) fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// Whether the newest transitions are held, as many as the capacity says.
+/// Whether the ring holds as many of the newest transitions as its capacity.
 fn is_held_by_number(config: &Config) -> bool {
     config.compressed_bytes_max.is_none() && config.disk_bytes_max.is_none()
 }
 
-/// What a log brings back of a server that died.
+/// Returns the state that a log restores after the server died.
 pub(crate) fn stored(replay: &Replay) -> Vec<u8> {
     replay.stored_bytes().unwrap()
 }
 
 impl StoredReplay {
-    /// Ends it: what its successor begins with.
+    /// Drops the replay, and returns the arguments and settings for its successor.
     pub(crate) fn end(self) -> (PersistArgs, Config) {
         drop(self.replay);
         (self.args, self.config)
@@ -122,7 +122,7 @@ impl StoredReplay {
         }
     }
 
-    /// The next chunk of an actor.
+    /// Stores the next chunk of an actor.
     pub(crate) fn store(&mut self, actor: usize) {
         let actor = &mut self.actors[actor];
         actor.next.weights_version = self.rng.random_range(0..9);
@@ -132,7 +132,7 @@ impl StoredReplay {
         assert!(is_stored(&reply), "{reply:?}");
     }
 
-    /// A batch for a request of a client, or why there is none.
+    /// Draws a batch for the request of a client; `None` if none is available.
     pub(crate) fn draw(&mut self, client: usize) -> Option<Batch> {
         let id = self.requests[client];
         let drawn = self.replay.draw_for(id, ROWS, Buffer::zeroed);
@@ -148,7 +148,7 @@ impl StoredReplay {
             9..16 => {
                 let client = self.rng.random_range(0..3);
                 let id = &mut self.requests[client];
-                // One that did not arrive is asked for again.
+                // A batch that did not arrive is requested again.
                 *id = if self.rng.random_bool(0.3) {
                     id.again()
                 } else {
@@ -182,7 +182,7 @@ impl StoredReplay {
                 self.replay.join_learner(join).unwrap();
             }
             _ => {
-                // One that cannot be answered yet, or ever.
+                // A request that cannot be answered yet, or never.
                 let id = RequestId::first(9);
                 let _ = self.replay.draw_for(id, 1, Buffer::zeroed);
             }
@@ -190,13 +190,13 @@ impl StoredReplay {
     }
 }
 
-/// The end of the record that begins at byte `at` of a segment.
+/// Returns the end of the record that begins at byte `at` of a segment.
 fn record_end(bytes: &[u8], at: u64) -> u64 {
     let length = &bytes[at as usize + LENGTH_AT..][..8];
     at + HEAD_BYTES + u64::from_le_bytes(length.try_into().unwrap())
 }
 
-/// The log of a replay that died is used: what the learner says it has counts, and rows are right.
+/// Uses a replay restored after a crash: the learner's report replaces the count of rows, and rows are right.
 fn check_continues(life: &StoredReplay, mut replay: Replay) {
     let rows = life.replay.counts().rows_sampled;
     replay.note_learned(learned(0, 0, rows)).unwrap();
@@ -254,7 +254,7 @@ proptest! {
         replay.check_valid();
         drop(replay);
 
-        // It had died while it wrote the last record, at any byte of it.
+        // The process died while it wrote the last record, at any byte of it.
         let torn = root.path().join("torn");
         copy(&life.args.dir, &torn);
         let path = torn.join(newest.file_name().unwrap());
@@ -268,7 +268,7 @@ proptest! {
                     fs::remove_file(later).unwrap();
                 }
             }
-            // What was removed with the rows of this write was not yet.
+            // Skips cases in which this write removed segments, which would still exist if it had not completed.
             for older in &known {
                 let kept = torn.join(older.file_name().unwrap());
                 prop_assume!(kept.exists());
@@ -279,7 +279,7 @@ proptest! {
             replay.check_valid();
         }
 
-        // It comes back from the start after a start, too.
+        // The replay can be opened again after a recovery.
         let (replay, _) = open(&args(&dead, segment_bytes), &life.config).unwrap();
         prop_assert_eq!(stored(&replay), after);
         check_continues(&life, replay);
@@ -298,7 +298,7 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     let bytes = bytes_in(&life.args.dir);
     assert!(bytes < 20_000, "{bytes}");
 
-    // A ring that is larger than the budget: the oldest leave it too.
+    // The ring is larger than the budget: the oldest transitions leave the ring too.
     let config = Config {
         disk_bytes_max: Some(4 << 20),
         ..Config::unlimited(1_000_000)
@@ -344,8 +344,8 @@ fn a_resumed_run_continues_with_what_was_kept() {
     let before = life.replay.status();
     let (mut args, config) = life.end();
 
-    // The learner saved after 50 updates: the rows beyond them are served again. Or it knows of more than the log does, whose end went
-    // with the machine's power.
+    // The learner saved after 50 updates: rows beyond them are served again. Or the learner has done more updates than the log knows, as a
+    // power cut lost the log's end.
     for (number, updates) in [(78, 50), (79, 70)] {
         let (mut replay, _) = open(&args, &config).unwrap();
         let rows = updates * u64::from(ROWS);
@@ -360,7 +360,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
         replay.check_valid();
     }
 
-    // A folder in which a run is resumed that kept no replay before counts from its checkpoint, also after a restart.
+    // A run is resumed in a folder without a replay: it continues the counts of the checkpoint, also after a restart.
     args.dir = root.path().join("fresh");
     let (mut replay, _) = open(&args, &config).unwrap();
     replay.join_learner(learner(80, 70, 280, 90)).unwrap();
@@ -371,7 +371,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
     assert_eq!((counts.inserted, counts.rows_sampled), (90, 280));
 }
 
-/// Reading can be watched and broken off; what is kept is then what it was.
+/// Reading reports its progress and can be stopped, which leaves the log unchanged.
 #[test]
 fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let root = tempfile::tempdir().unwrap();

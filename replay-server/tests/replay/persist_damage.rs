@@ -1,4 +1,4 @@
-//! A log with bits flipped, files missing or foreign: a warning says so, the rest is used, and rows of batches are right all the same.
+//! A log with flipped bits, missing or foreign files: a warning reports each, the rest is used, and rows of batches are still right.
 
 use std::{
     fs,
@@ -21,7 +21,7 @@ use crate::{
     persist::{ROWS, StoredReplay, args, open, segments, stored, test_spec},
 };
 
-/// A log of a dozen segments of some transitions each, and what is in it.
+/// A log of about a dozen segments with some transitions each, and a reference of its content.
 struct Kept {
     _root: tempfile::TempDir,
     args: PersistArgs,
@@ -35,7 +35,7 @@ impl Kept {
         let root = tempfile::tempdir().unwrap();
         let (dir, config) = (root.path().join("log"), Config::unlimited(capacity));
         let mut life = StoredReplay::begin(&dir, config, 4_000, 3);
-        // Until the newest has some, too.
+        // Until the newest segment has some transitions, too.
         let (mut newest, mut in_newest) = (None, 0);
         while life.history.inserted < 800 || in_newest < 5 {
             life.store(0);
@@ -61,7 +61,7 @@ impl Kept {
         open(&self.args, &self.config).unwrap()
     }
 
-    /// Opens it, which warns of all of these and of nothing where there are none.
+    /// Opens the log, and checks that each of `words` is in a warning. Without words, no warning may come.
     fn open_saying(&self, words: &[&str]) -> Replay {
         let (replay, recovery) = self.open();
         let said = |words: &&str| recovery.warnings.iter().any(|it| it.contains(words));
@@ -73,7 +73,7 @@ impl Kept {
         replay
     }
 
-    /// Checks batches of what came back, which holds `held` transitions or more: nothing of what is gone is in them.
+    /// Checks the restored replay and batches from it: they contain no lost transition.
     fn check(&self, replay: &mut Replay) {
         replay.check_valid();
         for client in 0..200 {
@@ -93,7 +93,7 @@ fn flip(path: &Path, at: impl FnOnce(usize) -> usize) {
     fs::write(path, bytes).unwrap();
 }
 
-/// Damage of any kind at any place: a bit, a range, a cut, a missing file, one in the place of another.
+/// Damages a log in any way at any place: a bit, a range, a cut, a missing file, a file in the place of another.
 fn damage(dir: &Path, rng: &mut ChaCha8Rng) {
     let all = segments(dir);
     let path = &all[rng.random_range(0..all.len())];
@@ -116,11 +116,11 @@ fn damage(dir: &Path, rng: &mut ChaCha8Rng) {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
 
-    /// Whatever happens to the files, the server starts or says why not; what it serves is right, and it comes back once more.
+    /// Whatever happens to the files, the server starts or gives a reason. The rows that it serves are right, and it can be opened again.
     #[test]
     fn whatever_is_damaged_what_is_served_is_right(seed in any::<u64>(), damages in 1usize..5, capacity in 300u64..2_000) {
         let mut kept = Kept::new(capacity);
-        // Where the end was cut off, older ones are held.
+        // If the end was cut off, older transitions are still held.
         kept.history.capacity = u64::MAX;
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         for _ in 0..damages {
@@ -136,7 +136,7 @@ proptest! {
         prop_assert!(status.transitions_inserted <= kept.history.inserted);
         for client in 0..20 {
             let drawn = replay.draw_for(RequestId::first(1_000 + client), ROWS, Buffer::zeroed);
-            // There may be nothing left.
+            // There may be no transition left.
             let Ok(batch) = drawn else { break };
             check_rows(&batch.unpack(), &kept.history);
         }
@@ -147,15 +147,15 @@ proptest! {
     }
 }
 
-/// Copies a segment to where another would be, as far as `bytes`.
+/// Copies the first `bytes` bytes of a segment to the file of segment `number`.
 fn copy_to(segment: &Path, number: u64, bytes: usize) {
     let other = segment.with_file_name(format!("segment-{number:012}.log"));
     let copied = fs::read(segment).unwrap();
     fs::write(other, &copied[..bytes.min(copied.len())]).unwrap();
 }
 
-/// The third byte of the length of the second record: it looks like a write that the end of the process cut off. No actor was told of
-/// such a one; of what is lost here one was.
+/// Damages the third byte of the second record's length, so that the record looks like an incomplete write. An incomplete write was never
+/// acknowledged, but this record was.
 fn lengthen_a_record(segment: &Path) {
     let bytes = fs::read(segment).unwrap();
     let heads = bytes.windows(4).enumerate();
@@ -174,7 +174,7 @@ fn append_zeros(segment: &Path) {
     fs::write(segment, &bytes).unwrap();
 }
 
-/// What is left: all that was stored, all counts and the transitions of other segments, or what was stored before.
+/// What remains: all transitions, all counts and the transitions of other segments, or the state of an earlier moment.
 #[derive(Clone, Copy, PartialEq)]
 enum Left {
     All,
@@ -183,7 +183,7 @@ enum Left {
 }
 use Left::{All, Beginning, Counts};
 
-/// Something happens to the last segment, or to an earlier one.
+/// Damages the last segment, or an earlier one.
 #[test]
 fn damage_costs_what_it_hits_and_is_said() {
     type Spoil = fn(&Path);
@@ -208,7 +208,7 @@ fn damage_costs_what_it_hits_and_is_said() {
         (last, remove, &[next], Beginning),
         (last, lengthen_a_record, &["are cut off"], Beginning),
         (last, append_zeros, &[], All),
-        // One that was just begun, one under another's name, a copy of one, and who it is: that is in the segments, too.
+        // A segment that was just begun, one under another's name, a copy, and a missing identity, which the segments have too.
         (3, begin_one, &[], All),
         (3, misplace, &[misplaced], All),
         (3, back_up, &[], All),
@@ -232,7 +232,7 @@ fn damage_costs_what_it_hits_and_is_said() {
         if is_whole {
             kept.check(&mut replay);
         }
-        // The warning comes again for as long as what is gone would be held, unless nothing older is left.
+        // The warning is repeated as long as the lost transitions would be held, unless no older segment is left.
         let after = stored(&replay);
         drop(replay);
         let (replay, recovery) = kept.open();
@@ -241,14 +241,14 @@ fn damage_costs_what_it_hits_and_is_said() {
         let is_within = *left == Counts && *segment > 0;
         assert_eq!(says_gone, is_within, "case {number}: {recovery:?}");
     }
-    // None is missing where the oldest were removed with their transitions.
+    // No warning comes if the oldest segments were removed with their transitions.
     let kept = Kept::new(100);
     let mut replay = kept.open_saying(&[]);
     assert_eq!(stored(&replay), kept.stored);
     kept.check(&mut replay);
 }
 
-/// What was acknowledged and is lost never comes again: the actor, which continues, is taken at its word, and the loss is counted.
+/// Lost chunks that were acknowledged are never sent again. The actor's next chunk is accepted, and the loss is counted.
 #[test]
 fn after_a_loss_an_actor_continues_and_the_loss_is_counted() {
     let kept = Kept::new(10_000);
@@ -262,10 +262,10 @@ fn after_a_loss_an_actor_continues_and_the_loss_is_counted() {
         steps: 4,
         ..header(0, 1, sequence, kept.history.inserted)
     };
-    // Far beyond what came back.
+    // Far beyond the last restored chunk.
     let sequence = 10_000;
     let mut insert = |sequence| replay.insert(&Chunk::zeroed(header(sequence)));
-    // One that overtook the one before it is told so; an actor that then sends the same again has nothing older.
+    // A chunk that overtook the one before is rejected. An actor that then repeats the same chunk has no older one.
     for early in [sequence + 1, sequence] {
         let reply = insert(early);
         assert!(matches!(reply, InsertReply::OutOfOrder { .. }), "{reply:?}");
@@ -346,7 +346,7 @@ fn a_folder_is_one_servers_and_one_runs() {
     check_refused(own, spec, config, words);
 }
 
-/// Other settings of the same run: what is held follows them.
+/// Opens the log with other settings of the same run, which determine what is held.
 #[test]
 fn a_run_may_go_on_with_another_capacity() {
     let kept = Kept::new(10_000);
@@ -359,7 +359,7 @@ fn a_run_may_go_on_with_another_capacity() {
         replay.check_valid();
         replay.sample(ROWS).unwrap();
     }
-    // Also where more is gone than it holds.
+    // Also if more transitions are gone than the ring holds.
     let kept = Kept::new(10_000);
     let segments = kept.segments();
     segments[1..segments.len() - 2]

@@ -1,5 +1,5 @@
-//! Restoring a replay to a mark in its log: the state is that of the mark, whatever came after it.
-//! What comes back without a mark is tested in `persist`.
+//! Restores a replay to a mark in its log: the state is that of the mark, whatever the log recorded later.
+//! `persist` tests recovery without a mark.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ fn state(replay: &Replay) -> Vec<u8> {
     replay.state_bytes().unwrap()
 }
 
-/// What is drawn next, of which the log learns nothing, and learned from where that counts.
+/// Draws the next batches, which the log does not record. With priorities, also updates them.
 fn next_draws(replay: &mut Replay) -> Vec<Batch> {
     let draw = |_| {
         let batch = replay.sample(ROWS).unwrap();
@@ -30,7 +30,7 @@ fn next_draws(replay: &mut Replay) -> Vec<Batch> {
     (0..5).map(draw).collect()
 }
 
-/// A life whose ring of 60 is smaller than what is stored, and whose segments are full after a few chunks.
+/// Returns a replay that has stored more than its ring of 60 holds, with segments that are full after a few chunks.
 fn begin(folder: &Path, config: Config, seed: u64) -> StoredReplay {
     let mut life = StoredReplay::begin(folder, config, 600, seed);
     for _ in 0..30 {
@@ -95,14 +95,14 @@ fn a_log_goes_back_to_its_last_two_marks() {
                 assert!(next_draws(&mut replay) == *draws, "seed {seed}");
             }
         }
-        // To go back to the older one gives the newer one up.
+        // Rolling back to the older mark removes the newer one.
         at(&args, &config, marks[0].0).unwrap();
         let gone = at(&args, &config, marks[1].0).map(drop).unwrap_err();
         assert!(matches!(gone, PersistError::NoMark(_)), "{gone}");
     }
 }
 
-/// Checkpoints that cannot be saved, one after the other, leave the newest that could its mark.
+/// Several checkpoints in a row cannot be saved: the newest saved checkpoint keeps its mark.
 #[test]
 fn marks_that_are_given_up_leave_the_one_before_them() {
     let folder = tempfile::tempdir().unwrap();

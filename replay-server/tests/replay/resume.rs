@@ -1,4 +1,4 @@
-//! A run that is resumed from its learner's checkpoint with an empty replay: what it counts, and what it waits for.
+//! A run that is resumed from its learner's checkpoint with an empty replay: its counts, and when it waits.
 //! Resuming all processes together is an end-to-end test.
 
 use driml_protocol::LearnerJoin;
@@ -16,7 +16,7 @@ fn config() -> Config {
     }
 }
 
-/// Plays to the end of the run: the chunks of 6 transitions that were stored, and the batches of `rows` that were served.
+/// Plays to the end of the run. Returns the number of chunks (of 6 transitions) stored, and of batches of `rows` rows served.
 fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
     let (mut batches, mut sequence) = (0, 0);
     loop {
@@ -33,7 +33,7 @@ fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
     }
 }
 
-/// 60 transitions warm up, 120 allow 480 rows: 60 updates of 8. What the checkpoint has, and what is left of it, in chunks and batches.
+/// 60 transitions warm up; 120 allow 480 rows, which are 60 updates of 8. Cases: the checkpoint, and the chunks and batches that remain.
 #[test]
 fn a_resumed_run_counts_on_and_fills_its_replay_first() {
     let since = Some(Since {
@@ -107,7 +107,7 @@ fn a_run_of_more_than_2_to_the_32_updates_counts_on() {
     }
 }
 
-/// Each shard fills again by its share, and counts on from what the learner says of it.
+/// Each shard refills its share, and continues the counts that the learner reports for it.
 #[test]
 fn shards_of_a_resumed_run_count_on_each_for_itself() {
     let config = Config {
@@ -141,7 +141,7 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
     }
 }
 
-/// A learner that comes back sends each shard's count at its checkpoint; it replaces a higher count from before.
+/// A learner that resumes sends each shard's count at its checkpoint, which replaces a higher count from before.
 #[test]
 fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
     let config = Config {
@@ -154,7 +154,7 @@ fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
     for sequence in 0..15 {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));
     }
-    // All rows of 90 + 90 transitions were given by the other shard; the learner saved after 200 of them.
+    // The other shard has served all rows of 90 + 90 transitions; the learner's checkpoint has 200 of them.
     replay.set_other_shards(counts(90, 480)).unwrap();
     assert_eq!(replay.sample(8), Err(NotReady::Finished));
     let join = LearnerJoin {

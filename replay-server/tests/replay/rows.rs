@@ -1,4 +1,4 @@
-//! Which rows are drawn: the law of both rules, who can be drawn, and what becomes of priorities that come late, twice or from elsewhere.
+//! Which rows are drawn: the law of both rules, which transitions are drawn, and late, repeated or foreign priorities.
 //! It does not check what the rows hold: `batches` does.
 
 use std::collections::HashMap;
@@ -34,16 +34,16 @@ pub(crate) fn prioritised(capacity: u64, alpha: f64) -> Config {
     }
 }
 
-/// A replay, all that it ever stored, and what its priorities have to be.
+/// A replay, all transitions that it ever stored, and their expected priorities.
 struct Setup {
     replay: Replay,
     history: History,
     rng: ChaCha8Rng,
-    /// None where rows are drawn uniformly.
+    /// `None` if rows are drawn uniformly.
     alpha: Option<f64>,
-    /// Of each transition that was learned from.
+    /// The priority of each transition that was learned from.
     priorities: HashMap<u64, f64>,
-    /// Of each that became an anchor, the highest priority then.
+    /// The priority of each transition when it became an anchor: the highest at that time.
     first: HashMap<u64, f64>,
     highest: f64,
     updates: u64,
@@ -86,7 +86,7 @@ impl Setup {
         self.replay.check_valid();
     }
 
-    /// Every transition that can be drawn, by its number.
+    /// Returns the index of every transition that can be drawn.
     fn anchors(&self) -> Vec<u64> {
         let anchors = self.history.valid_anchors().into_iter();
         let index = |(key, t): (StreamKey, usize)| self.history.streams[&key][t].index;
@@ -104,7 +104,7 @@ impl Setup {
         states.map(index).collect()
     }
 
-    /// Draws a batch and, where that counts, says what its rows' losses are.
+    /// Draws a batch and, with priorities, sends random losses for its rows.
     fn learn(&mut self) -> Option<PriorityUpdate> {
         let batch = self.replay.sample(ROWS).unwrap();
         check_rows(&batch, &self.history);
@@ -124,7 +124,7 @@ impl Setup {
         Some(update)
     }
 
-    /// The law over the anchors, by a plain loop: the paper's, or the uniform one.
+    /// Computes the law over the anchors with a plain loop: the paper's law, or the uniform one.
     fn law(&self) -> HashMap<u64, f64> {
         let mass = |index| {
             let priority = self.priorities.get(&index).or(self.first.get(&index));
@@ -140,12 +140,12 @@ impl Setup {
         law.collect()
     }
 
-    /// Draws follow the law, and say how likely they were.
+    /// Checks that draws follow the law, and that batches report the right probabilities.
     fn check_law(&mut self, what: &str) {
         let what = format!("alpha {:?}: {what}", self.alpha);
         let law = self.law();
         let mut counts: HashMap<u64, u64> = law.keys().map(|&index| (index, 0)).collect();
-        // The first frames of some stacks may be gone: each is found once, then chances are those of the law.
+        // Some stacks may have lost their first frames. Draws find each such anchor once; then the probabilities follow the law.
         for _ in 0..20 {
             self.replay.sample(ROWS).unwrap();
         }
@@ -196,7 +196,7 @@ fn draws_follow_the_law_of_their_rule() {
     }
 }
 
-/// What is kept on disk of a replay is opened again with another alpha. At 0 it tells no priorities: then all have the highest.
+/// Opens a replay on disk again with another alpha. An alpha of 0 stores no priorities, so all become the highest.
 #[test]
 fn priorities_that_were_kept_follow_the_law_of_another_alpha() {
     for (before, now) in [(0.5, 0.5), (0.5, 1.0), (1.0, 0.3), (0.4, 0.0), (0.0, 0.6)] {
@@ -222,7 +222,7 @@ fn priorities_that_were_kept_follow_the_law_of_another_alpha() {
     }
 }
 
-/// Streams of a step each: most of what is held can be no anchor. The uniform rule lists those that can, the other has them alone.
+/// Most streams have a single step, so most transitions cannot be anchors. The uniform rule lists the anchors; the other has only them.
 #[test]
 fn few_anchors_follow_the_law_too() {
     for alpha in [None, Some(0.5)] {
@@ -269,7 +269,7 @@ fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
         ..own
     };
     let law = setup.law();
-    // The answer was lost, and the learner asks again; of a life that is over; of another shard.
+    // The reply was lost and the learner retries; an update of an earlier incarnation; an update of another shard.
     for (update, gone, what) in [
         (of(own, first.number), 0, "after a repetition"),
         (of(earlier, 100), rows, "after what an earlier life drew"),
@@ -286,14 +286,14 @@ fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
         setup.check_law(what);
     }
 
-    // Every slot is another transition's by now.
+    // By now each slot holds another transition.
     setup.insert(0, 1, 100);
     setup.updates = 200;
     setup.replay.set_priorities(&of(own, 102)).unwrap();
     assert_eq!(counts(&setup.replay).gone, 2 * rows);
     setup.check_law("after what came too late");
 
-    // Another learner counts from its own first.
+    // Another learner numbers its updates from 1.
     let batch = setup.replay.sample(ROWS).unwrap();
     let found = [3.0; ROWS as usize];
     let update = batch.priority_update(LEARNER + 1, 1, &found).unwrap();
@@ -310,7 +310,7 @@ fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
     update.parts[0].transitions[3] = 60;
     let refused = setup.replay.set_priorities(&update).unwrap_err();
     assert_eq!(refused, "a priority of transition 60, where 60 were stored");
-    // The newest one lacks the steps of its return.
+    // The newest transition lacks the steps of its return.
     setup.history.ends = false;
     setup.insert(1, 1, 2);
     let gone = counts(&setup.replay).gone;
@@ -327,8 +327,8 @@ fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
 }
 
 proptest! {
-    /// Chunks of several actors and shapes, learned from in between: after each step exactly the anchors have a mass, and rows are
-    /// those of the reference.
+    /// Stores chunks of several actors and shapes, with updates in between. After each step exactly the anchors have a mass, and rows equal
+    /// the reference.
     #[test]
     fn exactly_the_anchors_can_be_drawn(
         steps in prop::collection::vec((0u32..4, 1u32..9, any::<bool>()), 1..40),

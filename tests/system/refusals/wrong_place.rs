@@ -106,7 +106,7 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     });
 }
 
-/// Soon, and as one that plays or learns: with exit code 0.
+/// Soon, and as one that plays or learns: with exit code 130.
 #[test]
 fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
     let system = system();
@@ -116,13 +116,13 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
             let mut process = system.start(&format!("{command} {}", system.endpoint()));
             process.wait_for_stderr("waiting for 30 s: nothing listens on ");
             process.signal(signal);
-            process.wait_ok();
+            process.wait().expect_code(130);
             // Something listens, and sends nothing.
             let (endpoint, listener) = listener();
             let process = system.start(&format!("{command} {endpoint}"));
             let connection = listener.accept().unwrap();
             process.signal(signal);
-            process.wait_ok();
+            process.wait().expect_code(130);
             drop(connection);
         }
     });

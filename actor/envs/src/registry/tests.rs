@@ -1,4 +1,4 @@
-//! Names, reading settings, and what each world says of itself before it is built.
+//! Tests the names of worlds, reading their settings, and what settings tell of a world before it is built.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -137,7 +137,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     }
     let text = "kind = 'flat'\nreward = 3.5\n";
     assert!(toml::from_str::<WorldConfig>(text).is_err());
-    // The name of one of ours stays ours.
+    // A registered kind does not replace this crate's world of the same name.
     let kinds = ["flat", "chain"].map(|name| CustomKind::of::<Flat>(name, "# preset"));
     plugin::register(kinds.into());
     let config: WorldConfig = toml::from_str(text).unwrap();
@@ -155,7 +155,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     check_round_trip(&chain);
 }
 
-/// Settings that are written are read back as they were.
+/// Checks that settings that are written are read back unchanged.
 fn check_round_trip(config: &WorldConfig) {
     let text = toml::to_string(config).unwrap();
     assert_eq!(&toml::from_str::<WorldConfig>(&text).unwrap(), config);
@@ -198,7 +198,7 @@ fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
     }
 }
 
-/// One set of settings for each world that needs no engine.
+/// Settings of each world that needs no engine.
 fn configs() -> [WorldConfig; 4] {
     let numbered = exec::tests::numbered("");
     [
@@ -241,7 +241,7 @@ fn an_environment_depends_on_seed_and_index_only() {
             let mut world = config.build(num_envs, seed, 0).unwrap();
             let mut rng = ChaCha8Rng::seed_from_u64(1);
             let mut take_step = || {
-                // The same in every environment, which so differ by their own chance alone.
+                // The same action in every environment, so that environments differ by their generators alone.
                 let actions = vec![rng.random_range(0..config.num_actions() as u8); num_envs];
                 (frames(&mut *world), step(&mut *world, &actions))
             };

@@ -1,5 +1,5 @@
-//! A corridor with a small reward near and a large one far, whose best return is known: a learner must pass by the near.
-//! It has no chance in it and no environments that differ; it exists for fast learning tests.
+//! A corridor with a small reward nearby and a large one far away. The best return is known; a learner must forgo the near reward.
+//! It has no randomness, and all its environments are alike; it exists for fast learning tests.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,11 +47,11 @@ pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
 
 /// N corridors. A frame is black but for the band of columns that belongs to the agent's cell, which is white.
 ///
-/// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows. The seed changes
-/// nothing: nothing is left to chance.
+/// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows. The
+/// seed has no effect, as nothing is random.
 pub type ChainWorld = Envs<Corridor>;
 
-/// Where the agent is in one corridor, and in which step of the episode. It is its own saved form.
+/// The agent's cell in one corridor, and the step of the episode. The saved state is this struct.
 #[derive(Clone, Copy, Serialize, Deserialize)]
 pub struct Corridor {
     cell: usize,
@@ -151,7 +151,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::playing::{frames, step};
 
-    /// A corridor in which 0.1 is near and 1 is far.
+    /// A corridor with the reward 0.1 at the near end and 1 at the far end.
     pub(crate) fn config() -> ChainConfig {
         ChainConfig {
             cells: 8,

@@ -1,4 +1,4 @@
-//! The worlds, a folder or a file each. What makes one of them known is a line in `registry`.
+//! The worlds, a folder or a file each. A line in `registry` registers each world.
 
 pub(crate) mod chain;
 pub(crate) mod exec;

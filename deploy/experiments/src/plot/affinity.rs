@@ -1,5 +1,5 @@
-//! The action affinity A of runs as heat maps, from their newest checkpoints.
-//! It computes nothing: A is what the learner last sent to the replay server.
+//! Draws the action affinity A of runs as heat maps, from their newest checkpoints.
+//! Nothing is computed: A is the matrix that the learner last sent to the replay server.
 
 use driml_figure::{Figure, Heat, Panel};
 use driml_launch::{chosen::config_of, run_folder::RunFolder};
@@ -46,7 +46,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
     })
 }
 
-/// The actions' names, or their numbers where the settings cannot be read.
+/// Returns the names of the actions, or their numbers if the settings cannot be read.
 fn action_names(folder: &RunFolder, side: usize) -> Vec<String> {
     let names = config_of(folder).map(|config| config.action_names());
     let names = names.ok().filter(|names| names.len() == side);

@@ -55,7 +55,7 @@ pub enum Over {
 }
 
 impl Over {
-    /// The column of `metrics.csv`, which is the axis' label too.
+    /// Returns the column of `metrics.csv`, which is also the label of the axis.
     pub(super) const fn column(self) -> &'static str {
         match self {
             Self::Frames => "frames",

@@ -1,5 +1,5 @@
-//! Runs of one configuration and several seeds as one curve with a band.
-//! Between two recorded values it takes the straight line.
+//! Combines runs of one configuration and several seeds into one curve with a band.
+//! Values between two recorded points are interpolated linearly.
 
 use std::collections::VecDeque;
 
@@ -12,16 +12,16 @@ use super::{
 };
 use crate::stats::{Spread, interval};
 
-/// Points of a curve over several runs.
+/// The number of grid intervals of a curve over several runs.
 const GRID_POINTS: usize = 240;
-/// Most points of a single run's curve; of a longer one every second, third, ... is drawn.
+/// The most points of a single run's curve. Of a longer curve only every second, third, ... point is drawn.
 const POINTS_MAX: usize = 600;
-/// Runs that lie no further apart are drawn together: as a share of x. Seeds' evaluations are some frames apart.
+/// Curves without a common x are still averaged if the gap is at most this share of x: evaluations of seeds are some frames apart.
 const APART_MAX: f64 = 0.05;
-/// k is an environment step or more.
+/// The smallest k, in environment steps.
 const K_MIN: f64 = 1.0;
 
-/// What is drawn as one line.
+/// The runs that are drawn as one line.
 #[derive(Debug)]
 pub(super) struct Group<'a> {
     pub(super) name: String,
@@ -35,7 +35,7 @@ pub(crate) struct Curve {
 }
 
 impl Curve {
-    /// The mean of the values at each x, and their band; nothing where there are none.
+    /// Returns the mean of the values at each x, and their band. An x without values is left out.
     pub(crate) fn of_means(all: impl IntoIterator<Item = (f64, Vec<f64>)>, band: Band) -> Self {
         let mut curve = Self::default();
         for (x, values) in all {
@@ -55,15 +55,15 @@ impl Curve {
         curve
     }
 
-    /// The curve in the colour of this index.
+    /// Returns the curve as a series in the colour of this index.
     pub(crate) fn series(self, name: &str, index: usize) -> Series {
         Series::line(name, index, self.points).banded(self.band)
     }
 }
 
-/// The runs, those that differ in their seed alone together if `together`; in the order in which they were named.
+/// Groups the runs in the order in which they are named. If `together`, runs that differ only in their seed form one group.
 ///
-/// Settings that only the machine decides (threads, sizes, the replay's capacity) do not part them; the number of actors does.
+/// Settings that depend on the machine (threads, sizes, the replay's capacity) do not separate runs; the number of actors does.
 pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
     let mut groups: Vec<Vec<&Run>> = Vec::new();
     for run in runs {
@@ -80,7 +80,7 @@ pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
 }
 
 impl Group<'_> {
-    /// The group's mean of a column, and its band.
+    /// Returns the group's mean of a column, and its band.
     pub(super) fn curve(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
         let mean = self.over_seeds(column, args)?;
         let has_spread = self.runs.iter().all(|run| run.has_values(SPREAD_OF_K));
@@ -99,7 +99,7 @@ impl Group<'_> {
     }
 
     fn over_seeds(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
-        // Evaluations are of some runs only.
+        // Some runs have no evaluations.
         let having = self.runs.iter().filter(|run| run.has_values(column));
         let each = having.map(|run| {
             let values = run.values(args.x.column(), column)?;
@@ -113,7 +113,7 @@ impl Group<'_> {
     }
 }
 
-/// One or several curves as one, with a band if there are several.
+/// Combines one or several curves into one, with a band if there are several.
 pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
     let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).collect();
     match &each[..] {
@@ -126,7 +126,7 @@ pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
     }
 }
 
-/// Mean over the points of the last `width` of x, at each point.
+/// Replaces each point by the mean over the points within `width` of x before it.
 pub(crate) fn smoothed(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
     let mut window = VecDeque::new();
     let mut smooth = Vec::with_capacity(points.len());
@@ -148,7 +148,7 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     points.iter().step_by(step).chain(last).copied().collect()
 }
 
-/// Mean and band of several curves, over the x that all of them have, or at the x between curves that end and begin close to each other.
+/// Returns mean and band of several curves over their common range of x, or at the middle of a small gap between them.
 fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
     let starts = curves.iter().map(|curve| curve[0].0);
     let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
@@ -170,7 +170,7 @@ fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
     Curve::of_means(means, band)
 }
 
-/// The value at `x` on the line through `points`, which are in the order of x and not empty; beyond its ends, theirs.
+/// Interpolates `points` linearly at `x`; beyond the ends, the value at the end. `points` must be sorted by x and not empty.
 fn between(points: &[(f64, f64)], x: f64) -> f64 {
     let after = points.partition_point(|point| point.0 < x);
     match (after.checked_sub(1).map(|i| points[i]), points.get(after)) {

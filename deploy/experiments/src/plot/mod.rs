@@ -1,5 +1,5 @@
-//! `driml plot`: what runs recorded, drawn beside each other over frames, as SVG, PDF or PNG.
-//! It reads run folders and changes nothing in them; whatever it does to the numbers stands in the picture.
+//! `driml plot`: draws the recorded metrics of runs side by side, as SVG, PDF or PNG.
+//! It reads run folders and does not change them. The notes in the picture say what was done to the numbers.
 
 mod affinity;
 pub mod flags;
@@ -33,18 +33,18 @@ use self::{
 };
 
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
-/// The column over which a random policy is a line.
+/// The column of training returns; the chart can show a random policy as a line.
 const RETURN: &str = "mean_return";
-/// The column of what checkpoints earned when they were played.
+/// The column of the returns of evaluated checkpoints.
 const EVALUATED: &str = "evaluated_return";
-/// Words for columns, as `--column` takes them too.
+/// Short names of columns, which `--column` accepts.
 const WORDS: [(&str, &str); 4] = [
     ("return", RETURN),
     ("loss", C51_LOSS),
     ("k", "mean_k"),
     ("speed", "frames_per_second"),
 ];
-/// Columns that are drawn if none is asked for, those that the runs have values of; auxiliary losses follow [`C51_LOSS`].
+/// The columns drawn by default, if the runs have values of them. Auxiliary losses follow after [`C51_LOSS`].
 const OVERVIEW: [&str; 7] = [
     RETURN,
     EVALUATED,
@@ -58,7 +58,7 @@ const OVERVIEW: [&str; 7] = [
 /// Draws columns of the runs' metrics, or their action affinities.
 ///
 /// # Errors
-/// A folder that is not a run's, a column that is not there, a file that cannot be written.
+/// No folder is that of a run, a column does not exist, or the file cannot be written.
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     Format::of(&args.out).map_err(|e| usage!("{e}"))?;
     let figure = match args.affinity {
@@ -70,7 +70,7 @@ pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     print(&format!("{}\n", args.out.display()))
 }
 
-/// The columns of the [`OVERVIEW`] and the auxiliary losses of which a run has values.
+/// Returns the columns of the [`OVERVIEW`] and the auxiliary losses for which some run has values.
 fn overview(runs: &[Run]) -> Vec<String> {
     let mut columns: Vec<&str> = OVERVIEW.into();
     let mut place = OVERVIEW.iter().position(|it| *it == C51_LOSS).unwrap_or(0) + 1;
@@ -84,7 +84,7 @@ fn overview(runs: &[Run]) -> Vec<String> {
     columns.into_iter().filter(has).map(String::from).collect()
 }
 
-/// The folders of runs among those named, each once; what is none is left out with a word, as `runs/*` names it too.
+/// Returns the named run folders, each once. Other folders and files are skipped with a message, because `runs/*` names them too.
 fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let mut seen = BTreeSet::new();
     // A folder given twice is one run, not two seeds.
@@ -127,7 +127,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     };
     let mut panels = Vec::new();
     for column in &columns {
-        // A name that no run knows is an error.
+        // A column that no run has is an error.
         if !runs.iter().any(|run| run.has_values(column)) {
             runs[0].values(args.x.column(), column)?;
         }
@@ -135,7 +135,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         let is_loss = runs.iter().any(reports);
         let mut series = Vec::new();
         for (index, group) in groups.iter().enumerate() {
-            // Agents differ in their losses: what another one reports is not drawn for this one.
+            // Agents differ in their losses: a loss that only other agents report is not drawn for this group.
             if is_loss && !group.runs.iter().any(|run| reports(run)) {
                 continue;
             }
@@ -176,7 +176,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     })
 }
 
-/// Title and label of a column's chart, with its unit.
+/// Returns the title of a column's chart, and the axis label with its unit.
 fn words(column: &str) -> (String, String) {
     if column == EVALUATED {
         return (
@@ -187,13 +187,13 @@ fn words(column: &str) -> (String, String) {
     let named = column.replace('_', " ");
     match metrics::column(column) {
         Some(it) if it.name == column => (it.plot_label.into(), it.unit.into()),
-        // One of several things.
+        // The column is one of several that share a description.
         Some(it) => (named, it.unit.into()),
         None => (named.clone(), named),
     }
 }
 
-/// What was done to the numbers.
+/// Returns the notes that say what was done to the numbers.
 fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<String> {
     let mut notes = Vec::new();
     if groups.iter().any(|group| group.runs.len() > 1) {
@@ -225,7 +225,7 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
     notes
 }
 
-/// A line about each run that has no value of a column which is drawn.
+/// Returns a message for each run that has no value of a drawn column.
 fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
     let why = match column {
         RETURN => "no episode has ended in it",
@@ -238,7 +238,7 @@ fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
     })
 }
 
-/// What a random policy earns in each of the runs' worlds, with the world's name.
+/// Returns the mean return of a random policy in each of the runs' worlds, with the name of the world.
 fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
     let (mut known, mut found) = (Vec::new(), Vec::new());
     for run in runs {
@@ -253,7 +253,7 @@ fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>
     Ok(found)
 }
 
-/// Level lines from the start to where the longest curve ends; those of several worlds in colours that no run has.
+/// Returns horizontal lines from 0 to the end of the longest curve. Lines of several worlds have colours that no run uses.
 fn lines(random: &[(String, f64)], curves: &[Series], groups: usize) -> Vec<Series> {
     let xs = curves.iter().flat_map(|it| &it.points);
     let last = xs.map(|point| point.0).fold(0.0, f64::max);

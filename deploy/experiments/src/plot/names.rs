@@ -1,14 +1,14 @@
-//! What a line is called: world and agent, the settings in which it differs from others of these, and its seeds.
-//! It groups nothing.
+//! Names the lines of a plot: world and agent, the settings that differ from other lines with both, and the seeds.
+//! This module does not group runs.
 
 use std::collections::BTreeSet;
 
 use super::runs::{Run, Settings};
 
-/// Settings that a name tells at most; of more it tells how many.
+/// The most settings in a name. Of further settings the name has only the number.
 const TOLD_MAX: usize = 3;
 
-/// A name for each of these lists of runs, which differ in their seeds alone; no two are alike.
+/// Returns a unique name for each group of runs. The runs of a group differ only in their seeds.
 pub(super) fn of(groups: &[Vec<&Run>]) -> Vec<String> {
     let name = |runs: &Vec<&Run>| {
         let (Some(what), Some(own)) = (&runs[0].what, &runs[0].settings) else {
@@ -31,7 +31,7 @@ pub(super) fn of(groups: &[Vec<&Run>]) -> Vec<String> {
     names.iter().zip(groups).map(told_apart).collect()
 }
 
-/// How many seeds there are, and that some were run again where that is so: runs of one seed are not independent samples.
+/// Describes the seeds of a group, and says if some seed has several runs: those are not independent samples.
 fn seeds(runs: &[&Run]) -> String {
     let seeds: BTreeSet<_> = runs.iter().map(|run| run.seed).collect();
     let seed = |seed: Option<i64>| seed.map_or("unknown".into(), |seed| seed.to_string());
@@ -43,7 +43,7 @@ fn seeds(runs: &[&Run]) -> String {
     }
 }
 
-/// The settings of `own` that are not the same in all of `peers`, which contain it, each as `name=value`.
+/// Returns as `name=value` the settings of `own` that are not the same in all `peers`. `peers` include `own`.
 fn differences(own: &Settings, peers: &[&Settings]) -> Vec<String> {
     let keys = peers.iter().flat_map(|peer| peer.keys());
     let differs = |key: &&String| peers.iter().any(|peer| peer.get(*key) != own.get(*key));
@@ -52,7 +52,7 @@ fn differences(own: &Settings, peers: &[&Settings]) -> Vec<String> {
         let value = own.get(*key).map_or("unset", String::as_str);
         format!("{}={value}", short(key, &keys))
     };
-    // Choices by name first, as others often follow from them; then numbers; last what some do not have, and lists.
+    // Named choices come first, because other settings often follow from them. Then numbers; last lists, and settings that some lack.
     let rank = |key: &&&String| {
         let all = |is: fn(&String) -> bool| peers.iter().all(|it| it.get(**key).is_some_and(is));
         match all(|it| !it.starts_with('[')) {
@@ -70,7 +70,7 @@ fn differences(own: &Settings, peers: &[&Settings]) -> Vec<String> {
     told
 }
 
-/// The last parts of a key that no other of these keys ends with.
+/// Returns the shortest suffix of a dotted key with which no other of these keys ends.
 fn short<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
     let starts = key.rmatch_indices('.').map(|(at, _)| &key[at + 1..]);
     let unique = |end: &&str| {

@@ -1,5 +1,5 @@
-//! A run's folder as a plot needs it: the columns of `metrics.csv`, and the settings without the seed.
-//! It judges no value.
+//! Reads a run's folder for a plot: the columns of `metrics.csv`, and the settings without the seed.
+//! This module does not judge any value.
 
 use std::{
     collections::BTreeMap,
@@ -13,28 +13,28 @@ use driml_settings::leaves;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
-/// The column before those of the auxiliary losses, and the one after them.
+/// The columns right before and right after those of the auxiliary losses.
 pub(super) const C51_LOSS: &str = "c51_kl";
 const TOTAL_LOSS: &str = "total_loss";
-/// Columns of `metrics.csv` that hold words.
+/// The columns of `metrics.csv` that hold words instead of numbers.
 const WORDS: [&str; 1] = ["waiting"];
 
-/// Settings as text, by their whole names.
+/// Settings as text, by their full dotted names.
 pub(crate) type Settings = BTreeMap<String, String>;
 
 /// The metrics of one run, and its settings.
 #[derive(Debug)]
 pub(crate) struct Run {
     pub(super) folder: RunFolder,
-    /// The folder's name.
+    /// The name of the folder.
     pub(super) name: String,
-    /// World and agent, if the settings say.
+    /// World and agent, if the settings can be read.
     pub(super) what: Option<String>,
     pub(super) seed: Option<i64>,
-    /// The settings without seed and without what the machine decides; none if there are none.
+    /// The settings without the seed and without those that depend on the machine; `None` if they cannot be read.
     pub(crate) settings: Option<Settings>,
     columns: Table,
-    /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
+    /// The evaluations of the run's checkpoints. This table also has the columns `frames`, `updates` and `seconds`.
     evaluations: Table,
 }
 
@@ -66,9 +66,9 @@ impl Run {
         })
     }
 
-    /// The values of a column over `x`, one which only grows, in their order; rows without a value are left out.
+    /// Returns the values (x, y) of a column over the column `x`, sorted by x. Rows without a value are left out.
     ///
-    /// Rows at the same place are one point, their mean: a row is written each second, in which there may be no new frame.
+    /// Rows with the same x become one point, their mean: a row is written each second, and a second may bring no new frame.
     pub(crate) fn values(&self, x: &str, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         let (table, path) = self.table(column);
         let x = self.place(table, x)?;
@@ -80,7 +80,7 @@ impl Run {
                 let number = text.parse::<f64>();
                 number.map_err(|_| usage!("{path}, row {line}: {text:?} is not numeric"))
             };
-            // What was not known yet at a time is empty.
+            // A cell is empty if its value was not known yet.
             if !row[place].is_empty() && !row[x].is_empty() {
                 values.push((number(&row[x])?, number(&row[place])?));
             }
@@ -93,7 +93,7 @@ impl Run {
         Ok(values.chunk_by(|a, b| a.0 == b.0).map(mean).collect())
     }
 
-    /// The table that has the column, and its file; the metrics if neither has.
+    /// Returns the table that has the column, and its file; the metrics if neither table has the column.
     fn table(&self, column: &str) -> (&Table, PathBuf) {
         let in_metrics = self.columns.place(column).is_some();
         if !in_metrics && self.evaluations.place(column).is_some() {
@@ -103,7 +103,7 @@ impl Run {
         }
     }
 
-    /// The place of a column of numbers.
+    /// Returns the index of a numeric column.
     fn place(&self, table: &Table, column: &str) -> Result<usize, Usage> {
         let place = table.place(column);
         place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
@@ -122,7 +122,7 @@ impl Run {
         })
     }
 
-    /// The columns of auxiliary losses: those between C51's loss and the total.
+    /// Returns the columns of auxiliary losses: the columns between the C51 loss and the total loss.
     pub(super) fn auxiliary_losses(&self) -> &[String] {
         let ends = [C51_LOSS, TOTAL_LOSS].map(|name| self.columns.place(name));
         match ends {
@@ -131,7 +131,7 @@ impl Run {
         }
     }
 
-    /// Whether the column is there and not empty.
+    /// Whether the column exists and has a value.
     pub(crate) fn has_values(&self, column: &str) -> bool {
         let (table, _) = self.table(column);
         let place = table.place(column);
@@ -145,18 +145,18 @@ pub(super) fn folder_name(folder: &Path) -> String {
     name.to_string_lossy().into_owned()
 }
 
-/// Settings without the seed and without what differs between machines alone, and the seed. A run without settings stands
-/// for itself.
+/// Returns the settings without the seed and without those that depend on the machine, and the seed. A run without settings is not
+/// grouped with others.
 fn settings(path: &Path) -> Option<(Settings, Option<i64>)> {
     let table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
     table.get("run")?.as_table()?;
     let mut all = flat(&table);
     let seed = all.remove("run.seed").and_then(|seed| seed.parse().ok());
-    // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
+    // Most launch settings depend on the machine, but the number of actors influences what is learned.
     let actors = all.remove("local.actors");
     all.retain(|name, _| !name.starts_with("local.") && !name.starts_with("transport."));
     all.extend(actors.map(|actors| ("actors".to_owned(), actors)));
-    // How often it is saved and played changes nothing that is learned.
+    // These settings do not influence what is learned.
     for name in [
         "learner.checkpoint_period_updates",
         "learner.checkpoints_kept",
@@ -169,7 +169,7 @@ fn settings(path: &Path) -> Option<(Settings, Option<i64>)> {
     Some((all, seed))
 }
 
-/// Every setting of a table.
+/// Returns every setting of a table.
 pub(super) fn flat(table: &toml::Table) -> Settings {
     let text = |it: &toml::Value| it.as_str().map_or_else(|| it.to_string(), str::to_owned);
     let all = leaves(table).into_iter();

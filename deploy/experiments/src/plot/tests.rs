@@ -1,5 +1,5 @@
-//! Charts of run folders: what is drawn, left out and said of it.
-//! No picture is looked at here.
+//! Tests which columns and runs the charts show or skip, and the messages.
+//! They do not check the pixels of a picture.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ impl Runs {
         Self(tempfile::tempdir().unwrap())
     }
 
-    /// A run's folder, with settings that differ in `agent` and `seed`.
+    /// Creates a run's folder with settings that differ in `agent` and `seed`.
     fn run(&self, name: &str, agent: &str, seed: u32, metrics: &str) -> PathBuf {
         let folder = self.0.path().join(name);
         std::fs::create_dir(&folder).unwrap();
@@ -200,7 +200,7 @@ fn a_run_that_was_never_evaluated_stands_beside_one_that_was() {
     let a = root.run("a", "c51", 1, METRICS);
     let evaluations = "seconds,frames,updates,evaluated_return\n3,20,2,7.5\n";
     std::fs::write(a.join("evaluations.csv"), evaluations).unwrap();
-    // Another seed of it, and another agent.
+    // Another seed of the same agent, and another agent.
     for (name, agent, seed) in [("b", "c51", 2), ("c", "curl", 1)] {
         let b = root.run(name, agent, seed, METRICS);
         for columns in [&[][..], &["evaluated_return"]] {

@@ -1,10 +1,10 @@
-//! Numbers from all of an f32's range, and often from where its arithmetic changes its ways; and what references are made of.
+//! Inputs from the whole range of f32, often from the edges where its arithmetic changes; and helpers to compute references and errors.
 
 use std::fmt;
 
 use rand::{Rng, seq::IndexedRandom};
 
-/// Ends of ranges.
+/// The ends of ranges.
 const ENDS: [f32; 11] = [
     0.0,
     -0.0,
@@ -19,12 +19,12 @@ const ENDS: [f32; 11] = [
     f32::MIN,
 ];
 
-/// A finite number: of a usual size, of any, subnormal, a neighbour of a power of two, an end of a range.
+/// Draws a finite number: of usual size, of any size, subnormal, a neighbour of a power of two, or an end of a range.
 pub(super) fn finite(rng: &mut impl Rng) -> f32 {
     match rng.random_range(0..10) {
         0..4 => rng.random_range(-10.0f32..10.0),
         4..6 => {
-            // Every bit pattern is as likely but those that are not finite, which lose a bit of their exponent.
+            // Every bit pattern is equally likely, except that patterns that are not finite lose a bit of their exponent.
             let bits = rng.random::<u32>();
             let is_lost = !f32::from_bits(bits).is_finite();
             f32::from_bits(bits ^ (u32::from(is_lost) << 30))
@@ -40,7 +40,7 @@ pub(super) fn finite(rng: &mut impl Rng) -> f32 {
     }
 }
 
-/// `count` finite numbers: each on its own, all of a usual size, all the same, each one of two, or of one size.
+/// Draws `count` finite numbers: independent, all of usual size, all equal, from two values, or all of similar size.
 pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     match rng.random_range(0..6) {
         0..2 => (0..count).map(|_| finite(rng)).collect(),
@@ -60,13 +60,13 @@ pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     }
 }
 
-/// The same, none larger than `most`.
+/// Draws as [`finites`], and clamps to `-most..=most`.
 pub(super) fn clamped(count: usize, most: f32, rng: &mut impl Rng) -> Vec<f32> {
     let values = finites(count, rng).into_iter();
     values.map(|x| x.clamp(-most, most)).collect()
 }
 
-/// `count` numbers at which sums and exponentials may go wrong: all the same, ramps whose neighbours are far apart, one unlike the rest.
+/// Lists vectors of `count` numbers on which sums and exponentials may fail: all equal, shuffled ramps, one unlike the rest.
 pub(super) fn listed(count: usize) -> Vec<Vec<f32>> {
     let sizes = [0.0, 1e-45, 1e-38, 1e4, 1e12, 1e20, 1e38, f32::MAX];
     let equal = sizes.iter().flat_map(|&x| [x, -x]);
@@ -84,7 +84,7 @@ pub(super) fn listed(count: usize) -> Vec<Vec<f32>> {
     equal.chain(ramps).chain(unlike).collect()
 }
 
-/// Weights of `count` atoms that sum to 1, some of them 0 or tiny.
+/// Draws probabilities of `count` atoms. They sum to 1, and some are 0 or tiny.
 pub(super) fn law(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     let mut weights: Vec<f64> = (0..count)
         .map(|_| match rng.random_range(0..3) {
@@ -98,7 +98,7 @@ pub(super) fn law(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     weights.iter().map(|weight| (weight / sum) as f32).collect()
 }
 
-/// A probability: usual, near 0 or 1, or at an end.
+/// Draws a probability: uniform, near 0 or 1, or a listed edge.
 pub(super) fn probability(rng: &mut impl Rng) -> f32 {
     match rng.random_range(0..4) {
         0 => rng.random(),
@@ -108,7 +108,7 @@ pub(super) fn probability(rng: &mut impl Rng) -> f32 {
     }
 }
 
-/// Supports from one step of a float to 2e30 wide, near 0 and far from it.
+/// Supports (low, high) from one float step to 2e30 wide, near 0 and far from it.
 pub(super) const SUPPORTS: [(f32, f32); 14] = [
     (-10.0, 10.0),
     (0.0, 1.0),
@@ -123,11 +123,11 @@ pub(super) const SUPPORTS: [(f32, f32); 14] = [
     (0.0, 1e30),
     (0.0, 1e-45),
     (-1e6 - 1.0, -1e6),
-    // Low and width do not add up to high in f64 either.
+    // Here low + (high - low) differs from high even in f64.
     (-9.174_887e29, -7.596_588_6),
 ];
 
-/// The ends of a support within 1e30: usual, one step of a float wide, or any.
+/// Draws a support within 1e30: the usual one, one that is one float step wide, or any.
 pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
     let end = |rng: &mut _| finite(rng).clamp(-1e30, 1e30);
     match rng.random_range(0..4) {
@@ -145,11 +145,11 @@ pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
     }
 }
 
-/// The least normal float; an error of what is smaller is a share of this.
+/// The smallest normal f32. Errors of smaller values are relative to this.
 pub(super) const LEAST: f64 = f32::MIN_POSITIVE as f64;
 pub(super) const F32_STEP: f64 = f32::EPSILON as f64;
 
-/// exp(x - max) / sum of a row, without a logarithm; the largest, and the sum.
+/// Returns the softmax of a row, exp(x - max) / sum, with the largest x and the sum.
 pub(super) fn shares(row: &[f64]) -> (Vec<f64>, f64, f64) {
     let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let weights: Vec<f64> = row.iter().map(|x| (x - max).exp()).collect();
@@ -158,7 +158,7 @@ pub(super) fn shares(row: &[f64]) -> (Vec<f64>, f64, f64) {
     (shares.collect(), max, sum)
 }
 
-/// The same numbers in f64.
+/// Converts the numbers to f64.
 pub(super) fn widened(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&x| f64::from(x)).collect()
 }
@@ -167,7 +167,7 @@ pub(super) fn bits(values: &[f32]) -> Vec<u32> {
     values.iter().map(|x| x.to_bits()).collect()
 }
 
-/// A sum that loses nothing to cancellation but its last place. Source: Neumaier 1974.
+/// Sums without cancellation errors, exact up to the last place. Source: Neumaier 1974.
 pub(super) fn exact_sum(terms: impl IntoIterator<Item = f64>) -> f64 {
     let (mut sum, mut lost) = (0.0f64, 0.0);
     for term in terms {
@@ -182,34 +182,34 @@ pub(super) fn exact_sum(terms: impl IntoIterator<Item = f64>) -> f64 {
     sum + lost
 }
 
-/// The error of `found` as a share of what it should be, or of the least normal number where that is larger.
+/// Returns the error of `found` relative to `expected`, or relative to the smallest normal f32 if that is larger.
 pub(super) fn off(found: f32, expected: f64) -> f64 {
     (f64::from(found) - expected).abs() / expected.abs().max(LEAST)
 }
 
-/// The largest of errors, and NaN if one is.
+/// Returns the largest error, or NaN if any is NaN.
 pub(super) fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
     let larger = |a: f64, b: f64| if b <= a || a.is_nan() { a } else { b };
     errors.into_iter().fold(0.0, larger)
 }
 
-/// An error where this holds; else NaN, the largest.
+/// Returns `error` if the condition holds, else NaN, which counts as the largest error.
 pub(super) const fn only_if(holds: bool, error: f64) -> f64 {
     if holds { error } else { f64::NAN }
 }
 
-/// One of the numbers that are not finite.
+/// Draws infinity, -infinity or NaN.
 pub(super) fn not_finite(rng: &mut impl Rng) -> f32 {
     one_of(&[f32::INFINITY, f32::NEG_INFINITY, f32::NAN], rng)
 }
 
-/// One of these.
+/// Draws one of these values.
 pub(super) fn one_of<T: Clone>(values: &[T], rng: &mut impl Rng) -> T {
     let value = values.choose(rng).cloned();
     value.expect("a list that is written out has an item")
 }
 
-/// Displays the first of `values`, and how many they are.
+/// Displays the first four values, and the number of values.
 pub(super) struct Shown<'a>(pub(super) &'a [f32]);
 
 impl fmt::Display for Shown<'_> {

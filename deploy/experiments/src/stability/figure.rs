@@ -1,17 +1,17 @@
-//! The figure: the worst error of each row as a share of what its routine promises.
+//! The figure: the worst error of each row as a share of the promised bound.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
 use super::property::Row;
 
-/// Where a row stands that had no error at all, which a logarithmic axis has no place for.
+/// The drawn value of a row without any error, because 0 has no place on a logarithmic axis.
 const NONE: f64 = 1e-6;
-/// Where a row stands whose promise is broken by more than the axis has room for.
+/// The largest drawn value, for rows whose error exceeds the bound by more.
 const MOST: f64 = 10.0;
-/// So few that their names have room below a chart.
+/// The number of routines in a chart, so that their names fit below it.
 const ROUTINES_A_CHART: usize = 8;
 
-/// Worst errors of rows with these inputs, `aside` of the place of their routine.
+/// Returns the worst errors of the rows with drawn or listed inputs, each at x = index of its routine + `aside`.
 fn points(rows: &[Row], names: &[String], is_drawn: bool, aside: f64) -> Vec<(f64, f64)> {
     let some = rows.iter().filter(|it| it.is_drawn == is_drawn);
     let points = some.filter_map(|row| {
@@ -26,7 +26,7 @@ fn points(rows: &[Row], names: &[String], is_drawn: bool, aside: f64) -> Vec<(f6
     points.collect()
 }
 
-/// One chart over some of the routines.
+/// Draws one chart for some of the routines.
 fn chart(rows: &[Row], names: &[String]) -> Chart {
     let of = |is_drawn, aside| points(rows, names, is_drawn, aside);
     let ends = vec![(-0.5, 1.0), (names.len() as f64 - 0.5, 1.0)];
@@ -43,7 +43,7 @@ fn chart(rows: &[Row], names: &[String]) -> Chart {
     )
 }
 
-/// All rows, over several charts.
+/// Draws all rows, split into several charts.
 pub(super) fn figure(rows: &[Row], cases: &str) -> Figure {
     let mut names: Vec<String> = rows.iter().map(|row| row.routine.into()).collect();
     names.dedup();

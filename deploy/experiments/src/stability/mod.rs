@@ -1,5 +1,5 @@
-//! Every numeric routine at the extremes of its range: what it promises, and the worst that was found, beside its reference.
-//! What is promised and tried stands in `checks`; the bounds are those of each routine of the product.
+//! Checks every numeric routine at the extremes of its range: its promised error bounds, and the worst errors found against a reference.
+//! `checks` has the promises and the inputs; most bounds are constants of the routines themselves.
 
 mod checks;
 mod edges;
@@ -33,7 +33,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let table = checks::table(&settings);
     let units = table.len() as u64 * u64::from(settings.seeds);
     let mut session = Session::open(NAME, args, &settings, units, false)?;
-    // What another build of the routines kept says nothing of these.
+    // Pieces of another build of the program are not valid for its routines.
     let program = cache::program()?;
     let mut rows: Vec<Row> = Vec::new();
     for (at, mut property) in table.into_iter().enumerate() {
@@ -65,7 +65,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Two digits; what is not a number is the largest float.
+/// Formats a number with two digits. The largest float stands for a result that is not finite.
 fn number(value: f64) -> String {
     match value {
         0.0 => "0".to_owned(),
@@ -79,7 +79,7 @@ fn cases(rows: &[Row]) -> String {
     HumanCount(rows.iter().map(|row| row.seen.cases).sum()).to_string()
 }
 
-/// What came out, in a sentence.
+/// Returns the outcome as a sentence.
 fn verdict(rows: &[Row]) -> String {
     let kept = rows.iter().filter(|row| row.is_kept()).count();
     let (all, cases) = (rows.len(), cases(rows));
@@ -95,7 +95,7 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
             "**Not kept**: {routine}, {extreme}: {promise}: {worst}, promised {bound}; at {input}."
         )
     });
-    // Rows that allow an error, by how much of it is used.
+    // Rows with a bound above 0, sorted by the share of the bound that is used.
     let share = |row: &Row| 100.0 * row.seen.worst / row.bound;
     let mut close: Vec<&Row> = rows.iter().filter(|row| row.bound > 0.0).collect();
     close.sort_by(|a, b| share(b).total_cmp(&share(a)));
@@ -118,7 +118,7 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
 mod tests {
     use super::{property::Seen, *};
 
-    /// What was seen of a promise.
+    /// Creates a row with these results.
     pub(super) fn row(cases: u64, worst: f64, input: &str) -> Row {
         Row {
             routine: "halving",

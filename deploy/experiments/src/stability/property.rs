@@ -1,6 +1,6 @@
-//! A property: a routine of the product, the inputs for which it promises something, the promises and what tries them; and what was
-//! seen of each promise at each kind of extreme.
-//! It computes nothing itself: a check brings the errors of one case and the input that gave them.
+//! A property: a routine of the product, the range of its inputs, its promises, the checks that try them, and what was seen of each
+//! promise at each kind of extreme.
+//! A property does no numerics: a check reports the errors of one case, with the input that gave them.
 
 use std::fmt::Arguments;
 
@@ -9,53 +9,53 @@ use serde::{Deserialize, Serialize};
 
 use crate::progress::Progress;
 
-// What a check is written in.
+// The names that checks need.
 pub(super) use super::edges::*;
 pub(super) use Inputs::{Drawn, Listed};
 pub(super) use rand::Rng;
 pub(super) use rand_chacha::ChaCha8Rng;
 
-/// How much is tried: a table of `config.toml`.
+/// How much is tried. A table of `config.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
-    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
+    /// The number of seeds, 1 to this. No piece depends on it, so that more seeds can be added later.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
-    /// Random inputs of a quick routine; slower ones take a share of it.
+    /// The base number of random inputs. Each check uses a share or a multiple of it.
     pub(super) draws: u64,
-    /// Steps of the longest run of Adam.
+    /// The number of steps of the longest run of Adam.
     pub(super) adam_steps: u64,
-    /// Updates of the learned affinity.
+    /// The number of updates of the learned affinity.
     pub(super) affinity_updates: u64,
-    /// Draws from each law that is tested.
+    /// The number of draws from each tested distribution.
     pub(super) law_draws: u64,
-    /// Random probabilities for which every value that can be drawn is drawn.
+    /// The number of random probabilities for which every possible draw is tried.
     pub(super) whole_draws: u64,
 }
 
-/// A row of the table of properties.
+/// A routine with its promises and checks, in the table of properties.
 pub(super) struct Property {
     pub(super) routine: &'static str,
-    /// The inputs, as the routine's own documentation has them.
+    /// The range of inputs, as the routine documents it.
     range: &'static str,
-    /// Each in words, with what an error is a share of, and the largest error that it allows; 0 where it allows none.
+    /// Each promise in words, including the unit of its error, and the largest allowed error; 0 if none is allowed.
     promises: Vec<(&'static str, f64)>,
     checks: Vec<(Inputs, Box<Check>)>,
-    /// Each promise at each kind of extreme.
+    /// The results: a row for each promise at each kind of extreme.
     pub(super) rows: Vec<Row>,
 }
 
-/// Where the inputs of a check come from.
+/// The source of a check's inputs.
 #[derive(Clone, Copy)]
 pub(super) enum Inputs {
-    /// Every combination of what the check lists.
+    /// Every combination of the values that the check lists.
     Listed,
-    /// The generator, in this share of the draws, 8 or more.
+    /// Random inputs: this share of `Settings::draws`, but at least 8.
     Drawn(f64),
 }
 
-/// Runs the routine beside its reference in one case.
+/// A function that compares the routine with its reference in one case.
 type Check = dyn Fn(&mut Cases<'_>) -> anyhow::Result<()>;
 
 impl Property {
@@ -74,7 +74,7 @@ impl Property {
         self
     }
 
-    /// Has all promises tried on these inputs, a kind of extremes in words.
+    /// Adds a check that tries all promises on these inputs. `extreme` describes the kind of inputs.
     pub(super) fn on(
         mut self,
         extreme: &str,
@@ -96,7 +96,7 @@ impl Property {
         self
     }
 
-    /// Runs all checks; what they saw, in the order of the rows.
+    /// Runs all checks, and returns what they saw in the order of the rows.
     pub(super) fn run(
         &self,
         settings: &Settings,
@@ -123,13 +123,13 @@ impl Property {
                 cases.rest = is_listed.then_some(case);
                 cases.combinations = 1;
                 match check(&mut cases) {
-                    // Breaks the first promise, and the error stands for its input.
+                    // An error breaks the first promise. Its message is shown as the input.
                     Err(e) if !e.is::<Interrupted>() => {
                         cases.see(format_args!("{e:#}"), [f64::NAN])?;
                     }
                     done => done?,
                 }
-                // How many lists there are is known once a case has taken an item of each.
+                // The number of combinations is known once a case has taken an item of each list.
                 count = count.max(cases.combinations);
                 case += 1;
             }
@@ -138,7 +138,7 @@ impl Property {
         Ok(all)
     }
 
-    /// Adds what one seed saw.
+    /// Adds the results of one seed.
     pub(super) fn add(&mut self, seen: Vec<Seen>) {
         assert_eq!(self.rows.len(), seen.len(), "each seed has all rows");
         for (row, seen) in self.rows.iter_mut().zip(seen) {
@@ -146,7 +146,7 @@ impl Property {
         }
     }
 
-    /// The rows with a case, and one, which is not kept, of each promise that has none at any extreme.
+    /// Returns the rows that have cases. For a promise without any case it adds one row, which counts as not kept.
     pub(super) fn tried(self) -> Vec<Row> {
         let rows = self.rows.into_iter();
         let (mut tried, untried): (Vec<_>, Vec<_>) = rows.partition(|row| row.seen.cases > 0);
@@ -160,13 +160,13 @@ impl Property {
     }
 }
 
-/// One promise at one kind of extreme.
+/// The result of one promise at one kind of extreme.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Row {
     pub(super) routine: &'static str,
     pub(super) range: &'static str,
     pub(super) extreme: String,
-    /// Whether its inputs are of the generator, and not listed.
+    /// Whether the inputs are random, not listed.
     pub(super) is_drawn: bool,
     pub(super) promise: &'static str,
     pub(super) bound: f64,
@@ -179,13 +179,13 @@ impl Row {
     }
 }
 
-/// What was seen of a row.
+/// The cases of a row and the worst of them.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Seen {
     pub(super) cases: u64,
-    /// The largest error, in units of the bound's; the largest float where a result was not a number.
+    /// The largest error, in the unit of the bound; the largest float if a result was NaN.
     pub(super) worst: f64,
-    /// What gave it.
+    /// The input that gave the largest error.
     pub(super) input: String,
 }
 
@@ -198,32 +198,32 @@ impl Seen {
     }
 }
 
-/// What a check takes the inputs of a case from, and reports its errors to.
+/// Gives a check the inputs of a case, and collects its errors.
 pub(super) struct Cases<'a> {
     pub(super) settings: &'a Settings,
-    /// The generator of inputs, and of nothing else.
+    /// The random generator of the inputs. It has no other use.
     pub(super) rng: ChaCha8Rng,
     progress: &'a mut Progress,
-    /// The number of the combination of listed inputs, without the lists that an item was taken of; none where inputs are drawn.
+    /// The index of the combination of listed inputs, divided by the lengths of the lists used so far; `None` if inputs are drawn.
     rest: Option<u64>,
-    /// Of the lists that the case has taken an item of.
+    /// The number of combinations of the lists that this case has used so far.
     combinations: u64,
-    /// Of each promise, at the extreme that is tried.
+    /// What was seen of each promise at the current extreme.
     seen: Vec<Seen>,
 }
 
 impl Cases<'_> {
-    /// How many cases this share of the draws is.
+    /// Returns the number of cases in this share of the draws, at least 8.
     pub(super) fn draws(&self, share: f64) -> u64 {
         (self.settings.draws as f64 * share).ceil().max(8.0) as u64
     }
 
-    /// One of these: in turn where inputs are listed, beside every item of the other lists; else any.
+    /// Returns one of `items`. Listed inputs go through all combinations with the items of other lists; else the item is drawn.
     pub(super) fn each<T: Clone>(&mut self, items: &[T]) -> T {
         self.of(items, |rng| one_of(items, rng))
     }
 
-    /// One of these where inputs are listed, as [`Cases::each`] takes it; else one that is drawn. A list is as long in each case.
+    /// Returns one of `items` like [`Cases::each`] if inputs are listed, else calls `draw`. A list must have the same length in all cases.
     pub(super) fn of<T: Clone>(
         &mut self,
         items: &[T],
@@ -239,7 +239,7 @@ impl Cases<'_> {
         items[at as usize].clone()
     }
 
-    /// Counts errors of this case, in the order and the units of the promises; NaN is the largest, none says nothing.
+    /// Counts the errors of this case, in the order and units of the promises. NaN counts as the largest error; `None` is not counted.
     pub(super) fn see<E: Into<Option<f64>>, const N: usize>(
         &mut self,
         input: Arguments<'_>,
@@ -247,7 +247,7 @@ impl Cases<'_> {
     ) -> anyhow::Result<()> {
         for (promise, error) in errors.into_iter().enumerate() {
             if let Some(error) = error.into() {
-                // The least of a number and NaN is the number.
+                // The minimum of a number and NaN is the number.
                 let error = error.abs().min(f64::MAX);
                 self.seen[promise].add(1, error, || input.to_string());
             }
@@ -255,7 +255,7 @@ impl Cases<'_> {
         self.pause()
     }
 
-    /// Counts whether this case keeps a promise that allows no error.
+    /// Counts whether this case keeps a promise with the bound 0.
     pub(super) fn keeps(
         &mut self,
         promise: usize,
@@ -266,7 +266,7 @@ impl Cases<'_> {
         self.pause()
     }
 
-    /// Where an interrupt ends a case that has long to go until it sees an error.
+    /// Returns an error if the user has interrupted. A long case calls this before it has an error to report.
     pub(super) fn pause(&mut self) -> anyhow::Result<()> {
         Ok(self.progress.advance(0)?)
     }

@@ -1,5 +1,5 @@
-//! Small statistics over seeds and pairs: mean and spread, 95% intervals, when two means are apart, rank correlation, area under the
-//! ROC curve. Every interval of seeds that is printed or drawn is made here. It normalises nothing.
+//! Statistics over few seeds and pairs: mean and spread, 95% intervals, tests whether two means differ, rank correlation, area under the
+//! ROC curve. Every printed or drawn interval over seeds is computed here. Nothing is normalised.
 
 pub(crate) mod over_games;
 
@@ -36,23 +36,23 @@ impl Spread {
     }
 }
 
-/// The mean; none of no value.
+/// Returns the mean; `None` without values.
 pub(crate) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| mean_and_deviation(values).0)
 }
 
-/// The mean of some values minus that of others which have nothing in common with them.
+/// The difference between the means of two independent samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Difference {
-    /// Welch's interval, with his degrees of freedom rounded down. No ends where either side has a single value.
+    /// Welch's 95% interval, with the degrees of freedom rounded down. It has no ends if either side has a single value.
     pub(crate) interval: Interval,
-    /// Whether 0 is outside of the interval, and the exact permutation test finds a chance of at most 5%: few values may coincide, and
-    /// their interval is then too narrow. Of more than 20 values the interval alone decides.
+    /// Whether 0 is outside the interval and the exact permutation test gives p <= 5%. The second condition is needed because a few values
+    /// may nearly coincide, and then the interval is too narrow. With more than 20 values the interval alone decides.
     pub(crate) is_apart: bool,
 }
 
 impl Difference {
-    /// What it says, for the end of a sentence.
+    /// Returns the verdict as the end of a sentence.
     pub(crate) const fn verdict(&self) -> &'static str {
         match (self.is_apart, self.interval.mean > 0.0) {
             (false, _) => "",
@@ -62,7 +62,7 @@ impl Difference {
     }
 }
 
-/// The mean of `to` minus that of `from`; none where either is empty.
+/// Returns the mean of `to` minus the mean of `from`; `None` if either is empty.
 pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
     let interval = welch(from, to)?;
     let excludes_zero = |(low, high)| low > 0.0 || high < 0.0;
@@ -91,12 +91,12 @@ fn welch(from: &[f64], to: &[f64]) -> Option<Interval> {
     Some(Interval { mean, ends })
 }
 
-/// Samples of [`apart_by_chance`].
+/// The number of simulated pairs of samples in [`apart_by_chance`].
 const SAMPLES: usize = 2_000;
 
-/// How often [`difference`] calls two samples of these sizes apart that are of one normal law.
+/// Returns the share of pairs of samples of these sizes that [`difference`] calls apart although both have the same normal distribution.
 pub(crate) fn apart_by_chance(from: usize, to: usize) -> f64 {
-    // One fixed seed: the same sizes give the same page.
+    // The seed is fixed, so that the same sizes give the same page.
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let mut sample = |count: usize| -> Vec<f64> { (0..count).map(|_| normal(&mut rng)).collect() };
     let apart = (0..SAMPLES).filter(|_| {
@@ -106,19 +106,19 @@ pub(crate) fn apart_by_chance(from: usize, to: usize) -> f64 {
     apart.count() as f64 / SAMPLES as f64
 }
 
-/// A number of the standard normal law. Source: Box and Muller 1958.
+/// Draws from the standard normal distribution. Source: Box and Muller 1958.
 fn normal(rng: &mut impl Rng) -> f64 {
     let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
     radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
 }
 
-/// Chance of the permutation test up to which means count as apart.
+/// The largest p-value of the permutation test at which means count as apart.
 const CHANCE_MAX: f64 = 0.05;
-/// Values of which [`chance_of_difference`] tries all deals: at most 184,756.
+/// The most values for which [`chance_of_difference`] tries all ways to deal them: at most 184,756.
 const DEALT_MAX: usize = 20;
 
-/// Chance that the means of `from` and `to` are at least so far apart if all of their values were dealt to the two at random:
-/// the exact permutation test, which asks nothing of how values are spread. None where either is empty, or of more than 20 values.
+/// Returns the p-value of the exact permutation test: the chance that the means are at least as far apart if all values are dealt to the
+/// two sides at random. It assumes no distribution. `None` if either side is empty, or for more than 20 values.
 fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
     let all = [from, to].concat();
     if from.is_empty() || to.is_empty() || all.len() > DEALT_MAX {
@@ -131,14 +131,14 @@ fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
         (sum / to.len() as f64 - (total - sum) / from.len() as f64).abs()
     };
     let seen = apart(((1 << to.len()) - 1) << from.len());
-    // Sums in another order may differ in their last places.
+    // Sums in another order may differ in their last digits.
     let least = seen - 1e-9 * (1.0 + seen);
     let deals = (0..1u32 << all.len()).filter(|it| it.count_ones() as usize == to.len());
     let (far, near): (Vec<_>, Vec<_>) = deals.partition(|&deal| apart(deal) >= least);
     Some(far.len() as f64 / (far.len() + near.len()) as f64)
 }
 
-/// Ranks from 1; equal values share the mean of their ranks.
+/// Returns the ranks of the values, from 1. Equal values share the mean of their ranks.
 fn ranks(values: &[f64]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..values.len()).collect();
     order.sort_by(|&a, &b| values[a].total_cmp(&values[b]));
@@ -154,7 +154,7 @@ fn ranks(values: &[f64]) -> Vec<f64> {
     ranks
 }
 
-/// Spearman's rank correlation, in -1..=1; none of fewer than three pairs or where one side does not vary.
+/// Returns Spearman's rank correlation in -1..=1; `None` for fewer than three pairs, or if one side is constant.
 pub(crate) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
     let x = ranks(&pairs.iter().map(|pair| pair.0).collect::<Vec<_>>());
     let y = ranks(&pairs.iter().map(|pair| pair.1).collect::<Vec<_>>());
@@ -166,9 +166,9 @@ pub(crate) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
     (pairs.len() > 2 && scale > 0.0).then(|| product(&x, &y) / scale)
 }
 
-/// Probability that a score of `yes` is above one of `no`, ties counting half: the area under the ROC curve.
+/// Returns the probability that a score of `yes` is above one of `no`, ties counting half: the area under the ROC curve.
 ///
-/// 0.5 for scores that tell nothing; none if either is empty. Scores must be finite.
+/// It is 0.5 for scores without information, and `None` if either is empty. Scores must be finite.
 pub(crate) fn auc(yes: &[f64], no: &[f64]) -> Option<f64> {
     if yes.is_empty() || no.is_empty() {
         return None;
@@ -185,7 +185,7 @@ mod tests {
 
     #[test]
     fn a_difference_is_welchs() {
-        // By hand: both of variance 1 and three values, so 4 degrees of freedom, and 2.776 * sqrt(2 / 3) = 2.267.
+        // By hand: both sides have variance 1 and three values, so 4 degrees of freedom; 2.776 * sqrt(2 / 3) = 2.267.
         let found = difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();
         let (low, high) = found.interval.ends.unwrap();
         assert!((low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
@@ -199,7 +199,7 @@ mod tests {
 
     #[test]
     fn two_tests_call_fewer_apart_by_chance_than_one() {
-        // Of three values and six 84 deals are possible, and 4 of 84 is the largest chance up to 5%.
+        // Three and six values can be dealt in 84 ways, and 4 of 84 is the largest p-value up to 5%.
         let chance = apart_by_chance(6, 3);
         assert!((0.018..0.036).contains(&chance), "{chance}");
         assert_eq!(apart_by_chance(6, 1), 0.0);
@@ -227,7 +227,7 @@ mod tests {
         for (yes, no, expected) in [
             (&[2.0, 3.0][..], &[0.0, 1.0][..], Some(1.0)),
             (&[1.0], &[1.0], Some(0.5)),
-            // Of the six pairs 2 > 1, 4 > 1, 4 > 3 are in order, 2 < 3 is not, and 2 = 2, 4 > 2.
+            // Of the six pairs four are in order (2 > 1, 4 > 1, 4 > 3, 4 > 2), one is not (2 < 3), and one is a tie (2 = 2).
             (&[2.0, 4.0], &[1.0, 3.0, 2.0], Some(4.5 / 6.0)),
             (&[], &[1.0], None),
         ] {
@@ -238,12 +238,12 @@ mod tests {
     #[test]
     fn a_permutation_test_counts_deals() {
         let is = |found: Option<f64>, chance: f64| (found.unwrap() - chance).abs() < 1e-12;
-        // Of the 10 deals of five values one is as far apart to this side, and one to the other.
+        // Of the 10 ways to deal five values, one is as far apart in this direction, and one in the other.
         let found = chance_of_difference(&[1.0, 2.0, 3.0], &[4.0, 5.0]);
         assert!(is(found, 0.2), "{found:?}");
         let found = chance_of_difference(&[1.0, 1.1, 0.9, 1.2, 0.8, 1.0], &[3.0, 3.1, 2.9]);
         assert!(is(found, 1.0 / 84.0), "{found:?}");
-        // Three values that coincide with two of six: Welch's interval excludes 0, and dealing says that it is chance.
+        // Three values that nearly coincide with two of six: Welch's interval excludes 0, but the permutation test finds chance.
         let (from, to) = ([2.0, 2.02, 0.0, 0.0, 0.0, 0.02], [2.0, 2.01, 2.04]);
         let judged = difference(&from, &to).unwrap();
         assert!(judged.interval.ends.unwrap().0 > 0.0 && !judged.is_apart);

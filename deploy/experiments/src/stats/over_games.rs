@@ -1,20 +1,20 @@
 //! Scores over games and seeds as the field reports them: interquartile mean and probability of improvement. Source: Agarwal et al.
-//! 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice". Their bootstrap intervals are for more seeds than
-//! runs of days allow; these are Student's. It normalises nothing.
+//! 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice". Their bootstrap intervals need more seeds than runs of
+//! days allow, so these are Student's. Nothing is normalised.
 
 use crate::stats::{Interval, auc, interval};
 
-/// Scores by game and seed: `scores[game][seed]`. Nothing follows from no game, or from one without a score.
+/// Scores by game and seed: `scores[game][seed]`. Results are `None` without games, or if a game has no score.
 pub(crate) type Scores = Vec<Vec<f64>>;
 
-/// Mean of the middle half of all scores, and its interval.
+/// Returns the interquartile mean (the mean of the middle half of all scores) and its interval.
 pub(crate) fn iqm(scores: &Scores) -> Option<Interval> {
     estimate(&[scores], |it| interquartile_mean(it[0].iter().flatten()))
 }
 
-/// Probability that a run of `x` does better than one of `y` in a game drawn at random, and its interval.
+/// Returns the probability that a run of `x` scores higher than a run of `y` in a game drawn at random, and its interval.
 ///
-/// `1/M sum_m 1/(N_x N_y) sum_ij [x_mi > y_mj] + [x_mi = y_mj] / 2` over the M games; both have the same games.
+/// `1/M sum_m 1/(N_x N_y) sum_ij [x_mi > y_mj] + [x_mi = y_mj] / 2` over the M games, which `x` and `y` share.
 pub(crate) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
     assert_eq!(x.len(), y.len(), "the same games");
     let found = estimate(&[x, y], |it| {
@@ -25,7 +25,7 @@ pub(crate) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
     Some(Interval { ends, ..found })
 }
 
-/// Mean without the lowest and the highest quarter, each rounded down to whole scores.
+/// Returns the mean without the lowest and the highest quarter, each rounded down to whole scores.
 fn interquartile_mean<'a>(scores: impl Iterator<Item = &'a f64>) -> f64 {
     let mut all: Vec<f64> = scores.copied().collect();
     all.sort_by(f64::total_cmp);
@@ -34,9 +34,9 @@ fn interquartile_mean<'a>(scores: impl Iterator<Item = &'a f64>) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// `of` the groups, and its interval over seeds by the jackknife: Student's interval of the pseudo-values
-/// `p_i = n v - (n - 1) v_i`, where `v` is of all scores and `v_i` of those without seed i of each game. No ends where a game has a
-/// single seed; of the games' further seeds only `v` knows. Source: Tukey 1958. For a mean it is Student's interval itself.
+/// Returns `of(groups)` and its interval over seeds by the jackknife: Student's interval of the pseudo-values `p_i = n v - (n - 1) v_i`.
+/// `v` uses all scores, `v_i` those without seed i of each game. A game with one seed leaves no ends. Seeds beyond the smallest number
+/// in a game are never left out. For a mean this is Student's interval itself. Source: Tukey 1958.
 fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Interval> {
     let all: Vec<Scores> = groups.iter().map(|&scores| scores.clone()).collect();
     let seeds = all.iter().flatten().map(Vec::len).min();
@@ -84,7 +84,7 @@ mod tests {
         let one_each = iqm(&vec![vec![0.1], vec![0.3]]).unwrap();
         assert_eq!((one_each.mean, one_each.ends), (0.2, None));
         assert_eq!(improvement(&vec![], &vec![]), None);
-        // No run of a game has ended an episode.
+        // In one game no run has finished an episode.
         assert_eq!(improvement(&vec![vec![], vec![1.0]], &y), None);
     }
 
@@ -95,7 +95,7 @@ mod tests {
         for seeds in [3, 4, 12] {
             let (mut of_iqm, mut of_improvement) = (0, 0);
             for _ in 0..rounds {
-                // Uniform scores around 0.5 in four games: one agent is as good as the other.
+                // Uniform scores around 0.5 in four games: both agents are equally good.
                 let mut scores = || -> Scores {
                     let mut game = || (0..seeds).map(|_| rng.random::<f64>()).collect();
                     (0..4).map(|_| game()).collect()

@@ -1,5 +1,5 @@
-//! A network with the auxiliary loss DIM alone and its optimiser, which are the learner's: what both studies train.
-//! It has neither returns nor actions nor a replay.
+//! The learner's network and optimiser with the auxiliary loss DIM alone, which both studies train.
+//! Returns, actions and a replay are not used.
 
 use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
@@ -15,7 +15,7 @@ use driml_learner::{
 use driml_model::{Features, Kernels, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 
-/// The weights of a network that DIM trains, and how they are trained.
+/// The weights of a network that DIM trains, with the loss and the optimiser.
 pub(super) struct DimLearner {
     parameters: Parameters,
     pub(super) network: Network,
@@ -42,7 +42,7 @@ impl DimLearner {
         })
     }
 
-    /// An update by InfoNCE of the one pair of 3t3, 3t4, 4t3 and 4t4 that has a weight; gives its loss before that.
+    /// Makes one update with the InfoNCE loss of the only pair (of 3t3, 3t4, 4t3, 4t4) with a weight. Returns the loss before the update.
     pub(super) fn learn(&mut self, now: &Features, next: &Features) -> anyhow::Result<f32> {
         let rows = now.f4.dim(0)?;
         let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
@@ -56,7 +56,7 @@ impl DimLearner {
         Ok(loss.to_scalar()?)
     }
 
-    /// Clipped scores [L, B, B] of every anchor with every candidate at each location, of the one pair that has a weight.
+    /// Returns the clipped scores [L, B, B] of every anchor with every candidate at each location, for the only pair with a weight.
     pub(super) fn scores(&self, now: &Features, next: &Features) -> anyhow::Result<Vec<f64>> {
         let action = Tensor::zeros(now.f4.dim(0)?, DType::U8, &Device::Cpu)?;
         let wanted = self.dim.lambda.wanted();

@@ -1,4 +1,4 @@
-//! Experiments that are not made of runs: each trains a small network by itself, and keeps its pieces in the cache.
+//! Experiments without runs: each trains a small network in this process, and keeps its pieces in the cache.
 
 mod dim;
 pub(crate) mod ising;

@@ -1,21 +1,21 @@
-//! The axes of a sweep and its cells: every combination of the values that a command line names.
-//! What a setting means is for `driml train`, which takes each of them as it stands here.
+//! The axes of a sweep, and its cells: every combination of the values on the command line.
+//! The settings are not interpreted here: `driml train` receives each of them unchanged.
 
 use driml_machine::error::{Usage, usage};
 use serde::{Deserialize, Serialize};
 
-/// Most runs of a grid; more are a slip of the keyboard.
+/// The most runs of a sweep. More are probably a typing error, and are rejected.
 pub(super) const RUNS_MAX: usize = 10_000;
 
-/// What is varied, or fixed if it has one value alone.
+/// A setting that varies over the sweep, or is fixed if it has a single value.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Axis {
-    /// As a column is headed: `env`, `agent`, or a setting's dotted path.
+    /// The column header: `env`, `agent`, or the dotted path of a setting.
     pub(crate) name: String,
     pub(crate) values: Vec<String>,
 }
 
-/// One combination: each axis' name and its value, in their order.
+/// One combination: the name and the value of each axis, in the order of the axes.
 pub(crate) type Cell = Vec<(String, String)>;
 
 impl Axis {
@@ -47,7 +47,7 @@ impl Axis {
     }
 }
 
-/// The parts of `text` between commas that are in no bracket, brace or quote.
+/// Splits `text` at the commas outside brackets, braces and quotes.
 fn split(text: &str) -> Vec<&str> {
     let (mut depth, mut quote, mut start) = (0_i32, None, 0);
     let mut parts = Vec::new();
@@ -69,7 +69,7 @@ fn split(text: &str) -> Vec<&str> {
     parts
 }
 
-/// Every combination of the axes' values; the last axis changes fastest.
+/// Returns every combination of the axes' values. The last axis changes fastest. More than `RUNS_MAX` runs are an error.
 pub(crate) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
     let counts = axes.iter().map(|axis| axis.values.len());
     let runs = counts.fold(seeds as usize, usize::saturating_mul);

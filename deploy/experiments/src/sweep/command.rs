@@ -1,5 +1,5 @@
-//! `driml sweep`: a run for each combination of settings and each seed, a table and a plot of them at the end.
-//! Runs are made by `queue`; which there are follows from `axes`.
+//! `driml sweep`: makes a run for each combination of settings and each seed, then a table and a plot of all runs.
+//! `axes` decides which runs there are, and `queue` makes them.
 
 use driml_launch::console::{aligned, print};
 use driml_machine::error::usage;
@@ -18,18 +18,18 @@ use crate::{
     stats::{Spread, interval},
 };
 
-/// Names the default folder, the table and the plot: what is made is a grid.
+/// The name of the default folder, the table and the plot.
 const NAME: &str = "sweep";
-/// Most letters of a cell in the name of a run's folder.
+/// The most letters that describe a cell in the name of a run's folder.
 const NAME_LETTERS: usize = 80;
-/// Columns of the table behind the axes.
+/// The columns of the table after the axes.
 const MEASURED: &str =
     "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
-/// Below the table on a terminal.
+/// The legend below the table on a terminal.
 const LEGEND: &str = "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds, ci_low and ci_high the mean's 95% \
                       interval (Student's t)\n";
 
-/// What all runs of a folder have in common: other seeds, and more runs at once, are the same sweep.
+/// What all runs of a folder share. The seeds and the number of runs at once may differ between calls.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Settings {
     axes: Vec<Axis>,
@@ -37,7 +37,7 @@ struct Settings {
     preset: Option<String>,
 }
 
-/// Makes a run for each combination of settings and each seed that is not there yet, then the table and the plot.
+/// Makes the missing runs of every combination of settings and every seed, then the table and the plot.
 ///
 /// # Errors
 /// As [`crate::run`].
@@ -51,7 +51,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let (settings, seeds) = settings(args, kept)?;
     let axes = &settings.axes;
     let cells = cells(axes, args.seeds)?;
-    // Of that many cells no sweep has more.
+    // A report asks for `SEEDS_MAX` seeds; no sweep has more than `RUNS_MAX` runs.
     let seeds = seeds.min((RUNS_MAX / cells.len()) as u32);
     let mut plans = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
@@ -87,7 +87,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     session.check_made()
 }
 
-/// What a call asks for, and its seeds. A report that names no axis is of the `kept` settings, and of all seeds that there are.
+/// Returns the settings and the number of seeds of a call. A report that names no axis uses the `kept` settings and all seeds.
 fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Settings, u32)> {
     let asked = Settings {
         axes: axes_of(args)?,
@@ -105,7 +105,7 @@ fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Setting
     Ok((settings, SEEDS_MAX))
 }
 
-/// Worlds and agents first, where there are several, then the settings as they were named.
+/// Returns the axes of a call: `--env` and `--agent` first, if given, then each `--set` in the order of the command line.
 fn axes_of(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
     let mut axes = Vec::new();
     for (name, values) in [("env", &args.env), ("agent", &args.agent)] {
@@ -140,7 +140,7 @@ impl Settings {
         };
         for (name, value) in cell {
             match name.as_str() {
-                // A game may be named alone.
+                // The user may name a game without its `procgen:`.
                 "env" => call.env = Some(full_name(value)),
                 "agent" => call.agent = Some(value.clone()),
                 _ => call.sets.push(format!("{name}={value}")),
@@ -154,13 +154,13 @@ fn full_name(world: &str) -> String {
     presets::world(world).map_or_else(|_| world.to_owned(), |it| it.to_string())
 }
 
-/// Such as `agent=c51, learner.batch_size=64`: the axes along which something changes.
+/// Describes a cell, such as `agent=c51, learner.batch_size=64`.
 fn described(cell: &Cell) -> String {
     let words = cell.iter().map(|(name, value)| format!("{name}={value}"));
     words.collect::<Vec<_>>().join(", ")
 }
 
-/// A name for a cell's runs: its number, and what a person knows it by.
+/// Returns a name for the runs of a cell: its number, and its values on the axes that vary.
 fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     let mut name = (at + 1).to_string();
     let varied = axes.iter().zip(cell);
@@ -175,7 +175,7 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     name.chars().take(NAME_LETTERS).collect()
 }
 
-/// What came out, a row a cell, with empty cells where a number is missing; the point of a run is its cell's number.
+/// Returns the table, a row for each cell of the grid; a missing number is empty. The `point` of a run is the number of its cell.
 fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
     let row = |(at, cell): (usize, &Cell)| {
         let here = made.iter().filter(|it| it.point == at);

@@ -1,6 +1,6 @@
-//! The engine of whatever is made of runs: `axes` spans the combinations, `plan` has the runs and their calls, `runs` keeps each
-//! run beside the call that made it, `queue` makes those that are missing, `results` plays with their weights; `command` is `driml sweep`.
-//! What a run is for, and what follows from all of them, is for the sweep that plans it.
+//! The engine for experiments that consist of runs. `axes` spans the combinations; `plan` has the planned runs and their calls; `runs`
+//! keeps each run beside the call that made it; `queue` makes the missing runs; `results` plays with their weights; `command` is
+//! `driml sweep`. Each sweep that plans runs decides what they mean and what follows from all of them.
 
 pub(crate) mod axes;
 pub(crate) mod command;

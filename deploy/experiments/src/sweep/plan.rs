@@ -1,5 +1,5 @@
-//! What a sweep plans and gets: runs at the points of its axes, and the calls that make them.
-//! It knows no folder and starts no run.
+//! The planned and the finished runs of a sweep, each at its point on the axes, and the calls that make them.
+//! This module reads no folder and starts no run.
 
 use anyhow::ensure;
 use driml_launch::{
@@ -23,7 +23,7 @@ pub(crate) struct Call {
     pub(crate) preset: Option<String>,
     pub(crate) seed: u32,
     pub(crate) frames: Option<u64>,
-    /// In the form of `--set`.
+    /// Settings in the form of `--set`.
     pub(crate) sets: Vec<String>,
 }
 
@@ -59,21 +59,21 @@ impl Call {
     }
 }
 
-/// A run to be made. Plans go seed by seed, so that what was stopped has one seed of everything before it has two of anything.
+/// A run to be made. Plans are ordered by seed, so that a stopped sweep has one seed of every point before two of any.
 #[derive(Clone, Debug)]
 pub(crate) struct PlannedRun {
-    /// Its folder's name.
+    /// The name of its folder.
     pub(crate) name: String,
     pub(crate) call: Call,
     pub(crate) frames: u64,
-    /// Episodes after which it is long enough, if that comes first.
+    /// The number of episodes after which the run may stop before it has all its frames.
     pub(crate) episodes: Option<u64>,
-    /// Its share of the sweep's work.
+    /// The units of work that the run counts for in the progress.
     pub(crate) units: u64,
 }
 
 impl PlannedRun {
-    /// One whose folder's name has a dash for each letter that does not belong there, such as those of a world's command.
+    /// Plans a run. In the folder name each unsuitable character, such as one of a world's command, becomes a dash.
     pub(crate) fn new(name: &str, call: Call, frames: u64) -> Self {
         let fits = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
         let letters = name.chars().map(|it| if fits(it) { it } else { '-' });
@@ -91,23 +91,23 @@ impl PlannedRun {
 pub(crate) struct FinishedRun {
     pub(crate) folder: RunFolder,
     pub(crate) summary: Summary,
-    /// The commit that the program which made it was built from; those of several, where others resumed it, parted by `+`; empty
-    /// where it was not noted.
+    /// The commit that the program was built from; empty if it was not recorded. If programs of several commits made and resumed the run,
+    /// the commits are joined by `+`.
     pub(crate) commit: String,
 }
 
-/// A run that is planned, and what it is for: its place on the axes of its sweep.
+/// A planned run, with its point on the axes of the sweep.
 pub(crate) type Planned<P> = (P, PlannedRun);
 
-/// A finished run at its place in the sweep.
+/// A finished run at its point in the sweep.
 pub(crate) struct Made<P> {
     pub(crate) point: P,
     pub(crate) plan: PlannedRun,
     pub(crate) run: FinishedRun,
 }
 
-/// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
-/// called before anything is written, so that a corrected call can have the same folder.
+/// Resolves the settings of each call once, whatever its seed, and installs what its world needs. For a report it does nothing. Call it
+/// before anything is written, so that the user can correct the call and use the same folder.
 pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<()> {
     let mut known: Vec<Call> = Vec::new();
     let plans = if report { &[] } else { plans };

@@ -1,6 +1,6 @@
-//! Makes the runs of a sweep: `driml train` as child processes, a few at once, each in a folder.
-//! A finished run is not run again; an unfinished one is resumed, or moved aside and started anew if it cannot be. It knows no
-//! experiment.
+//! Makes the runs of a sweep: `driml train` as child processes, a few at once, each with a separate folder.
+//! A finished run is not repeated. An unfinished run is resumed; if that is impossible, its folder is moved aside and the run starts
+//! again. This module knows nothing about experiments.
 
 use std::{
     collections::VecDeque,
@@ -30,15 +30,15 @@ use super::{
 };
 use crate::{cache::Session, progress::Progress};
 
-/// Times that a run is tried in one call. A run may lose contact with its processes on a machine that is busy with much else.
+/// How often a run is tried in one call. On a machine that is busy with other work, a run may lose contact with its processes.
 const TRIES: u32 = 2;
-/// How often running children are looked at.
+/// The interval between two checks of the running children.
 const POLL: Duration = Duration::from_millis(250);
-/// How long children may take to save once they were asked to stop; after that they are killed.
+/// How long children may take to save after they were asked to stop. Then they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
-/// Makes all runs, `jobs` at once, in the order of `plans`, and announces their work; for a report it makes none. The result is those
-/// that are finished, in the same order.
+/// Makes all runs, `jobs` at once, in the order of `plans`, and adds their work to the progress. For a report it makes none. Returns the
+/// finished runs in the same order.
 pub(crate) fn make<P>(
     session: &mut Session,
     plans: Vec<Planned<P>>,
@@ -77,7 +77,7 @@ pub(crate) fn make<P>(
     Ok(made)
 }
 
-/// The commit that this program's file was built from, as `--version` says in brackets: another build may have replaced it.
+/// Returns the commit of this program's file, which `--version` prints in brackets. Another build may have replaced the file.
 fn commit() -> anyhow::Result<String> {
     let mut command = Command::new(process_env::program());
     let output = command.arg("--version").output();
@@ -91,18 +91,18 @@ fn commit() -> anyhow::Result<String> {
 struct Queue {
     runs: Runs,
     jobs: u32,
-    /// Bytes of memory for each of the runs at once.
+    /// The bytes of memory for each of the concurrent runs.
     memory_share: u64,
     waiting: VecDeque<Job>,
     running: Vec<Running>,
 }
 
-/// A run that is to be made.
+/// A run to be made, with the history of its tries in this call.
 struct Job {
     plan: PlannedRun,
-    /// How often it was started.
+    /// How often the run was started.
     tried: u32,
-    /// The updates after which it was resumed the last time. That checkpoint may be what fails, so that it is not resumed from it again.
+    /// The updates of the checkpoint that the last try resumed from. That checkpoint may cause the failure, so it is not used again.
     resumed_at: Option<u64>,
 }
 
@@ -119,14 +119,14 @@ impl Job {
 struct Running {
     job: Job,
     child: Child,
-    /// Of the plan's units.
+    /// The units of the plan that are done.
     done: u64,
-    /// Long enough, and asked to stop.
+    /// Whether the run is long enough and was asked to stop.
     enough: bool,
 }
 
 impl Queue {
-    /// Starts and watches until nothing waits or runs.
+    /// Starts and watches runs until none is waiting or running.
     fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
             while self.running.len() < self.jobs as usize
@@ -147,7 +147,7 @@ impl Queue {
         }
     }
 
-    /// Counts what the children did, and sees to those that ended.
+    /// Counts the new work of the children, and handles those that exited.
     fn look(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         let mut at = 0;
         while at < self.running.len() {
@@ -172,7 +172,7 @@ impl Queue {
         Ok(())
     }
 
-    /// Units that the plan's run has done, and whether it has all its episodes.
+    /// Returns the units that the plan's run has done, and whether the run has all its episodes.
     fn done(&self, plan: &PlannedRun) -> (u64, bool) {
         let folder = self.runs.folder(plan);
         let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
@@ -183,14 +183,14 @@ impl Queue {
         ((share * plan.units as f64) as u64, enough)
     }
 
-    /// Units that a run which resumes did in an earlier start: no measure of this one's speed.
+    /// Counts and returns the units that a resumed run did in an earlier start. They do not count for the speed.
     fn find(&self, plan: &PlannedRun, progress: &mut Progress) -> u64 {
         let (done, _) = self.done(plan);
         progress.find(done);
         done
     }
 
-    /// Counts a run that ended; one that failed is tried once more, or left out.
+    /// Handles a run whose process exited: counts a finished run; retries a failed run once, then leaves it out.
     fn see_to(
         &mut self,
         ended: Running,
@@ -202,7 +202,7 @@ impl Queue {
             return Ok(progress.advance(plan.units - ended.done)?);
         }
         let (name, words) = (&plan.name, self.runs.last_words(plan));
-        // Settings that cannot work will not work for the others either.
+        // Settings that are wrong here are wrong for the other runs too.
         if status.code() == Some(EXIT_USAGE.into()) && ended.job.resumed_at.is_none() {
             return Err(usage!("the run {name} cannot be made:\n{words}").into());
         }
@@ -221,7 +221,7 @@ impl Queue {
         Ok(progress.advance(plan.units - ended.done)?)
     }
 
-    /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone; none if another process finished it.
+    /// Starts a run in a separate process group, so that only this process passes Ctrl-C to it. `None` if the run is finished or left out.
     fn start(&self, mut job: Job, progress: &mut Progress) -> anyhow::Result<Option<Running>> {
         let plan = &job.plan;
         let path = self.runs.log(plan);
@@ -272,7 +272,7 @@ impl Queue {
         }))
     }
 
-    /// The call that makes a run, or resumes it with the replay and the threads that it has.
+    /// Builds the command that starts a run, or resumes it. A resumed run keeps its replay size and its number of threads.
     fn command(&self, plan: &PlannedRun, resumed: bool) -> Command {
         let folder = self.runs.folder(plan);
         let mut command = Command::new(process_env::program());
@@ -289,7 +289,7 @@ impl Queue {
         command
     }
 
-    /// The updates after which what lies in the plan's folder is resumed; none if the run starts anew.
+    /// Returns the updates of the checkpoint from which the run resumes; `None` if the run starts from the beginning.
     fn resumes_at(&self, job: &Job, progress: &mut Progress) -> anyhow::Result<Option<u64>> {
         let (plan, folder) = (&job.plan, self.runs.folder(&job.plan));
         if !folder.path().exists() {
@@ -316,7 +316,7 @@ impl Queue {
         }
     }
 
-    /// The cores shared out among the runs at once, so that their learners do not get in each other's way.
+    /// Returns the flags that divide the cores among the concurrent runs, so that their learners do not compete for them.
     fn threads(&self) -> Vec<String> {
         if self.jobs == 1 {
             return Vec::new();
@@ -325,7 +325,7 @@ impl Queue {
         vec!["--set".into(), format!("local.learner_threads={threads}")]
     }
 
-    /// Asks all children to stop and waits until they have saved; a second wish, or too long a time, kills them.
+    /// Asks all children to stop and waits until they have saved. A second interrupt, or `DRAIN_MAX`, kills them.
     fn stop(&mut self, progress: &Progress) {
         if self.running.is_empty() {
             return;
@@ -338,7 +338,7 @@ impl Queue {
         while !self.running.is_empty() {
             if progress.shutdown().now.is_set() || Instant::now() > deadline {
                 for running in &mut self.running {
-                    // It may have ended by itself in this moment.
+                    // The child may have exited by itself in the meantime.
                     let _ = running.child.kill();
                     let _ = running.child.wait();
                 }
@@ -351,8 +351,8 @@ impl Queue {
     }
 }
 
-/// A run whose parent was killed still saves what it has. It holds its log's lock, as a child shares our open file, so
-/// that two never write into one folder.
+/// Waits until no process of an earlier call writes to the run: a run whose parent was killed still saves. A child inherits our open
+/// log file and with it the lock, so that two processes never write to one folder.
 fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<()> {
     let mut said = false;
     while !lock_file::try_lock(log).context("locking a run's log")? {
@@ -377,7 +377,7 @@ mod tests {
     use super::*;
     use crate::sweep::{plan::Call, runs::tests::finish};
 
-    /// A queue in `root`, where the run of its only plan is finished.
+    /// Creates a queue in `root` with a single plan, whose run is finished.
     fn queue(root: &Path) -> (Queue, PlannedRun) {
         let runs = Runs::open(root).unwrap();
         let plan = PlannedRun::new("run", Call::default(), 10);
@@ -433,7 +433,7 @@ mod tests {
         }
     }
 
-    /// As when a run saved while this call waited for its log.
+    /// This happens when a run saves while this call waits for the lock of its log.
     #[test]
     fn a_run_that_finished_meanwhile_is_not_made_again() {
         let root = tempfile::tempdir().unwrap();

@@ -1,5 +1,5 @@
-//! What finished runs earn when they are played, each played once: greedy episodes of their newest weights, and a random policy's.
-//! Returns of the training are in their summaries.
+//! Plays the agents of finished runs, each once: greedy episodes with the newest weights, and episodes of a random policy.
+//! The returns during training are in the summaries of the runs.
 
 use driml_launch::{
     chosen::{Weights, Which, config_of},
@@ -11,21 +11,21 @@ use driml_learner::checkpoint::{self, AVERAGE};
 use super::plan::FinishedRun;
 use crate::{cache::Session, progress::Progress};
 
-/// Seed of the played episodes: the same levels for every run.
+/// The seed of the played episodes, so that every run plays the same levels.
 const SEED: u64 = 1;
 
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Played {
     pub(crate) levels: Levels,
-    /// Checkpoints that share the episodes, the newest ones; the averaged weights alone play where a run has some.
+    /// The number of newest checkpoints that share the episodes. If a run has averaged weights, only these play.
     pub(crate) checkpoints: usize,
     pub(crate) episodes: u32,
-    /// Of work, which only the estimate of the time left depends on.
+    /// The units of work, which matter only for the estimate of the time left.
     pub(crate) units: u64,
 }
 
 impl Played {
-    /// Returns of a run's agent, played greedily; none if its world does not have the levels. Kept under `key` for these weights.
+    /// Plays a run's agent greedily and gives its returns; `None` if the world lacks the levels. Kept under `key` for these weights.
     pub(crate) fn greedy(
         self,
         session: &mut Session,
@@ -38,7 +38,7 @@ impl Played {
         })
     }
 
-    /// Returns of a random policy in a run's world, on the levels trained on.
+    /// Plays a random policy in a run's world, on the training levels, and gives its returns.
     pub(crate) fn random(
         self,
         session: &mut Session,
@@ -71,7 +71,7 @@ fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>>
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
-        // Averages of three checkpoints differ little. Without a checkpoint the player says what is missing.
+        // Averages of three checkpoints differ little, so the newest suffices. Without a checkpoint the player reports the error.
         return Ok(vec![Which::Newest]);
     }
     let newest = all.iter().rev().take(checkpoints);

@@ -1,5 +1,5 @@
-//! The runs of a sweep as they lie on the disk: each with the call that made it and what its process printed.
-//! It starts none.
+//! The runs of a sweep on the disk: the folder of each, the call that made it and the output of its process.
+//! This module starts no run.
 
 use std::{
     fs,
@@ -12,7 +12,7 @@ use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far,
 use super::plan::{FinishedRun, PlannedRun};
 use crate::cache::RUNS;
 
-/// Bytes at the end of a run's output that are shown if it fails.
+/// The number of bytes at the end of a failed run's output that are shown.
 const LAST_WORDS_BYTES: usize = 1200;
 
 pub(crate) struct Runs {
@@ -20,14 +20,14 @@ pub(crate) struct Runs {
 }
 
 impl Runs {
-    /// Opens the folder in the sweep's `folder`, or makes it.
+    /// Opens or creates the subfolder for runs in the sweep's `folder`.
     pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let root = folder.join(RUNS);
         fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
         Ok(Self { root })
     }
 
-    /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
+    /// Returns the plan's run if it exists, was made by this plan, and is complete and long enough.
     pub(crate) fn finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
         if !self.is_made_by(plan) {
             return None;
@@ -53,14 +53,14 @@ impl Runs {
         commit.trim().to_owned()
     }
 
-    /// Whether what lies in the plan's folder was begun by this very plan.
+    /// Whether the run in the plan's folder was started with exactly this plan's call.
     pub(super) fn is_made_by(&self, plan: &PlannedRun) -> bool {
         let call = fs::read_to_string(self.beside(plan, "call.json")).ok();
         let call = call.and_then(|text| serde_json::from_str::<Vec<String>>(&text).ok());
         call.is_some_and(|args| args == plan.call.args())
     }
 
-    /// Notes that the plan's run is made by this plan, and by a program of this commit; one that resumes keeps those before it.
+    /// Records the call of the plan's run and the commit of the program. A resumed run keeps the earlier commits.
     pub(super) fn write_call(
         &self,
         plan: &PlannedRun,
@@ -81,7 +81,7 @@ impl Runs {
         write_whole(&self.beside(plan, "commit"), commits.as_bytes())
     }
 
-    /// The end of what the run's process printed.
+    /// Returns the end of the output of the run's process.
     pub(super) fn last_words(&self, plan: &PlannedRun) -> String {
         let text = fs::read(self.log(plan)).unwrap_or_default();
         let start = text.len().saturating_sub(LAST_WORDS_BYTES);
@@ -92,7 +92,7 @@ impl Runs {
         RunFolder::new(self.root.join(&plan.name))
     }
 
-    /// What the run's process printed.
+    /// Returns the path of the output of the run's process.
     pub(super) fn log(&self, plan: &PlannedRun) -> PathBuf {
         self.beside(plan, "log")
     }
@@ -102,7 +102,7 @@ impl Runs {
     }
 }
 
-/// Renames what lies at `folder`, if anything does; says where it is now.
+/// Renames `folder` if it exists, and returns its new path.
 pub(super) fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     if !folder.exists() {
         return Ok(None);
@@ -128,7 +128,7 @@ pub(super) mod tests {
     use super::*;
     use crate::sweep::plan::Call;
 
-    /// Leaves what a finished run of a chain leaves.
+    /// Writes what a finished run of the chain world leaves in its folder.
     pub(in crate::sweep) fn finish(folder: &RunFolder) {
         let call = Call {
             env: Some("chain".into()),

@@ -1,4 +1,4 @@
-//! Experiments that are sweeps: settings in a TOML file, a page template, and the Rust for what is special about each.
+//! Experiments that are sweeps. Each has settings in a TOML file, a page template, and Rust code for its special parts.
 
 pub(crate) mod pacman;
 pub(crate) mod procgen;

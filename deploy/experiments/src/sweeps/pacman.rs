@@ -1,5 +1,5 @@
-//! Fig. 3: ghosts that can be predicted more or less, and one lethal ghost of four that changes, with and without noise in
-//! the walls. Runs are made by the engine in `sweep`; what they left is in `results`, the picture in `figure`.
+//! Fig. 3: (a) ghosts that are more or less predictable; (b, c) one lethal ghost of four that changes, without and with noise in
+//! the walls. The engine in `sweep` makes the runs, `results` reads them, `figure` draws them.
 
 mod figure;
 mod results;
@@ -57,8 +57,8 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// By seed, of each agent how much more it earns at the end of its last task than of its first, and how much more than the first agent
-/// over all tasks; where a run has both.
+/// Returns for each agent, with a value for each seed: the return at the end of the last task minus that of the first task, and the mean
+/// return over all tasks minus that of the first agent. Seeds that lack a number are left out.
 fn differences(part: usize, results: &Results) -> Vec<Value> {
     let agents = &results.settings.agents;
     let row = |agent: &String, first: Option<&String>, values: Vec<f64>| {

@@ -1,5 +1,5 @@
-//! Table 1: agents on Procgen's games beside a random policy and the paper's numbers.
-//! Runs are made by the engine in `sweep`; what they are is in `settings`.
+//! Table 1: agents on Procgen's games, compared with a random policy and the paper's numbers.
+//! `settings` decides which runs there are, and the engine in `sweep` makes them.
 
 mod settings;
 
@@ -28,10 +28,10 @@ use crate::{
     sweeps::published::{normalised, paper},
 };
 
-/// Standard errors from which on a mean return counts as different from the random policy's.
+/// A mean return counts as above that of the random policy if the difference exceeds this many standard errors.
 const ERRORS: f64 = 2.0;
 const PAPER_FRAMES: f64 = 50e6;
-/// Seeds of each game and agent from which on scores over all games are made.
+/// The fewest seeds for each game and agent with which scores over all games are computed.
 const SEEDS_MIN: usize = 3;
 
 /// Makes the runs, plays with them, and writes the table, the figure and the page.
@@ -40,7 +40,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
     let play = settings.play(Levels::Train);
-    // Each run's agent plays, and a random policy beside it.
+    // For each run its agent plays, and also a random policy.
     let units = plans.len() as u64 * 2 * play.units;
     let report = args.queue.report;
     install(&plans, report)?;
@@ -80,7 +80,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     session.finish(include_str!("procgen.md.j2"), values)
 }
 
-/// A finished run and its mean returns; a line of the data, from which the page is made.
+/// A finished run and its mean returns: a line of the table, and an entry of the page.
 #[derive(Serialize)]
 struct Scored {
     #[serde(flatten)]
@@ -92,12 +92,12 @@ struct Scored {
     #[serde(skip)]
     metrics: Run,
     training: Option<f64>,
-    /// Of its agent, played greedily.
+    /// The mean return of the agent, played greedily.
     greedy: Option<f64>,
-    /// Of a random policy in its world.
+    /// The mean return of a random policy in the same world.
     random: Option<f64>,
     is_above_random: bool,
-    /// Normalised, of its agent, played greedily in single levels; none where there are no scores over all games.
+    /// The normalised return of the agent, played greedily on single levels; `None` without scores over all games.
     #[serde(skip)]
     single: Option<f64>,
 }
@@ -111,12 +111,12 @@ fn is_above(greedy: &[f64], random: &[f64]) -> bool {
     greedy.mean - random.mean > ERRORS * (error(greedy) + error(random)).sqrt()
 }
 
-/// The games that have a run, in the order of their names.
+/// Returns the games that have a run, sorted by name.
 fn games(all: &[Scored]) -> BTreeSet<&str> {
     all.iter().map(|it| it.point.game.as_str()).collect()
 }
 
-/// The runs of an agent in a game.
+/// Returns the runs of an agent in a game.
 fn of<'a>(all: &'a [Scored], game: &str, agent: &str) -> impl Iterator<Item = &'a Scored> {
     let all = all.iter();
     all.filter(move |it| it.point.game == game && it.point.agent == agent)
@@ -132,7 +132,7 @@ fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
         let settings = it.metrics.settings.as_ref();
         let settings = settings
             .with_context(|| format!("{} cannot be read", it.run.folder.config().display()))?;
-        // Runs without a choice have the torso of Nature's DQN.
+        // Settings of earlier versions lack `model.torso` and mean `nature`, the torso of DQN in Nature.
         let torso = settings.get("model.torso").map_or("nature", String::as_str);
         rows.push((
             (&point.game, &point.agent, torso),
@@ -144,7 +144,7 @@ fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
     session.csv("table", columns, rows)
 }
 
-/// Training return over frames, a chart a game.
+/// Draws the training return over frames, with a chart for each game.
 fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
     for game in games(scored) {
@@ -189,7 +189,7 @@ fn has_seeds(settings: &Settings, scored: &[Scored]) -> bool {
     })
 }
 
-/// What the page says.
+/// Returns the values for the page template.
 fn values(settings: &Settings, scored: &[Scored]) -> Value {
     let (agents, games) = (&settings.agents, games(scored));
     let scores = |agent: &String, score: fn(&Scored) -> Option<f64>| -> Scores {

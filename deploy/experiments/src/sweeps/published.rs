@@ -1,16 +1,16 @@
-//! Numbers that others published on Procgen, from `published.csv`: the paper's returns, and those between which scores are normalised.
-//! Nothing here is measured by us.
+//! Published numbers on Procgen, from `published.csv`: the paper's returns, and the returns that scores are normalised between.
+//! None of them was measured with this program.
 
-/// A line a game; of each column the mean, and the standard deviation where that was published.
+/// A line for each game. A cell has the mean, and the standard deviation if it was published.
 const TABLE: &str = include_str!("published.csv");
 
-/// Its lines as cells, the columns' names first.
+/// Returns the lines of the table as cells, beginning with the header.
 fn lines() -> impl Iterator<Item = Vec<&'static str>> {
     let lines = TABLE.lines().filter(|line| !line.starts_with('#'));
     lines.map(|line| line.split(',').collect())
 }
 
-/// The paper's training return of an agent in a game, both by their names on the command line; none for other worlds.
+/// Returns the paper's training return of an agent in a game, both by their command-line names; `None` for other worlds or agents.
 pub(super) fn paper(game: &str, agent: &str) -> Option<f64> {
     let column = lines().next()?.iter().position(|name| *name == agent)?;
     let line = lines().find(|line| line[0] == game)?;
@@ -18,7 +18,7 @@ pub(super) fn paper(game: &str, agent: &str) -> Option<f64> {
     Some(mean.parse().expect("it is built in, and a test reads it"))
 }
 
-/// `(return - min) / (max - min)` of single levels; none for worlds that are not Procgen's.
+/// Normalises a return on single levels: `(return - min) / (max - min)`. `None` for worlds other than Procgen.
 pub(super) fn normalised(game: &str, score: f64) -> Option<f64> {
     let [min, max] = ["easy-min", "easy-max"].map(|what| paper(game, what));
     let (min, max) = min.zip(max)?;
@@ -29,7 +29,7 @@ pub(super) fn normalised(game: &str, score: f64) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// Both tables have every game: nine agents with the ablation's, and two ends.
+    /// Every game has eleven numbers: nine agents, including those of the ablation, and the two ends of the normalisation.
     #[test]
     fn the_table_is_whole_and_is_read_by_name() {
         let header = lines().next().unwrap();

@@ -1,6 +1,6 @@
-//! `driml tradeoff`: what each dial that buys speed costs in accuracy, and the other way round, from short trainings of whole runs,
-//! one dial turned at a time, and benches of single updates beside them.
-//! The dials are in `menu`, what fits a budget in `plan`, data, figures and page in `report`.
+//! `driml tradeoff`: measures how much accuracy each setting that buys speed costs, and the other way round. It makes short trainings of
+//! whole runs in which one such setting (a dial) changes at a time, and benchmarks single updates.
+//! `menu` has the dials, `plan` chooses what fits into a budget, `report` writes data, figures and page.
 
 mod figures;
 mod fixed_batch;
@@ -40,24 +40,24 @@ use crate::{
     },
 };
 
-/// The piece that lists the calls.
+/// The piece with the list of command lines that made runs in this folder.
 const CALLS: &str = "calls";
-/// A piece of measuring as a share of a run's work; only the estimate of the time left depends on it.
+/// A measurement counts as 1 / this of the work of a run, used only to estimate the time left.
 const PIECE_SHARE: u64 = 20;
-/// What a run takes beside its updates and actions, as a factor: replay, messages, waiting for one another.
+/// The factor for what a run does besides updates and actions: replay, messages, and processes that wait for each other.
 const OVERHEAD: f64 = 1.3;
-/// Seconds that processes take to start, and to save and end.
+/// The seconds that the processes of a run take to start, to save and to exit.
 const START_SECONDS: f64 = 4.0;
 
 struct Tradeoff<'a> {
     args: &'a TradeoffArgs,
     settings: Settings,
     session: Session,
-    /// The bench of points by their keys.
+    /// The benchmarks of points, by their keys.
     speeds: BTreeMap<String, Measured>,
 }
 
-/// Measures what each dial that buys speed costs: plans, benches, trains, and writes the page.
+/// Measures what each dial that buys speed costs: plans, benchmarks, trains, and writes the page.
 ///
 /// # Errors
 /// As [`crate::run`].
@@ -71,7 +71,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         let base = settings.common.config(&settings.levels[0].base)?;
         base.world.install(&mut console::line)?;
     }
-    // Machine time for the runs of this call.
+    // The budget is the machine time for the runs of this call.
     let (started, budget_seconds) = (Instant::now(), f64::from(args.budget) * 60.0);
     if settings.frames_open {
         shorten(&mut settings, args.flags.smoke, budget_seconds)?;
@@ -102,7 +102,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     report::report(it.session, &results)
 }
 
-/// Makes the runs shorter if not even the first level fits into the budget.
+/// Makes the runs shorter if not even the first requested level fits into the budget.
 fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow::Result<()> {
     let Some(level) = settings.levels.iter().find(|it| it.is_asked) else {
         return Ok(());
@@ -129,7 +129,7 @@ impl Tradeoff<'_> {
         self.settings.common.frames / PIECE_SHARE
     }
 
-    /// The bench of every level that is asked for and of its base; of the others, and for a report, what is there.
+    /// Benchmarks every requested level and its base. For other levels, and for a report, it only reads existing benchmarks.
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
         let (smoke, settings) = (self.args.flags.smoke, &self.settings);
         let (units, program) = (self.piece_units(), cache::program()?);
@@ -139,7 +139,7 @@ impl Tradeoff<'_> {
             }
             let key = format!("speed-{}", point.key);
             let speed = if self.args.queue.report || !settings.asks_for(point) {
-                // Of whatever program made it: only what is asked for is made anew.
+                // Accept the result of any program: only requested points are measured again.
                 self.session.kept_piece(&key)
             } else {
                 let base = settings.common.config(settings.base_of(point))?;
@@ -153,7 +153,7 @@ impl Tradeoff<'_> {
         Ok(())
     }
 
-    /// Whether each level is run: it is asked for, and fits into the seconds that are `left`. Prints that plan; a report runs nothing.
+    /// Returns for each level whether it is run: it is requested and fits into the `left` seconds. Prints this plan. A report runs nothing.
     fn choose(&self, left: f64) -> anyhow::Result<Vec<bool>> {
         let levels = &self.settings.levels;
         if self.args.queue.report {
@@ -180,10 +180,10 @@ impl Tradeoff<'_> {
         Ok(chosen)
     }
 
-    /// What is left to run of a point, which is compared with this base or is it.
+    /// Returns the cost of the unfinished runs of a point. `base` is the point itself or the base of its level.
     fn cost(&self, runs: &Runs, point: &Point, base: &Point) -> anyhow::Result<Cost> {
         let common = &self.settings.common;
-        // Seconds of this machine for each finished run of a point.
+        // The seconds of machine time for each finished run of a point.
         let taken = |point: &Point| {
             let seeds = self.settings.seeds_of(point == base);
             let plans = (1..=seeds).map(|seed| common.run(point, seed));
@@ -201,7 +201,7 @@ impl Tradeoff<'_> {
         let each = match finished {
             _ if unfinished == 0 => 0.0,
             Some(finished) => finished.mean,
-            // What a finished base took corrects what a bench lets expect.
+            // The time of finished base runs corrects the estimate from the benchmark.
             None => {
                 let corrected = taken(base).zip(estimated(base)?);
                 let factor = corrected.map_or(1.0, |(taken, estimated)| taken.mean / estimated);
@@ -214,18 +214,18 @@ impl Tradeoff<'_> {
         })
     }
 
-    /// The runs of the chosen levels and their bases, and those that are there already.
+    /// Returns the runs of the chosen levels and their bases, and all runs that are already finished.
     fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<Planned<Point>>> {
         let runs = Runs::open(self.session.folder())?;
         let mut wanted: Vec<Planned<Point>> = Vec::new();
-        // Seed by seed, so that what was stopped has one seed of everything before it has two of anything. Further seeds that another
-        // call made are on the page too.
+        // Ordered by seed, so that a stopped call has one seed of every point before two of any. The page also has further seeds that
+        // another call made.
         for seed in 1..=SEEDS_MAX {
             for (of, &is_chosen) in self.settings.levels.iter().zip(chosen) {
                 for (point, is_base) in [(&of.base, true), (&of.point, false)] {
                     let run = self.settings.common.run(point, seed);
                     let is_asked = is_chosen && seed <= self.settings.seeds_of(is_base);
-                    // Levels share bases, and a level may be another's base.
+                    // Levels share bases, and a level may be the base of another.
                     let is_new = wanted.iter().all(|(_, known)| known.name != run.name);
                     if is_new && (is_asked || runs.finished(&run).is_some()) {
                         wanted.push((point.clone(), run));
@@ -236,12 +236,12 @@ impl Tradeoff<'_> {
         Ok(wanted)
     }
 
-    /// Makes the chosen runs and plays with their weights, and those that are there already.
+    /// Makes the chosen runs, and plays with the weights of these and of the runs that are already finished.
     fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
         let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
         install(&wanted, report_only)?;
-        // Each run plays, and a random policy once.
+        // The agent of each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
         self.session.progress().again(units * plays);
         let common = self.settings.common.clone();
@@ -262,7 +262,7 @@ impl Tradeoff<'_> {
                 random = play.random(&mut self.session, "random", &run)?;
             }
             let result = points.entry(point.key.clone()).or_default();
-            // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
+            // One run suffices: seeds differ in what they learned, not in the numeric error of the computation.
             if result.seeds.is_empty() {
                 result.measured = self.exactness(&point, &run)?;
                 let speed = self.speeds.get(&point.key).cloned();
@@ -295,7 +295,7 @@ impl Tradeoff<'_> {
     }
 
     fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
-        // The run's own: its seed need not be the first.
+        // Read the config of this run, whose seed may not be 1.
         let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.progress().again(units);
         let key = format!("exactness-{}", point.key);
@@ -306,7 +306,7 @@ impl Tradeoff<'_> {
         self.session.computed(&what, &key, units, measure)
     }
 
-    /// The calls that made the folder's runs, this one last unless it makes none.
+    /// Returns the command lines that made the folder's runs, with this one last unless it only reports.
     fn commands(&self) -> anyhow::Result<Vec<String>> {
         let mut all: Vec<String> = self.session.kept_piece(CALLS).unwrap_or_default();
         let this = this_command();

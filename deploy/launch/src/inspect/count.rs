@@ -1,5 +1,5 @@
-//! The rows of the table: parameters, FLOPs and bytes, of a configuration and of the same with everything on.
-//! What a layer or an update costs is counted in the crates of the model and the learner.
+//! Counts the rows of the table: parameters, FLOPs and bytes of a configuration, and of the same configuration with everything on.
+//! The crates of the model and the learner compute what a layer or an update costs.
 
 use driml_learner::{
     Lambda,
@@ -13,16 +13,16 @@ use serde::Serialize;
 
 pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
      a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
-/// Positives of a row if everything is on: those of the agent that has most, cpc.
+/// Positives of a row with everything on: those of the agent with the most, cpc.
 const EVERY_POSITIVES: usize = 5;
 pub(super) const BATCH: &str = "a batch";
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Line {
     pub(crate) what: String,
-    /// How much of it the configuration has.
+    /// The count for the configuration.
     pub(crate) is: u64,
-    /// How much it would have with everything on.
+    /// The count with everything on.
     pub(crate) everything: u64,
 }
 
@@ -47,7 +47,7 @@ impl<'a> Counted<'a> {
         })
     }
 
-    /// The same world and sizes with everything on, which no agent is.
+    /// The same world and sizes with everything on, which no agent has.
     pub(super) fn with_everything_on(config: &'a RunConfig) -> driml_model::Result<Self> {
         let (frame, input) = (config.world.frame_shape(), config.input);
         let model = ModelConfig {
@@ -58,7 +58,7 @@ impl<'a> Counted<'a> {
             head: HeadConfig::RAINBOW,
             ..config.model.clone()
         };
-        // A stack's frames as one, of the size that the network takes.
+        // The frames of a stack as one frame, of the size that the network takes.
         let run = RunSpec {
             frame_height: input.height,
             frame_width: input.width,
@@ -91,7 +91,7 @@ impl<'a> Counted<'a> {
         units(&self.model)
     }
 
-    /// Scalars of all networks that the learner holds; `units` are those of the model that has most.
+    /// Scalars of all networks that the learner holds; `units` are those of the model that has the most.
     pub(super) fn parameters(&self, units: &[String]) -> Counts {
         let layers = self.model.layer_costs();
         let scalars = |part: &str| sum(&layers, part, |layer| layer.parameters);
@@ -105,7 +105,7 @@ impl<'a> Counted<'a> {
         counts
     }
 
-    /// Arithmetic of one decision of an actor, where the network takes it and not chance.
+    /// FLOPs of one decision of an actor, if the network decides and not chance.
     pub(super) fn decision_flops(&self) -> Counts {
         let layers = self.model.without_dim().layer_costs();
         let forward = |part: &str| sum(&layers, part, |layer| layer.forward);
@@ -126,7 +126,7 @@ impl<'a> Counted<'a> {
         ])
     }
 
-    /// Bytes of a transition, a batch whose rows have every state, and a broadcast. Compression and the socket's own are not counted.
+    /// Bytes of a transition, of a batch whose rows have every state, and of a broadcast, without compression and socket overhead.
     pub(super) fn bytes(&self) -> Counts {
         let header = |run: &RunSpec| {
             let header = BatchHeader::of(run, self.config.learner.batch_size);
@@ -165,7 +165,7 @@ fn sum(layers: &[LayerCost], part: &str, cost: fn(&LayerCost) -> u64) -> u64 {
     of_part.map(cost).sum()
 }
 
-/// The units in which layers are shown: a residual block is one, and so is C51's head, of one layer or two.
+/// The units in which layers are shown: a residual block is one unit, and so is C51's head, of one layer or two.
 fn units(model: &ModelConfig) -> Vec<String> {
     let mut units: Vec<String> = Vec::new();
     for layer in model.layer_costs() {

@@ -1,5 +1,5 @@
-//! `driml inspect`: what a configuration builds, holds, sends and computes, and what it would with everything on.
-//! It counts from the settings: it builds no network, plays no world and measures no time.
+//! `driml inspect`: what a configuration builds, holds, sends and computes, and the same with everything on.
+//! All numbers follow from the settings: this module builds no network, plays no world and measures no time.
 
 mod count;
 
@@ -11,24 +11,24 @@ use serde::Serialize;
 use crate::console::aligned;
 use count::{Counted, EVERYTHING, Line};
 
-/// Columns of the names; a longer name pushes its row to the right.
+/// Width of the names in characters; a longer name pushes its row to the right.
 const WHAT_COLUMNS: usize = 26;
 const NUMBER_COLUMNS: usize = 16;
 
-/// What a world and an agent cost.
+/// The size and the cost of a world and an agent.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Inspection {
     pub(crate) world: String,
     pub(crate) agent: String,
-    /// What [`Line::everything`] stands for.
+    /// The meaning of [`Line::everything`].
     pub(crate) everything: &'static str,
     /// Scalars of all networks that the learner holds, layer by layer.
     pub(crate) parameters: Vec<Line>,
-    /// Multiplications and additions of one update, part by part. Rows of a batch that need less are not known before it is drawn.
+    /// Multiplications and additions of one update, part by part. Rows that need less are not known before a batch is drawn.
     pub(crate) update_flops: Vec<Line>,
     /// Multiplications and additions of one decision of an actor, layer by layer.
     pub(crate) decision_flops: Vec<Line>,
-    /// Bytes of what travels and of what is kept, without headers of some 60 bytes. They do not add up.
+    /// Bytes of what is sent and of what is kept, without headers of some 60 bytes. The lines overlap and have no sum.
     pub(crate) bytes: Vec<Line>,
 }
 
@@ -79,7 +79,7 @@ impl Inspection {
     }
 }
 
-/// A table of one line a world: the sums of an agent's tables, and in brackets those with everything on.
+/// A table with one line per world: the sums of an agent's tables, and in brackets the sums with everything on.
 pub fn describe_worlds(inspections: &[Inspection]) -> String {
     let headings = "world,parameters,FLOPs an update,FLOPs a decision,bytes a batch";
     let mut rows = vec![headings.split(',').map(String::from).collect()];

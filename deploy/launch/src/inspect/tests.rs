@@ -1,4 +1,4 @@
-//! An inspection against what a learner builds and sends.
+//! Compares an inspection with what a learner builds and sends.
 
 use driml_learner::{Compute, Learner, LearnerConfig};
 use driml_protocol::{Batch, BatchHeader, Buffer, RowScalars};
@@ -104,7 +104,7 @@ fn what_is_counted_is_what_is_built() {
 
             let weights = learner.next_weights().unwrap().safetensors.len();
             assert_eq!(find(&inspection.bytes, "a broadcast").is, weights as u64);
-            // Rows that have every state that a row may have.
+            // Rows with every state that a row may have.
             let header = BatchHeader::of(&config.run, config.learner.batch_size)
                 .sampled_by(&config.replay.sampling);
             let row = RowScalars {
@@ -126,7 +126,7 @@ fn what_is_counted_is_what_is_built() {
             match header.stacked {
                 None => assert_eq!(said_states, [states[0] + states[1], states[2]]),
                 Some(stacked) => {
-                    // Four bytes say which frame each of a state is.
+                    // For each frame of a state, four bytes say which frame it is.
                     let frames = stacked.frames as usize * config.run.frame_bytes();
                     let stacks = states.iter().sum::<usize>() / config.run.frame_bytes() * 4;
                     assert_eq!(said_states.iter().sum::<usize>(), frames + stacks);

@@ -1,6 +1,6 @@
-//! The launcher: starts replay servers, learner and actors as processes, watches them to the end of the run, and ends them in
+//! The launcher starts replay servers, learner and actors as processes, watches them until the run is over, and stops them in
 //! order.
-//! Each is a `managed_process`; `view` asks how they are and shows it, and `run_folder` keeps it.
+//! `managed_process` handles each process, `view` polls and displays the run, and `run_folder` records it.
 
 mod processes;
 
@@ -31,22 +31,22 @@ use crate::{
 };
 
 const POLL: Duration = Duration::from_secs(1);
-/// How long a process may leave questions unanswered, from its start too, before the run is given up.
+/// How long the replay servers or the learner may leave requests unanswered, also after their start, before the run fails.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
-/// How long a run may make no progress before it is given up.
+/// How long a run may make no progress before it fails.
 const STALL_MAX: Duration = Duration::from_secs(600);
-/// How long actors may take to deliver what they have, once they are not needed or told to stop.
+/// How long actors may take to deliver their transitions, once they are not needed or told to stop.
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
-/// How long actors may take to end once another process has failed.
+/// How long actors may take to exit once another process has failed.
 const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 /// How long the learner may take to save, once it is told to stop.
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
-/// How long the replay server may take to end, once it is told to stop.
+/// How long the replay server may take to exit, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 
-/// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
-/// that folder already and continues from the point given.
+/// Trains with a process for each replay server, the learner and each actor, and leaves the folder `run_dir`. A run that is
+/// `resumed` already has that folder and continues from the given point.
 ///
 /// # Errors
 /// A process that failed or is unresponsive, a file system error; `Interrupted` if the run was asked to stop.
@@ -60,7 +60,7 @@ pub fn run(
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
     let shutdown = shutdown.context("listening for signals")?;
     open_files::check_run(config)?;
-    // Opening the recorder removes it.
+    // `RunRecorder::open` removes the summary.
     let before = resumed.and_then(|_| Summary::read(run_dir).ok());
     let restarts_before = before.map_or([0; 2], |it| {
         [it.replay_servers_restarted, it.actors_restarted]
@@ -79,7 +79,7 @@ pub fn run(
     let place = rendezvous.path().as_os_str().as_encoded_bytes();
     write_whole(&run_dir.rendezvous(), place)?;
     let display = Display::new(config.frames(), Instant::now(), resume_point.updates);
-    // What killed processes left is room again.
+    // Frees the shared memory that killed processes left behind.
     session::sweep_shared_memory();
     let shared_memory = config.transport.shared_memory && {
         let settings = Settings::parse(&config.to_toml())?;
@@ -112,21 +112,21 @@ pub fn run(
     launch.display.screen.clear();
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
     let (mut summary, written) = launch.conclude(outcome, restarts_before);
-    // An interrupted or failed run does not wait for it.
+    // An interrupted or failed run does not wait for the last evaluation.
     if outcome == Outcome::Finished {
         let evaluator = &mut launch.evaluator;
         evaluator.finish(&launch.display.screen, &|| launch.shutdown.ending.is_set());
     }
-    // No process is left that could be reached by them; where these files stay behind, locks show it.
+    // All processes have exited, so these files are of no use. If they stay behind, the released locks show that.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
         if let Err(e) = std::fs::remove_file(&path) {
             tracing::debug!("removing {}: {e}", path.display());
         }
     }
-    // A run that was resumed and learned nothing most likely failed because of what it was resumed from.
+    // A resumed run that did no update most likely failed because of what it was resumed from, and would fail again.
     let has_learned = resumed.is_none() || summary.updates > resume_point.updates;
     if let Err(failed) = ended {
-        // This error is reported last; that the disk is full too is reported before.
+        // The caller reports `failed` last. A summary that could not be written, as on a full disk, is reported before.
         if let Err(e) = written {
             console::line(&console::describe(&e));
         }
@@ -165,7 +165,7 @@ impl Launch<'_> {
             }
             let opened = Reached::open(name, endpoint, hash);
             if opened.is_err() {
-                // One that died while this process connected says more than the connection.
+                // If a server died meanwhile, its exit report says more than the connection error.
                 check_alive()?;
             }
             reached.push(opened?);
@@ -179,7 +179,7 @@ impl Launch<'_> {
         self.watch()
     }
 
-    /// Asks, shows and records once a second until the run is over.
+    /// Polls, shows and records the run once a second until it is over.
     fn watch(&mut self) -> anyhow::Result<Outcome> {
         let (mut standstill, mut counts_before) = (Silence::default(), (0, 0));
         loop {
@@ -219,7 +219,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Finished);
             }
             let counts = (view.replay.transitions_inserted, view.learner.updates);
-            // While a replay server reads its replay back the others wait for it.
+            // While a replay server reads its replay back from disk, the other processes wait for it.
             if counts != counts_before || view.recovering().next().is_some() {
                 standstill.answered();
                 counts_before = counts;
@@ -236,11 +236,11 @@ impl Launch<'_> {
         }
     }
 
-    /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
-    /// that it can be asked for the final counts. A second interrupt ends everything at once. Gives how the run ended.
+    /// Stops all processes in order: first the actors, which deliver their transitions; then the learner, which saves; then the
+    /// replay servers, which must answer with the final counts. A second interrupt kills all at once. Returns how the run ended.
     fn end(&mut self, ran: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
         let failed = ran.as_ref().err().map(|e| format!("{e:#}"));
-        // The signal that interrupted this process may have reached the others first.
+        // A signal that interrupts this process may reach the others first; their exit then counts as an interruption.
         let ran = match self.shutdown.ending.is_set() {
             false => ran,
             true => ran.or(Ok(Outcome::Interrupted)),
@@ -251,12 +251,12 @@ impl Launch<'_> {
         let now = self.shutdown.now.clone();
         let abort = move || now.is_set();
         let finished = matches!(ran, Ok(Outcome::Finished));
-        // Once a process has failed, what the actors still have will hardly be learned from.
+        // After a failure, the learner will hardly use what the actors still hold.
         let actors_max = match ran {
             Ok(_) => ACTORS_DRAIN_MAX,
             Err(_) => FAILED_DRAIN_MAX,
         };
-        // When the run is finished, actors learn it from the replay server and exit.
+        // In a finished run, the replay server tells the actors so, and they exit.
         let shards = self.endpoints.len();
         let actors = self.processes.iter_mut().skip(shards + 1);
         let actors = stop(actors, !finished, actors_max, &abort);
@@ -269,12 +269,12 @@ impl Launch<'_> {
             }
             let ask = |shard, since| poller.episodes(shard, since, true);
             self.recorder.record_episodes(&poller.view, ask);
-            // Before its router goes away, so that it does not try to reach it again.
+            // Closed before the replay server, which is the session's router: otherwise it would try to reconnect.
             poller.close();
         }
         let servers = self.processes.iter_mut().take(shards);
         others.extend(stop(servers, true, REPLAY_DRAIN_MAX, &abort));
-        // All transitions are in and learned from, and the result is saved, by the last answers.
+        // By the last answers, all transitions are stored and learned from, and the result is saved.
         let is_learned = |Poller { view, .. }: &Poller| {
             let served = updates_served(self.config, view.replay.rows_sampled);
             view.is_learned() && view.learner.updates >= served
@@ -292,7 +292,7 @@ impl Launch<'_> {
             Ok(outcome) => self.run_dir.check_whole().map(|()| outcome),
             Err(e) => Err(e),
         };
-        // What an actor could not deliver is in the count of lost transitions; all that was learned is still saved.
+        // Transitions that an actor could not deliver count as lost and are not an error: what was learned is saved.
         let error = result.as_ref().err();
         let error = error.map_or(String::new(), |e| format!("{e:#}"));
         let mut warnings: Vec<_> = actors.into_iter().chain(others).collect();
@@ -303,7 +303,7 @@ impl Launch<'_> {
         result
     }
 
-    /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
+    /// Tells the learner to stop, then polls its status until it reports that it has saved or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
         let learner = self.processes.get_mut(self.endpoints.len());
         let (Some(learner), Some(poller)) = (learner, &mut self.poller) else {
@@ -312,7 +312,7 @@ impl Launch<'_> {
         if learner.end().is_some() {
             return;
         }
-        // One that has finished may end as soon as it is told to.
+        // Ask once before the signal: a learner that has finished may exit right after it.
         if let Err(e) = poller.ask_learner() {
             tracing::debug!("a question before the last: {e:#}");
         }
@@ -330,7 +330,7 @@ impl Launch<'_> {
         }
     }
 
-    /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
+    /// Writes the last row and the summary. Prints which rows and lines are lost; the result says whether the summary was written.
     fn conclude(
         &mut self,
         outcome: Outcome,

@@ -1,5 +1,5 @@
-//! The launcher's processes: the words that start each, and those that are started again when they have died.
-//! When the first are started, and how all end, is in `mod`.
+//! The launcher's processes: the command line of each, and the restart of processes that have died.
+//! When the first processes start, and how all of them end, is in `mod`.
 
 use std::{
     ffi::{OsStr, OsString},
@@ -12,20 +12,20 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     evaluator::Evaluator,
-    managed_process::ManagedProcess,
+    managed_process::{ManagedProcess, is_orderly},
     rendezvous::Rendezvous,
     run_folder::{ResumePoint, RunFolder, RunRecorder},
     view::{Display, Poller},
 };
 
-/// How often replay servers that keep their replay on disk are started again in a run, all together.
+/// How often replay servers that keep their replay on disk are restarted in one run, in total; one more failure is an error.
 const RESTARTS_MAX: u32 = 8;
-/// How often actors that have died are started again in one run, all together; one more is an error.
+/// How often actors that have died are restarted in one run, in total; one more failure is an error.
 const ACTOR_RESTARTS_MAX: u32 = 16;
-/// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
+/// Threads for arithmetic in an actor and in a replay server: one, as many processes share the cores.
 const PROCESS_THREADS: u32 = 1;
 
-/// What a process does: as the replay server of a shard, or the actor of an id.
+/// The role of a process: the replay server of a shard, the learner, or the actor with an ID.
 #[derive(Clone, Copy)]
 enum Part {
     ReplayServer(usize),
@@ -33,7 +33,7 @@ enum Part {
     Actor(usize),
 }
 
-/// The processes of a run that is started on one machine: replay servers, learner, actors.
+/// The names of the processes that the launcher starts: replay servers, learner, actors.
 pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
     let mut names: Vec<String> = match config.replay.shards {
         1 => vec!["replay-server".into()],
@@ -44,10 +44,10 @@ pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
     names
 }
 
-/// Where the replay server is reached from outside the run.
+/// How clients from outside the run reach the replay server.
 #[derive(Clone, Debug, Default)]
 pub struct Outside {
-    /// Where the processes meet, if not at a private unix socket; with certificates, where it listens beside that.
+    /// The endpoint that replaces the private unix socket; with certificates, an endpoint in addition to the socket.
     pub listen: Option<String>,
     /// The folder of certificates.
     pub tls_dir: Option<PathBuf>,
@@ -55,32 +55,32 @@ pub struct Outside {
     pub allow_insecure: bool,
 }
 
-/// A run that is started on one machine: its processes, and what watches and keeps it.
+/// A run that is started on one machine: its processes, and the parts that watch and record it.
 pub(super) struct Launch<'a> {
     pub(super) config: &'a RunConfig,
-    /// Whether chunks and batches go through shared memory: it is asked for, and there is enough for all processes.
+    /// Whether chunks and batches go through shared memory: the settings ask for it, and there is enough for all processes.
     pub(super) shared_memory: bool,
     pub(super) run_dir: &'a RunFolder,
     pub(super) resume_point: ResumePoint,
-    /// Where each replay server listens, one a shard.
+    /// The endpoint of each replay server, one per shard.
     pub(super) endpoints: Vec<String>,
     pub(super) outside: Outside,
     pub(super) rendezvous: Rendezvous,
     pub(super) display: Display,
     pub(super) shutdown: GracefulShutdown,
-    /// Names of all processes, and those that are started: replay servers, learner, actors.
+    /// The names of all processes, and the processes started so far, both in the order replay servers, learner, actors.
     pub(super) names: Vec<String>,
     pub(super) processes: Vec<ManagedProcess>,
     pub(super) evaluator: Evaluator,
     pub(super) server_restarts: u32,
     pub(super) actor_restarts: u32,
     pub(super) poller: Option<Poller>,
-    /// The last that goes: no other launcher writes to the folder before.
+    /// Dropped last: until then its lock keeps other launchers out of the folder.
     pub(super) recorder: RunRecorder,
 }
 
 impl Launch<'_> {
-    /// What the process of this number does, by its place among the names.
+    /// The role of the process at index `number` of `names`.
     fn part(&self, number: usize) -> Part {
         match number.checked_sub(self.endpoints.len()) {
             None => Part::ReplayServer(number),
@@ -89,7 +89,7 @@ impl Launch<'_> {
         }
     }
 
-    /// Starts the processes up to this number that are not started yet.
+    /// Starts the first `count` processes, except those that are already started.
     pub(super) fn start_up_to(&mut self, count: usize) -> anyhow::Result<()> {
         for number in self.processes.len()..count {
             self.processes.push(self.start(number)?);
@@ -120,7 +120,7 @@ impl Launch<'_> {
                 if local.durable {
                     flag("--replay-dir", &self.run_dir.replay());
                 }
-                // The first is reached from outside the run, too.
+                // The first server can also be reached from outside the run.
                 let outside = &self.outside;
                 if shard == 0
                     && let (Some(listen), Some(folder)) = (&outside.listen, &outside.tls_dir)
@@ -150,7 +150,7 @@ impl Launch<'_> {
         ManagedProcess::start(name, &args, threads, &logs, screen, rendezvous)
     }
 
-    /// Whether an actor has exited though frames are missing, by an answer that is newer than its end.
+    /// Whether an actor has exited although frames are missing. Asks the replay server again, so that its answer is newer than the exit.
     fn is_actor_missed(&mut self) -> bool {
         let Some(poller) = &mut self.poller else {
             return false;
@@ -163,11 +163,11 @@ impl Launch<'_> {
         poller.ask_replay().is_ok() && !poller.view.replay.finished
     }
 
-    /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. What an actor had not delivered is
-    /// lost; the run continues.
+    /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. Transitions that an actor had
+    /// not delivered are lost; the run continues.
     ///
     /// # Errors
-    /// One that has died is not restarted.
+    /// A process has died that is not restarted.
     pub(super) fn revive(&mut self) -> anyhow::Result<()> {
         let actors_are_needed = self.is_actor_missed();
         for number in 0..self.processes.len() {
@@ -177,7 +177,7 @@ impl Launch<'_> {
                 continue;
             };
             let is_actor = matches!(part, Part::Actor(_));
-            if is_actor && status.success() && !actors_are_needed {
+            if is_actor && is_orderly(status) && !actors_are_needed {
                 continue;
             }
             let (name, report) = (&self.names[number], process.exit_report());

@@ -1,5 +1,5 @@
-//! Actors, replay server and learner in one process, one after the other in a fixed order: the same code as the processes run,
-//! without sockets. The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
+//! Runs actors, replay and learner in one process, one after the other in a fixed order: the same code as in separate processes, but
+//! without sockets. The same seed gives the same weights, bit for bit, on the same machine. The mode is for tests and debugging.
 //!
 //! A resumed run continues as if it had not been interrupted: each checkpoint holds the state of worlds, actors and replay.
 
@@ -25,13 +25,13 @@ use crate::{
 use processes::Lockstep;
 
 const POLL: Duration = Duration::from_secs(1);
-/// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.
+/// Rows of metrics that even the shortest run has, evenly over its frames, as such a run may last less than a second.
 const ROWS_MIN: u64 = 200;
 
-/// Trains in this process, and leaves `run_dir`; with a resume point it continues the run that is there.
+/// Trains in this process, and leaves the folder `run_dir`. With a resume point, continues the run in that folder.
 ///
 /// # Errors
-/// A component that failed, a file system that refuses; `Interrupted` if the run was asked to stop.
+/// A component that failed, a file system error; `Interrupted` if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -72,7 +72,7 @@ pub fn run(
 
     let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| (point.updates, point.frames));
-    // After how many updates a save was last tried.
+    // The updates at the last attempt to save.
     let mut tried = updates;
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
@@ -80,7 +80,7 @@ pub fn run(
         let updates = lockstep.learner.updates();
         if updates / period > tried / period {
             tried = updates;
-            // A disk that refuses once does not end the training; what cannot be saved in the end is an error.
+            // A failed save does not end the training, but at the end of the run it is an error.
             if let Err(e) = lockstep.save(&folder) {
                 screen.line(&format!(
                     "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
@@ -104,13 +104,13 @@ pub fn run(
             break;
         }
     }
-    // Frames may have come since the last update.
+    // Frames may have been stored since the last update.
     if saved != Some((lockstep.learner.updates(), lockstep.replay.inserted_total()))
         || outcome == Outcome::Interrupted
     {
         lockstep.save(&folder)?;
     }
-    // After the last save: a longer run would continue from there without it.
+    // Only after the last save: a longer run must continue from a state in which the actors have not left.
     lockstep.end()?;
     screen.clear();
     record(&mut recorder, &mut view, &mut lockstep);
@@ -137,7 +137,7 @@ fn exit_at_a_second(second: Shutdown) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Records how the run stands, and the episodes that ended. Returns warnings.
+/// Records the state of the run, and the episodes that ended. Returns warnings.
 fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockstep) -> Vec<String> {
     let status = lockstep.replay.status();
     let ended = status.episodes;

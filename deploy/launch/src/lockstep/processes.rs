@@ -1,6 +1,6 @@
-//! Actors, replay and learner stepped in a fixed order.
-//! A checkpoint holds the learner, and beside it the state of the others but for the replay's transitions, which lie in the run folder.
-//! When to save and what to show is for `mod`.
+//! Actors, replay and learner, stepped in a fixed order.
+//! A checkpoint holds the learner, and beside it the state of actors and replay. The replay's transitions lie in the run folder.
+//! `mod` decides when to save and what to show.
 
 use std::path::Path;
 
@@ -18,15 +18,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::{console, run_folder::RunFolder};
 
-/// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
+/// The incarnation of every actor: an actor of this mode starts only once, and the number influences nothing.
 const INCARNATION: u64 = 1;
 /// The learner's number, which influences nothing either.
 const LEARNER: u64 = 1;
 
-/// How it is written; another way is rejected.
+/// Version of the format of [`SavedParts`]; another version is rejected.
 const FORMAT: u32 = 5;
 
-/// The state of a run in lockstep, without the learner.
+/// The saved state of a run in lockstep, without the learner.
 #[derive(Serialize, Deserialize)]
 struct SavedParts {
     actors: Vec<CollectorState>,
@@ -34,14 +34,14 @@ struct SavedParts {
     turn: Turn,
 }
 
-/// Which actor is next, and with which weights.
+/// Which actor is next, and the weights with which the actors act.
 #[derive(Clone, Serialize, Deserialize)]
 pub(super) struct Turn {
     next_actor: usize,
-    /// Transitions of each actor that came after the run's last.
+    /// Transitions that each actor produced after the replay had all that the run needs.
     unwanted: Vec<u64>,
     pub(super) status: LearnerStatus,
-    /// The weights with which the actors act, a safetensors file, and the updates after which they were published.
+    /// The weights with which the actors act, as a safetensors file, and the updates after which they were published.
     acting: (WeightsHeader, Vec<u8>),
     published: u64,
 }
@@ -53,7 +53,7 @@ impl SavedParts {
         Ok(bytes)
     }
 
-    /// What the newest checkpoint in a run's folder holds.
+    /// Reads the state in the newest checkpoint of a run's folder.
     fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;
@@ -69,7 +69,7 @@ impl SavedParts {
     }
 }
 
-/// The replay of a run, kept in its folder; with a mark, as it was there.
+/// Opens the replay in a run's folder; with a mark, in the state at that mark.
 fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {
     let args = PersistArgs {
         dir: run_dir.replay(),
@@ -79,7 +79,7 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
     };
     let batch_size = config.learner.batch_size;
     let (replay, recovery) = Replay::open(&args, &config.run, &config.replay, batch_size)?;
-    // A server could continue with a part of it, but a lockstep run must be the same.
+    // A replay server could continue with a part of the replay, but a lockstep run must repeat exactly.
     match recovery.warnings.first() {
         Some(why) if mark.is_some() => bail!(usage!(
             "the run cannot resume to the same weights: {why}. Start it again, in another folder"
@@ -99,7 +99,7 @@ pub(super) struct Lockstep {
 }
 
 impl Lockstep {
-    /// The components of a run that begins; its replay is kept in the run's folder if its checkpoints can be resumed.
+    /// The components of a new run; the replay is kept in the run's folder if the state of the world can be saved.
     pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let mut this = Self::in_memory(config)?;
         match this.actor_states() {
@@ -115,7 +115,7 @@ impl Lockstep {
         Ok(this)
     }
 
-    /// The components of the run in `run_dir`, as they were at its newest checkpoint.
+    /// The components of the run in `run_dir`, in the state of its newest checkpoint.
     pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let saved = SavedParts::read(run_dir)?;
         let compute = config.local.learner_device.open(config.learner.precision)?;
@@ -135,7 +135,7 @@ impl Lockstep {
         Ok(this)
     }
 
-    /// The components of a run that begins and is not kept.
+    /// The components of a new run, with the replay in memory only.
     pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
         let replay = Replay::new(&config.run, &config.replay, config.learner.batch_size)?;
         let compute = config.local.learner_device.open(config.learner.precision)?;
@@ -161,7 +161,7 @@ impl Lockstep {
         Ok(this)
     }
 
-    /// These components, with actors that begin and act with the weights of this turn.
+    /// Assembles these components with new actors, which act with the weights of `turn`.
     fn of(
         config: &RunConfig,
         learner: Learner,
@@ -206,12 +206,12 @@ impl Lockstep {
         self.actors.iter_mut().map(Collector::state).collect()
     }
 
-    /// Writes a checkpoint into `folder`, from which the run continues exactly as now.
+    /// Writes a checkpoint into `folder`, from which a resumed run continues exactly as this one.
     pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
         let inserted = self.replay.counts().inserted;
         self.learner.progress_mut().note_inserted(0, inserted);
         let Some(mark) = self.replay.mark()? else {
-            // Which says that the run is in lockstep, and cannot be resumed.
+            // An empty companion says that the run is in lockstep, and cannot be resumed.
             return Ok(self.learner.save_with(folder, Some(&[]))?);
         };
         let saved = self.save_at(mark, folder);
@@ -221,7 +221,7 @@ impl Lockstep {
         saved
     }
 
-    /// [`Lockstep::save`] of a run whose replay is marked in its log.
+    /// [`Lockstep::save`] for a run whose replay has a mark in its log.
     fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
         let doing = "saving the worlds for a checkpoint; at the run's start it could be done";
         let saved = SavedParts {
@@ -232,7 +232,7 @@ impl Lockstep {
         Ok(self.learner.save_with(folder, Some(&saved.to_bytes()?))?)
     }
 
-    /// One chunk of the next actor, then every update that it allows; `false` once all updates are done.
+    /// Stores one chunk of the next actor, then does every update that it allows. Returns false once all updates are done.
     pub(super) fn round(&mut self) -> anyhow::Result<bool> {
         let id = self.turn.next_actor;
         self.turn.next_actor = (id + 1) % self.actors.len();
@@ -312,7 +312,7 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Publishes the last weights; the actors leave.
+    /// Publishes the last weights, and lets the actors leave.
     pub(super) fn end(&mut self) -> anyhow::Result<()> {
         if self.turn.published != self.learner.updates() {
             self.publish()?;

@@ -1,4 +1,4 @@
-//! What a run in lockstep computes, and that one that was interrupted computes the same.
+//! What a run in lockstep computes, and that an interrupted run computes the same.
 
 use driml_model::{Precision, describe_kernels};
 
@@ -50,11 +50,11 @@ fn every_torso_learns_the_same_again() {
     }
 }
 
-/// Worlds that are made so large that a convolution leaves a border out: as drawn, and enlarged.
+/// Worlds so large that a convolution leaves out a border: as drawn, and enlarged.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
     let pacman = ["input.height=88", "input.width=90"];
-    // AMX sums 32 terms at a time, which are others where zeros stand between them.
+    // AMX sums 32 terms at a time, and zeros between the terms change which 32 these are.
     let is_amx = describe_kernels(Precision::Bf16).starts_with("AMX");
     let precisions = [Precision::F32, Precision::Bf16];
     let precisions = &precisions[..if is_amx { 1 } else { 2 }];
@@ -73,7 +73,7 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
     }
 }
 
-/// A random crop reads what no convolution of the whole frame does.
+/// A random crop reads the border, which no convolution of the whole frame reads.
 #[test]
 fn where_states_are_augmented_frames_stay_whole() {
     let config = config("chain", "curl", 400, &WIDE_CHAIN);
@@ -82,7 +82,7 @@ fn where_states_are_augmented_frames_stay_whole() {
     weights(&config);
 }
 
-/// A run that was saved after so many rounds.
+/// Begins a run, and saves it after `rounds` rounds.
 fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lockstep) {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());
@@ -95,7 +95,7 @@ fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lo
 const PRIORITISED: &str =
     "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
 
-/// Before the first update, and late; a ring that is full by then, and one that is compressed. Rounds after the save are lost.
+/// Saves before the first update, and late, when the ring is full; also with a compressed ring. Rounds after the save are lost.
 #[test]
 fn a_run_that_was_interrupted_computes_what_it_would_have() {
     let small = ["replay.capacity_transitions=320"];
@@ -128,7 +128,7 @@ fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
     format!("{error:#}")
 }
 
-/// Each resumption begins where the one before it saved.
+/// Each resume begins where the one before saved.
 #[test]
 fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
     let config = config("mspacman", "driml-ada", 800, &[]);
@@ -168,7 +168,7 @@ fn what_cannot_go_on_says_why() {
         let said = refused(&config, &run_dir);
         assert!(said.contains(why), "{said}");
     }
-    // Of a world that cannot be saved.
+    // The checkpoint of a world that cannot be saved.
     let (_folder, run_dir, _) = begun(&config, 9);
     std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
     let mut unkept = Lockstep::in_memory(&config).unwrap();

@@ -1,10 +1,10 @@
-//! `episodes.csv`: a row for every training episode, kept over a run's resumptions, and the mean return of the last 100.
-//! Each shard's replay server is asked for the episodes that ended; what an episode is, is theirs to say.
+//! `episodes.csv`: one row per training episode, also across resumes, and the mean return of the last 100 episodes.
+//! Each shard's replay server reports the episodes that ended; this module does not decide what an episode is.
 //!
-//! Columns: `seconds` of the run when the episode was received, up to a second after it ended (empty where it had ended before the
-//! run was watched); `frames`, the run's count with the chunk that held its end; `episode`, its number; `actor` and `env`, who
-//! played it, and in which environment; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
-//! Of more than the replay server keeps between two looks the oldest are missing, and so are their numbers.
+//! Columns: `seconds`, the run's time when the episode was received, up to a second after its end (empty if that was before the
+//! run was watched); `frames`, the run's count with the chunk that held its end; `episode`, its number; `actor` and `env`, the actor
+//! that played it and its environment; `return`, undiscounted, and `length` in steps, both empty if a part of the episode was lost.
+//! If more episodes end between two requests than a replay server keeps, the oldest have no row, and their numbers are skipped.
 
 use std::collections::VecDeque;
 
@@ -20,12 +20,12 @@ use crate::{
     run_view::Episodes,
 };
 
-/// Answers that are asked of one shard at a time; what they do not hold comes the next time.
+/// Maximum number of requests to one shard per update; the next update requests the remaining episodes.
 const ASKS_MAX: usize = 16;
 
 const HEADER: &str = "seconds,frames,episode,actor,env,return,length";
 
-/// What is read again of a row.
+/// The columns that are read back from a row.
 #[derive(Deserialize)]
 struct Row {
     frames: u64,
@@ -38,24 +38,24 @@ struct Row {
 #[derive(Debug)]
 pub(super) struct TrainingEpisodes {
     table: AppendLog,
-    /// The newest returns, the oldest first.
+    /// The newest returns, oldest first.
     newest: VecDeque<f64>,
-    /// The number of the newest.
+    /// The number of the newest episode.
     pub(super) episode: u64,
     frames: u64,
     frames_at_status: Option<u64>,
-    /// How many had ended in each shard at its last status.
+    /// How many episodes of each shard were received or counted as lost.
     received: Vec<u64>,
     lost: u64,
     folder: RunFolder,
-    /// The rows with which it began, and of how many the shards do not know, until their first status shows how many stay; none if they
-    /// know of none.
+    /// The rows at the start, and how many of the first episodes the shards do not know. The shards' first status shows how many of
+    /// the rows stay, and clears this field. None if the shards know none of the rows.
     known: Option<(Table, u64)>,
 }
 
 impl TrainingEpisodes {
-    /// With what ended until a run that is resumed had `frames_max` frames, none of one that begins; the others are set aside.
-    /// If its replay knows of them, the number of the first ones of which it does not.
+    /// Opens the table. A resumed run keeps the episodes that ended by `frames_max` frames and sets the others aside; a run that begins
+    /// has none. If the replay was kept, `unknown` is the number of first episodes that it does not know.
     pub(super) fn open(
         folder: &RunFolder,
         frames_max: Option<u64>,
@@ -66,7 +66,7 @@ impl TrainingEpisodes {
         };
         let path = folder.episodes();
         let mut rows = Table::read(&path)?;
-        // A replay that was kept says itself how far it is, once it answers.
+        // A replay that was kept reports the run's frames once it answers; the rows are cut then.
         rows.keep(&path, |row: Row| {
             unknown.is_some() || row.frames <= frames_max
         })?;
@@ -93,8 +93,8 @@ impl TrainingEpisodes {
         })
     }
 
-    /// Takes what each shard counts and asks it for the episodes that ended since those that are known, after so many `seconds` of the
-    /// run, if they are known. The file then holds as many as the shards count, and each once. Returns warnings about the file.
+    /// Requests the episodes of each shard that ended since the last update, and adds their rows. `seconds` is the run's time, if known.
+    /// Afterwards the file has as many episodes as the shards count, each once. Returns warnings about the file.
     pub(super) fn update(
         &mut self,
         shards: &[ReplayStatus],
@@ -102,7 +102,7 @@ impl TrainingEpisodes {
         seconds: Option<f64>,
     ) -> Vec<String> {
         if shards.is_empty() {
-            // None has answered yet, so that nothing is known of what was done.
+            // No shard has answered yet, so nothing is known of what was done.
             return Vec::new();
         }
         let frames: u64 = shards.iter().map(|it| it.transitions_inserted).sum();
@@ -112,16 +112,16 @@ impl TrainingEpisodes {
             warnings.extend(cut.err().map(|e| format!("{e:#}")));
             self.take_as_received(shards, &rows, unknown);
         }
-        // They were not there the last time; what a shard knows of the others is older.
+        // The new episodes ended after the last status; a shard may report fewer frames, as its count of the other shards is older.
         let received = self.frames_at_status.replace(frames);
         let later = received.map_or(0, |before| before.saturating_add(1).min(frames));
-        // While a resumed run's replay fills again it counts frames that it had before.
+        // While a resumed run's replay fills again, it counts frames that the run had before.
         self.frames = self.frames.max(later);
         self.received
             .resize(shards.len().max(self.received.len()), 0);
         let mut rows = Vec::new();
         for (shard, status) in shards.iter().enumerate() {
-            // A server that knows of fewer than before is another one.
+            // A server that counts fewer episodes than before is a new one.
             let mut received = self.received[shard];
             if status.episodes < received {
                 received = 0;
@@ -143,7 +143,7 @@ impl TrainingEpisodes {
                     self.lost += missing;
                     self.episode += missing;
                 }
-                // One that ended after the status comes with the next.
+                // An episode that ended after the status is taken in the next update.
                 let wanted = status.episodes.saturating_sub(reply.before) as usize;
                 let ended = reply.episodes.iter().take(wanted);
                 let all = reply.before + ended.len() as u64;
@@ -152,12 +152,12 @@ impl TrainingEpisodes {
             }
             self.received[shard] = received;
         }
-        // Those that could not be written before are tried again, too.
+        // This also retries the rows that could not be written before.
         warnings.extend(self.table.add(rows));
         warnings
     }
 
-    /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
+    /// Sets aside the episodes that ended after `frames_max` frames: the run does that part again.
     fn cut(&mut self, rows: &mut Table, frames_max: u64) -> anyhow::Result<()> {
         if rows.keep(&self.folder.episodes(), |row: Row| row.frames <= frames_max)? {
             *self = Self::begin(&self.folder, rows.clone(), None)?;
@@ -165,8 +165,8 @@ impl TrainingEpisodes {
         Ok(())
     }
 
-    /// What the shards knew of when the last episode was received, the first `unknown` apart: all but the newest, which are those of
-    /// shards with fewer rows.
+    /// Notes how many of each shard's episodes were received before this process started. Those that were not are the newest episodes
+    /// of shards that count more episodes than they have rows. The first `unknown` episodes do not count.
     fn take_as_received(&mut self, shards: &[ReplayStatus], rows: &Table, unknown: u64) {
         let mut of_shards = vec![0; shards.len()];
         for row in rows.all::<Row>().unwrap_or_default() {
@@ -205,7 +205,7 @@ impl TrainingEpisodes {
         ]
     }
 
-    /// So many, or as many as have a number: a replay that was kept counts none before it answers.
+    /// The episodes so far: `count`, or the newest number if that is higher, as a kept replay counts none before it answers.
     pub(super) fn so_far(&self, count: u64) -> Episodes {
         Episodes::of(count.max(self.episode), self.newest.iter())
     }

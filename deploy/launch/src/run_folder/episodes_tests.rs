@@ -1,4 +1,4 @@
-//! The table of episodes: each has one row, of every shard, over resumptions and where the server has let some go.
+//! The table of episodes: one row per episode, from every shard, across resumes, and if the server no longer keeps some.
 
 use std::fs;
 
@@ -7,8 +7,8 @@ use driml_protocol::Played;
 use super::*;
 use crate::testing::with;
 
-/// A shard of `frames` in which so many episodes have `ended`, of which the server keeps those after the first `let_go`, thirty an
-/// answer; their returns are their numbers from `first`.
+/// A shard with `frames` frames and `ended` episodes that have ended. The server keeps the episodes after the first `let_go`, thirty
+/// per answer. The return of an episode is `first` plus its number.
 #[derive(Clone, Copy)]
 struct Shard {
     frames: u64,
@@ -35,7 +35,7 @@ impl Shard {
         })
     }
 
-    /// One more has ended since the status.
+    /// The reply to a request; one more episode has ended since the status.
     fn reply(&self, since: u64) -> EpisodesReply {
         let episode = |n| EndedEpisode {
             frames: self.frames,
@@ -74,7 +74,7 @@ fn rows(folder: &RunFolder) -> Vec<String> {
     text.lines().skip(1).map(str::to_owned).collect()
 }
 
-/// The mean return, and of how many.
+/// The mean return, and the number of episodes in it.
 fn mean(episodes: &TrainingEpisodes) -> (Option<f64>, usize) {
     let so_far = episodes.so_far(0);
     (so_far.mean_return, so_far.mean_return_of)
@@ -84,7 +84,7 @@ fn mean(episodes: &TrainingEpisodes) -> (Option<f64>, usize) {
 fn every_episode_is_taken_once_from_every_shard() {
     let (_root, folder, mut episodes) = begun();
     assert_eq!(mean(&episodes), (None, 0));
-    // The last time nothing has ended since.
+    // In the last update nothing new has ended.
     let later = [shard(20, 1, 3, 0), shard(5, 0, 1, 50)];
     for shards in [[shard(10, 0, 1, 0), shard(5, 0, 0, 50)], later, later] {
         update(&mut episodes, &shards);
@@ -112,7 +112,7 @@ fn what_the_server_has_let_go_is_counted_and_said() {
     assert_eq!(mean(&episodes), (Some((155.0 + 254.0) / 2.0), 100));
     let rows = rows(&folder);
     assert_eq!(rows.len(), 105);
-    // 150 of them are in no row, but they have numbers.
+    // 150 of the episodes have no row, but they have numbers.
     let expected = ["1.500,90,156,4,2,155,9", "1.500,90,255,4,2,254,9"];
     assert_eq!([&rows[5], &rows[104]], expected);
 }
@@ -139,7 +139,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     let (_root, folder, mut episodes) = begun();
     update(&mut episodes, &[shard(1_000, 0, 60, 0)]);
     update(&mut episodes, &[shard(2_000, 60, 70, 0)]);
-    // What came after the checkpoint does not count, nor what was cut off.
+    // Episodes after the checkpoint do not count, nor does a row that was cut off.
     update(&mut episodes, &[shard(3_000, 70, 90, 0)]);
     let path = folder.episodes();
     let text = fs::read_to_string(&path).unwrap();
@@ -147,13 +147,13 @@ fn a_run_that_continues_has_the_episodes_before() {
 
     let mut episodes = TrainingEpisodes::open(&folder, Some(2_500), None).unwrap();
     assert_eq!(mean(&episodes), (Some(34.5), 70));
-    // Another server, which counts from the start; the replay fills again.
+    // Another server counts from the start, while the replay fills again.
     update(&mut episodes, &[shard(1_500, 0, 40, 1_000)]);
     let expected: f64 = (10..70).chain(1_000..1_040).map(f64::from).sum();
     assert_eq!(mean(&episodes), (Some(expected / 100.0), 100));
     assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
 
-    // A server that knows of those before, and of four more; it hands out all that it keeps. A run that ends before its answer keeps all.
+    // A server that knows the episodes before, and four more, hands out all that it keeps. A run that ends before its answer keeps all.
     let mut episodes = TrainingEpisodes::open(&folder, Some(2_500), Some(0)).unwrap();
     assert!(update(&mut episodes, &[]).is_empty());
     assert_eq!((rows(&folder).len(), episodes.so_far(0).count), (110, 110));
@@ -170,12 +170,12 @@ fn a_run_that_continues_has_the_episodes_before() {
     let said = TrainingEpisodes::open(&folder, Some(9), None).unwrap_err();
     let said = said.to_string();
     assert!(said.contains("is not a row of episodes"), "{said}");
-    // A run that begins does not read what it replaces.
+    // A run that begins does not read the file that it replaces.
     TrainingEpisodes::open(&folder, None, None).unwrap();
     assert_eq!(rows(&folder), [] as [String; 0]);
 }
 
-/// Its replay began to count after the first thirty.
+/// The replay began to count after the first thirty episodes.
 #[test]
 fn a_run_that_was_resumed_without_its_replay_and_then_with_it_has_each_once() {
     let (_root, folder, mut episodes) = begun();

@@ -1,5 +1,5 @@
-//! What a run's checkpoints earned when they were played: `evaluations.csv`, and the best of them, kept in `best/`.
-//! It plays nothing.
+//! The returns of a run's evaluated checkpoints: `evaluations.csv`, and the best checkpoint, kept in `best/`.
+//! This module plays nothing.
 
 use std::{
     ffi::OsString,
@@ -20,33 +20,33 @@ use crate::metrics::{cell, rounded};
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
-/// The name of a checkpoint that is about to be the best; one with this name is left from a process that was killed.
+/// The name of a checkpoint that is about to become the best. A checkpoint with this name is left from a process that was killed.
 const NEW: &str = ".new";
 
-/// What a checkpoint earned over whole episodes.
+/// The return of a checkpoint over whole episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct Evaluated {
-    /// Seconds of the run at the checkpoint, by the metrics; none without them.
+    /// Seconds of the run at the checkpoint, from the metrics; none without metrics.
     pub seconds: Option<f64>,
-    /// Frames of the run, likewise.
+    /// Frames of the run at the checkpoint, likewise.
     pub frames: Option<u64>,
-    /// Updates behind the weights.
+    /// Updates of the weights.
     pub updates: u64,
     /// Whole episodes played.
     pub episodes: u32,
-    /// Their mean undiscounted return.
+    /// Mean undiscounted return of the episodes.
     #[serde(rename = "evaluated_return")]
     pub mean_return: f64,
-    /// Its standard deviation over episodes; 0 for one.
+    /// Standard deviation of the return over episodes; 0 for one episode.
     #[serde(rename = "evaluated_return_sd")]
     pub deviation: f64,
 }
 
 impl Evaluated {
-    /// All that were kept in a run's folder, in the order in which they were played; none of a folder that has none.
+    /// Reads all evaluations in a run's folder, in the order in which they were made; none without the file.
     ///
     /// # Errors
-    /// A file that is not a table of evaluations, or that cannot be read.
+    /// The file is not a table of evaluations, or cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
         let name = path.display();
@@ -54,7 +54,7 @@ impl Evaluated {
         rows.with_context(|| usage!("{name} is not a table of evaluations: move it away"))
     }
 
-    /// The kept best checkpoint and what it earned when it was played for the most episodes; none of a folder that has none.
+    /// The kept best checkpoint, with the evaluation of it that has the most episodes; none if none is kept.
     pub(crate) fn best(folder: &RunFolder) -> anyhow::Result<Option<Self>> {
         let kept = driml_learner::checkpoint::list(&folder.best())?;
         let played = Self::all(folder)?.into_iter();
@@ -62,8 +62,8 @@ impl Evaluated {
         Ok(of_best.max_by_key(|it| it.episodes))
     }
 
-    /// A checkpoint of so many updates, with the run's time and frames at it: those of the row of metrics at or before it, or of the
-    /// first row, which is written within a second or so, where it was saved before that.
+    /// An evaluation of the checkpoint after `updates`. The run's time and frames at that point come from the row of metrics at or
+    /// before the checkpoint, or else from the first row, which is written within about a second.
     pub(crate) fn at(
         folder: &RunFolder,
         updates: u64,
@@ -85,7 +85,7 @@ impl Evaluated {
         }
     }
 
-    /// A line about it.
+    /// Describes the evaluation in one line.
     pub fn describe(&self) -> String {
         format!(
             "evaluated after {} updates: mean return {:.3}, standard deviation {:.3} over {} episodes",
@@ -93,7 +93,7 @@ impl Evaluated {
         )
     }
 
-    /// Adds it to the run's table, which is made where there is none.
+    /// Adds the evaluation to the run's table, which is made if it does not exist.
     pub(crate) fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
@@ -108,12 +108,12 @@ impl Evaluated {
             rounded(self.deviation).to_string(),
         ]);
         let head = is_new.then(|| csv_row(HEADER.split(',')));
-        // A whole row at once: others may read meanwhile.
+        // A whole row in one write, as others may read meanwhile.
         append(&mut file, &[head.unwrap_or_default(), row].concat()).with_context(doing)
     }
 }
 
-/// A checkpoint that is being played, in memory, so that it can be kept even if the learner clears it away meanwhile.
+/// A checkpoint that is being evaluated, in memory, so that it can be kept even if the learner deletes it meanwhile.
 #[derive(Debug)]
 pub(crate) struct Candidate {
     name: OsString,
@@ -133,12 +133,12 @@ impl Candidate {
         Ok(Self { name, files })
     }
 
-    /// Adds what it earned to the run's table, and keeps it if it earned more than the best before it, over at least as many episodes.
-    /// Says whether it is the best.
+    /// Adds the evaluation to the run's table. Keeps the checkpoint if it earned more than the best before it, over at least as many
+    /// episodes. Returns whether it is the best.
     pub(crate) fn judge(&self, folder: &RunFolder, earned: &Evaluated) -> anyhow::Result<bool> {
         let path = folder.evaluations();
         let file = open_to_append(&path)?;
-        // Where several processes evaluate one run, each judges by what the others kept.
+        // If several processes evaluate one run, each compares with what the others kept.
         if let Err(e) = file.lock() {
             tracing::debug!("{} cannot be locked: {e}", path.display());
         }
@@ -153,7 +153,7 @@ impl Candidate {
         Ok(is_best)
     }
 
-    /// Makes it the only checkpoint in the folder `best`.
+    /// Makes this checkpoint the only one in the folder `best`.
     fn replace(&self, best: &Path) -> anyhow::Result<()> {
         let (new, path) = (best.join(NEW), best.join(&self.name));
         let doing = || format!("keeping {}", path.display());
@@ -165,12 +165,12 @@ impl Candidate {
             atomic_write::write(&new.join(name), bytes).with_context(doing)?;
         }
         let older = driml_learner::checkpoint::list(best)?;
-        // Only for one of the same name there is a moment without a best.
+        // Only if the old best has the same name, the folder is without a best for a moment.
         if path.is_dir() {
             fs::remove_dir_all(&path).with_context(doing)?;
         }
         fs::rename(&new, &path).with_context(doing)?;
-        // The older best may be the only one that a power cut leaves.
+        // Before this sync, a power cut may leave only the older best, which is therefore removed afterwards.
         let best = File::open(best).and_then(|folder| folder.sync_all());
         best.with_context(doing)?;
         for (_, older) in older.into_iter().filter(|(_, it)| *it != path) {
@@ -184,7 +184,7 @@ impl Candidate {
 mod tests {
     use super::*;
 
-    /// A checkpoint of so many updates, which the learner clears away while it is played.
+    /// Judges a checkpoint after `updates`, which the learner deletes while it is played.
     fn judge(folder: &RunFolder, updates: u64, mean: f64, episodes: u32) -> anyhow::Result<bool> {
         let path = folder.checkpoints().join(format!("checkpoint-{updates}"));
         fs::create_dir_all(&path).unwrap();
@@ -211,7 +211,7 @@ mod tests {
         assert_eq!(best.len(), 1);
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
-        // What a process that was killed left does not count as a checkpoint.
+        // The remains of a process that was killed do not count as a checkpoint.
         fs::create_dir(folder.best().join(NEW)).unwrap();
         let again = driml_learner::checkpoint::list(&folder.best()).unwrap();
         assert_eq!(again, best);

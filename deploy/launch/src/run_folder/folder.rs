@@ -1,5 +1,5 @@
-//! Where a run's files are. Nothing else in the program knows their names, but for the learner, which is told a folder and
-//! puts its checkpoints into `checkpoints/`.
+//! The paths of a run's files. No other module knows the names of these files. The learner is given a folder and puts its
+//! checkpoints into `checkpoints/`.
 
 use std::{
     fs::{self, File},
@@ -20,7 +20,7 @@ use super::table::{Table, write_whole};
 
 pub(super) const EVENTS: &str = "events.out.tfevents.";
 
-/// Makes a method for each file and folder of a run's, which gives its path.
+/// Makes a method for each file and folder of a run, which returns its path.
 macro_rules! paths {
     ($($(#[$doc:meta])+ $vis:vis $method:ident: $name:expr;)+) => {
         impl RunFolder {
@@ -34,61 +34,61 @@ macro_rules! paths {
 paths! {
     /// The resolved settings, TOML.
     pub config: "config.toml";
-    /// A row a second: frames, updates, losses, speed, memory.
+    /// One row per second: frames, updates, losses, speed, memory.
     pub metrics: "metrics.csv";
-    /// A row for each training episode: when it ended, who played it, its return and length.
+    /// One row per training episode: when it ended, who played it, its return and length.
     pub episodes: "episodes.csv";
-    /// How the run ended and what it counted, JSON; it is there once the run has ended.
+    /// How the run ended and its counts, JSON; exists once the run has ended.
     pub summary: "summary.json";
     /// What a resumed run had done before its replay began to count, JSON.
     pub(super) resumed: "resumed.json";
-    /// The endpoints of the replay servers, a line each, while `driml train` runs here.
+    /// The endpoints of the replay servers, one per line, while `driml train` runs here.
     pub endpoints: "endpoints";
-    /// The folder in which the processes of `driml train` meet, while it runs here.
+    /// The path of the folder in which the processes of `driml train` meet, while it runs here.
     pub(crate) rendezvous: "rendezvous";
-    /// What checkpoints earned when they were played.
+    /// The returns of the checkpoints that were evaluated.
     pub evaluations: "evaluations.csv";
     /// A folder with the checkpoint that earned most.
     pub best: "best";
-    /// A folder for each checkpoint.
+    /// A folder with one folder per checkpoint.
     pub checkpoints: driml_learner::checkpoint::FOLDER;
-    /// The replay, where it is kept on disk.
+    /// A folder with the replay, if it is kept on disk.
     pub replay: "replay";
-    /// A file for each process.
+    /// A folder with one log file per process.
     pub logs: "logs";
     /// The file whose lock keeps other launchers out.
     lock_file: ".lock";
 }
 
-/// The folder of a run, which need not be there yet.
+/// The folder of a run, which may not exist yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunFolder {
     path: PathBuf,
 }
 
 impl RunFolder {
-    /// The folder at `path`; nothing is looked at.
+    /// The folder at `path`; nothing is read from the disk.
     pub fn new(path: impl Into<PathBuf>) -> Self {
         Self { path: path.into() }
     }
 
-    /// The folder itself.
+    /// The path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Its path for a message.
+    /// The path of the folder, for a message.
     pub fn display(&self) -> std::path::Display<'_> {
         self.path.display()
     }
 
-    /// Its path for a command that a person may paste.
+    /// The path of the folder, for a command that a person may paste.
     pub fn quoted(&self) -> String {
         quoted_path(&self.path)
     }
 
-    /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command
-    /// that is corrected takes its folder again.
+    /// Rejects a folder that is not empty, and one that cannot be made. A run that ended before its first frame does not count: the
+    /// corrected command may use its folder again.
     pub fn check_free(&self) -> Result<(), Usage> {
         let taken = match fs::read_dir(&self.path) {
             Ok(entries) => !self.is_empty_run(entries),
@@ -109,7 +109,7 @@ impl RunFolder {
         self.check_writable()
     }
 
-    /// Whether nothing lies in the folder, or only what a run makes before its first frame.
+    /// Whether the folder is empty, or holds only what a run makes before its first frame.
     fn is_empty_run(&self, entries: fs::ReadDir) -> bool {
         let tables = [self.metrics(), self.episodes()];
         let others = [
@@ -138,7 +138,7 @@ impl RunFolder {
                 && saved.is_ok_and(|all| all.is_empty())
     }
 
-    /// Refuses a folder into which nothing could be written, before it is made.
+    /// Rejects a folder into which nothing could be written, before the folder is made.
     fn check_writable(&self) -> Result<(), Usage> {
         let whole = std::path::absolute(&self.path).unwrap_or_else(|_| self.path.clone());
         let Some(there) = whole.ancestors().find(|it| it.exists()) else {
@@ -156,10 +156,10 @@ impl RunFolder {
         ))
     }
 
-    /// Keeps other launchers out as long as the file is held.
+    /// Keeps other launchers out as long as the returned file is held.
     ///
     /// # Errors
-    /// Another launcher holds it, or a file system that refuses.
+    /// Another launcher holds the lock, or the file system failed.
     pub fn lock(&self) -> anyhow::Result<File> {
         let path = self.lock_file();
         let doing = || format!("locking {}", path.display());
@@ -170,7 +170,7 @@ impl RunFolder {
         })
     }
 
-    /// Whether another launcher holds it, also for a user who may only read it.
+    /// Whether another launcher holds the lock; also works for a user who may only read the folder.
     pub(crate) fn is_locked(&self) -> bool {
         let file = File::open(self.lock_file());
         file.is_ok_and(|file| matches!(lock_file::try_lock(&file), Ok(false)))

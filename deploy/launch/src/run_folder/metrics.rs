@@ -1,5 +1,5 @@
-//! `metrics.csv` read again: where a run is resumed, the rows that a resumed run keeps, and how far a run is.
-//! The recorder writes it, with the columns of `crate::metrics`.
+//! Reads `metrics.csv`: the point where a run is resumed, the rows that a resumed run keeps, and the progress of a run.
+//! The recorder writes the file, with the columns of `crate::metrics`.
 
 use std::{
     fs::File,
@@ -15,33 +15,33 @@ use super::{
 };
 use crate::run_view::Spread;
 
-/// What was done before a run starts: nothing, or what its newest checkpoint says.
+/// What a run had done before this start: nothing, or what its newest checkpoint says.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ResumePoint {
-    /// Updates that the checkpoint has learned.
+    /// Updates of the checkpoint.
     pub updates: u64,
-    /// Rows from which it has learned.
+    /// Rows from which the checkpoint has learned.
     pub(crate) rows: u64,
-    /// Frames of the run by then.
+    /// Frames of the run at the checkpoint.
     pub(crate) frames: u64,
-    /// The replay was kept, and counts all that [`Uncounted`] does not.
+    /// Whether the replay was kept; it then counts everything that [`Uncounted`] does not.
     pub(crate) replay_is_kept: bool,
-    /// Updates after which the replay began to count, where it was not kept.
+    /// Updates after which the replay began to count, if it was not kept.
     pub(crate) after_updates: u64,
-    /// Frames with which the run ends now.
+    /// Frames after which the run now ends.
     pub(crate) frames_max: u64,
 }
 
-/// What a run had done before its replay began to count: when it was last resumed without one, or nothing.
+/// What a run had done before its replay began to count: up to the last resume without a replay, or nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Uncounted {
-    /// By which the replay is known.
+    /// Updates at which the replay began to count; they identify the replay.
     pub(crate) after_updates: u64,
     pub(crate) rows: u64,
     pub(crate) episodes: u64,
-    /// Of those rows.
+    /// k of those rows.
     pub(crate) k: Option<Spread>,
-    /// That the run had taken when it was last resumed, with or without its replay: rows of metrics that were set aside tell it no more.
+    /// Seconds that the run took up to its last resume, with or without its replay. Rows of metrics that were set aside do not show it.
     pub(crate) seconds: f64,
 }
 
@@ -59,18 +59,18 @@ impl Uncounted {
     }
 }
 
-/// Bytes at the end of the file in which its last row lies.
+/// The last row lies within this many bytes at the end of the file.
 const LAST_ROW_BYTES: u64 = 1 << 16;
 
-/// What decides whether a resumed run keeps a row.
+/// The columns that decide whether a resumed run keeps a row.
 #[derive(Deserialize)]
 struct Counts {
     frames: u64,
     updates: u64,
 }
 
-/// The rows of an interrupted run up to `resume_point`, under this header; none without the file. The others, which
-/// contradict what the run will do, are set aside. And the seconds that the run has taken, with those that are set aside.
+/// Reads the rows of an interrupted run up to `resume_point`, under this header; none without the file. Later rows contradict what the
+/// run will do and are set aside. Also returns the seconds that the run has taken, by all rows.
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
@@ -81,8 +81,8 @@ pub(super) fn rows_up_to(
     let seconds = seconds.filter_map(|row| found.value::<f64>(row, "seconds"));
     let seconds = seconds.fold(0.0, f64::max);
     found.keep(path, |it: Counts| {
-        // Actors run ahead: without the second condition a run that now ends sooner would end before its rows. A replay that is filled
-        // anew counts from the checkpoint's frames.
+        // Actors run ahead: without the limit on frames, a run that now ends sooner would keep rows from after its end. A replay that
+        // is filled anew counts from the checkpoint's frames.
         let is_counted = resume_point.replay_is_kept || it.frames <= resume_point.frames;
         let is_before = it.updates <= resume_point.updates && it.frames <= resume_point.frames_max;
         is_before && is_counted
@@ -96,7 +96,7 @@ pub(super) fn rows_up_to(
     Ok((Table { header, rows }, seconds))
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Progress {
     /// Frames of the last row of metrics.
@@ -105,7 +105,7 @@ pub struct Progress {
     pub episodes: u64,
 }
 
-/// How far the run in `folder` is; none before its first row of metrics. Only the file's ends are read.
+/// The progress of the run in `folder`; none before its first row of metrics. Reads only the file's first line and its end.
 pub fn progress(folder: &RunFolder) -> Option<Progress> {
     let mut file = File::open(folder.metrics()).ok()?;
     let mut header = String::new();
@@ -116,7 +116,7 @@ pub fn progress(folder: &RunFolder) -> Option<Progress> {
     let mut end = Vec::new();
     file.read_to_end(&mut end).ok()?;
     let end = String::from_utf8_lossy(&end);
-    // What follows the last line's end is still being written.
+    // Text after the last line break is still being written.
     let row = end.get(..end.rfind('\n')?)?.lines().last()?;
     let last = Table::parse(format!("{header}{row}\n").as_bytes()).ok()?;
     Some(Progress {
@@ -143,7 +143,7 @@ mod tests {
             frames: 200,
             episodes: 7,
         };
-        // With the memory of as many processes as a run may have, too.
+        // Also with the memory of as many processes as a run may have.
         for processes in [3, 512] {
             let [names, memory] =
                 [",rss_mib_actor_255", ",12345.678"].map(|it| it.repeat(processes));

@@ -1,4 +1,4 @@
-//! A run's folder: the names of its files, what is written there during a run, and reading it again.
+//! A run's folder: the names of its files, what a run writes into them, and how they are read.
 
 mod episodes;
 mod evaluations;

@@ -1,5 +1,5 @@
-//! What is written into the run folder during a run: settings, metrics, episodes, events on request, and the summary at its end.
-//! It asks no process: its caller hands a view over.
+//! Writes the files of the run folder during a run: settings, metrics, episodes, events on request, and the summary at the end.
+//! This module asks no process: its caller passes a view of the run.
 
 use std::{
     fs::{self, File},
@@ -23,10 +23,10 @@ use crate::{
     run_view::{Episodes, Plan, RunView, Spread},
 };
 
-/// Writes a run folder.
+/// Writes the files of a run folder.
 #[derive(Debug)]
 pub struct RunRecorder {
-    /// No other launcher writes to the folder while this is held.
+    /// While this lock is held, no other launcher writes to the folder.
     _lock: File,
     resume_point: ResumePoint,
     /// Seconds that the run took before it was resumed.
@@ -35,17 +35,17 @@ pub struct RunRecorder {
     metrics: AppendLog,
     events: Option<Events>,
     episodes: TrainingEpisodes,
-    /// The next episodes that arrive had ended before.
+    /// Whether the next episodes to arrive ended before the run was watched, at unknown times.
     is_late: bool,
-    /// Resident memory of each process by name, now and at the most.
+    /// Resident memory of each process by name, MiB: now, and the highest so far.
     rss_mib: Vec<(String, Option<f64>)>,
     rss_max: Vec<Option<f64>>,
     started: Instant,
 }
 
 impl RunRecorder {
-    /// Records a run with these settings in `folder`, the memory of `processes` and, on request, `events` of TensorBoard: one that
-    /// begins, whose folder is made, or one that is `resumed` there and keeps its rows up to that point. The clock starts.
+    /// Records a run with these settings in `folder`, with the memory of `processes` and, on request, TensorBoard `events`. A run that
+    /// begins gets a new folder; a run that is `resumed` keeps its rows up to that point. The clock starts.
     pub fn open(
         folder: &RunFolder,
         config: &RunConfig,
@@ -69,7 +69,7 @@ impl RunRecorder {
         let kept = kept.then_some(earlier).transpose()?;
         let (rows, seconds) = match resumed {
             None => {
-                // First: by its settings a folder in which nothing was learned is known as a run's.
+                // First, because a folder in which nothing was learned is recognised as a run's by its settings.
                 folder.write_config(config)?;
                 let rows = Vec::new();
                 (Table { header, rows }, 0.0)
@@ -110,13 +110,13 @@ impl RunRecorder {
         })
     }
 
-    /// The run has taken at least so many seconds before this recorder started.
+    /// Notes that the run took at least this many seconds before this recorder started.
     pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
         self.is_late = true;
         self.seconds_before = self.seconds_before.max(seconds);
     }
 
-    /// The k of all rows of the run, before it was resumed too.
+    /// k over all rows of the run, including those before a resume.
     fn k(&self, replay: &ReplayStatus) -> Option<Spread> {
         let since = Spread::of_k(replay);
         let (Some(before), Some(since)) = (self.uncounted.k, since) else {
@@ -132,7 +132,7 @@ impl RunRecorder {
         Some(Spread { mean, sd })
     }
 
-    /// Lets a view tell of the whole run, before it was resumed too.
+    /// Fills the numbers of the whole run into a view, including those from before a resume.
     pub(crate) fn complete(&self, view: &mut RunView) {
         view.recorded_s = Some(self.seconds());
         view.episodes = self.episodes(&view.replay);
@@ -144,8 +144,8 @@ impl RunRecorder {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Asks for the episodes that ended since the last time: those of a shard after the first so many, none if it does not answer.
-    /// Warnings are returned as by [`Self::record`], which is to follow.
+    /// Records the episodes that ended since the last call. `ask(shard, count)` requests the episodes of a shard after the first
+    /// `count`; none if the shard does not answer. Returns warnings as [`Self::record`] does; call that method next.
     pub(crate) fn record_episodes(
         &mut self,
         view: &RunView,
@@ -155,11 +155,11 @@ impl RunRecorder {
         self.episodes.update(&view.shards, ask, seconds)
     }
 
-    /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row.
-    /// `rss_mib` is in the order of the processes given at the start, none for one that ended.
+    /// Adds a row of metrics for the state of the run; a resumed run adds rows once it has passed its resume point.
+    /// `rss_mib` is in the order of the processes given at the start, none for a process that has ended.
     ///
-    /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
-    /// at the end what was lost.
+    /// A full disk does not end the run: a warning is returned the first time, and [`Self::missing`] reports at the end what
+    /// was lost.
     pub fn record(&mut self, view: &mut RunView, rss_mib: &[Option<f64>]) -> Vec<String> {
         let known = rss_mib.iter().copied().chain(std::iter::repeat(None));
         for (((_, rss), max), now) in self.rss_mib.iter_mut().zip(&mut self.rss_max).zip(known) {
@@ -179,7 +179,7 @@ impl RunRecorder {
         self.metrics.add([row]).into_iter().chain(drawn).collect()
     }
 
-    /// What to say about rows that could not be written up to now.
+    /// Messages about rows that could not be written so far.
     pub fn missing(&self) -> Vec<String> {
         let events = self.events.as_ref().and_then(|it| it.file.missing());
         let mut missing = self.episodes.missing();
@@ -192,7 +192,7 @@ impl RunRecorder {
             .so_far(self.uncounted.episodes + replay.episodes)
     }
 
-    /// What there is to say of the run, which ended so.
+    /// The summary of the run, which ended with `outcome`.
     pub fn summarise(&self, outcome: Outcome, view: &mut RunView) -> Summary {
         self.complete(view);
         let rss = self.rss_mib.iter().zip(&self.rss_max);

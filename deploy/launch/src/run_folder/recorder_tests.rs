@@ -1,4 +1,4 @@
-//! The run folder's files: what a run leaves, and what a resumed one continues.
+//! The run folder's files: what a run leaves, and what a resumed run continues.
 
 use driml_actor::Schedule;
 use driml_protocol::{EndedEpisode, LearnerStatus, Played, Waiting};
@@ -23,7 +23,7 @@ fn open(
     RunRecorder::open(folder, &settings(), processes, resumed, false)
 }
 
-/// Where a run is resumed, with 16 rows an update.
+/// A point where a run is resumed, with 16 rows per update.
 fn point(updates: u64) -> ResumePoint {
     with(|it: &mut ResumePoint| {
         (it.updates, it.rows, it.frames) = (updates, 31 * 16, 2_000);
@@ -44,7 +44,7 @@ fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
     testing::view(plan, replay, Some(learner))
 }
 
-/// A run after so many frames, updates of 16 rows, and episodes.
+/// The view of a run after this many frames, updates of 16 rows, and episodes.
 fn after(frames: u64, updates: u64, episodes: u64, k_histogram: [u64; 3]) -> RunView {
     let replay = ReplayStatus {
         transitions_inserted: frames,
@@ -137,7 +137,7 @@ fn a_resumed_run_continues_in_its_metrics() {
     let summary = recorder.summarise(Outcome::Interrupted, &mut view);
     summary.write(&run).unwrap();
     drop(recorder);
-    // A launcher that was killed while it wrote.
+    // As after a launcher was killed while it wrote a row.
     let path = run.metrics();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
@@ -150,7 +150,7 @@ fn a_resumed_run_continues_in_its_metrics() {
     let mut recorder = open(&run, &processes, Some(point(31))).unwrap();
     assert!(!run.summary().exists());
     assert!(recorder.seconds() >= 50.0);
-    // While the replay fills again nothing is new.
+    // While the replay fills again, nothing is new.
     recorder.record(&mut after(2_000, 31, 1, k_before), &[]);
     let mut resumed = after(2_100, 62, 2, k_since);
     resumed.after_updates = Some(31);
@@ -161,7 +161,7 @@ fn a_resumed_run_continues_in_its_metrics() {
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
     drop(recorder);
-    // Its replay, which is kept from now on, counts what came after the first resumption.
+    // The run's replay, which is kept from now on, counts what came after the first resume.
     let kept = |updates, frames_max| ResumePoint {
         replay_is_kept: true,
         frames_max,
@@ -183,13 +183,13 @@ fn a_resumed_run_continues_in_its_metrics() {
     assert_eq!(column("frames"), [1_000.0, 2_000.0, 2_100.0]);
     assert_eq!(column("episodes"), [1.0, 7.0, 9.0]);
     assert_eq!(column("mean_k"), [1.5, 1.5, 1.75]);
-    // Squares: 2.5 and 4 are 3.25 in the mean, 1.75^2 is 3.0625.
+    // The mean squares 2.5 and 4 average to 3.25; 1.75^2 is 3.0625.
     assert_eq!(column("sd_k"), [0.5, 0.5, 0.433013]);
     assert!(column("seconds").is_sorted());
 }
 
-/// What is there stays where it agrees with the checkpoint, under the columns of the processes that there are now; what does not is set
-/// aside, and the seconds that it took count.
+/// Rows that agree with the checkpoint stay, under the columns of the processes that the run has now. Other rows are set aside, and
+/// the seconds that they took count.
 #[test]
 fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
     let episodes = "seconds,frames,episode,actor,env,return,length\n1.0,900,1,0,0,1,3\n2.0,2000,2,0,1,1,3\n3.0,2400,3,0,2,1,3\n";
@@ -220,7 +220,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         assert_eq!(summary.frames, 2_000, "{what}");
         drop(recorder);
 
-        // A run resumed twice from there sets aside beside what was set aside before, and remembers the time.
+        // A second resume from the same point sets rows aside in another file, and remembers the time.
         fs::write(run.episodes(), episodes).unwrap();
         let recorder = open(&run, &["actor-0"], Some(point(31))).unwrap();
         assert!(recorder.seconds() >= seconds, "{what}");
@@ -228,7 +228,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
     }
 }
 
-/// The replay fills again, from the checkpoint's frames, or from none where nothing was learned.
+/// The replay fills again, from the checkpoint's frames, or from 0 if nothing was learned.
 #[test]
 fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
     let at_start = ResumePoint::default();
@@ -275,7 +275,7 @@ fn next_steps_stand_in_columns() {
     assert!(!repeated_alone.contains("--resume"), "{repeated_alone}");
 }
 
-/// It may come from a file or another process.
+/// The time may come from a file or another process.
 #[test]
 fn a_time_that_cannot_be_is_described_as_none() {
     for wall_seconds in [-1.0, 1e300, f64::NAN] {

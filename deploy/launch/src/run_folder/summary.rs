@@ -1,5 +1,5 @@
-//! `summary.json`: how a run ended and what it counted, in one object.
-//! It computes nothing; the recorder fills it in.
+//! `summary.json`: how a run ended and its counts, in one object.
+//! The recorder fills the summary in.
 
 use std::{collections::BTreeMap, fs, time::Duration};
 
@@ -23,15 +23,15 @@ use crate::{
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Outcome {
-    /// All frames are in, their updates done and the last checkpoint written.
+    /// All frames are stored, their updates done and the last checkpoint written.
     Finished,
-    /// A person ended it; what was done is saved.
+    /// A person stopped the run; what was done is saved.
     Interrupted,
     /// A process failed.
     Failed,
 }
 
-/// The mean undiscounted return of whole episodes, and the 95% interval in which it lies.
+/// The mean undiscounted return of whole episodes, and its 95% confidence interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Earned {
     pub(crate) mean: f64,
@@ -40,7 +40,7 @@ pub(crate) struct Earned {
 }
 
 impl Earned {
-    /// Of these returns, at least one; both ends are the mean of a single one.
+    /// The mean of at least one return, and its interval; for a single return, both ends are that return.
     pub(crate) fn of(returns: &[f64]) -> Self {
         let (mean, _) = mean_and_deviation(returns);
         let ends = interval(returns).and_then(|it| it.ends);
@@ -49,7 +49,7 @@ impl Earned {
     }
 }
 
-/// What a finished run's weights earned, and a random policy over as many episodes.
+/// The returns of a finished run's weights, and of a random policy over as many episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct LastPlay {
     /// Which weights: "averaged" or "online".
@@ -84,47 +84,47 @@ pub struct Summary {
     pub agent: String,
     /// The seed of every generator of the run.
     pub seed: u64,
-    /// Updates that were done when the run was resumed, the last time; 0 if it never was. Frames, updates,
-    /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
+    /// Updates that were done when the run was last resumed; 0 if it never was. Frames, updates, rows, episodes, mean return,
+    /// seconds and mean k are of the whole run, all other fields only of the time since then.
     pub resumed_after_updates: u64,
-    /// Frames that trained: transitions stored.
+    /// Frames of the run: transitions stored.
     pub frames: u64,
     /// Updates that the learner has done.
     pub updates: u64,
     /// Rows per transition, both counted from the end of the warm-up.
     pub replay_ratio: Option<f64>,
-    /// Episodes that ended, in a resumed run those too in which the replay filled again.
+    /// Episodes that ended; in a resumed run also those in which the replay filled again.
     pub episodes: u64,
-    /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
+    /// Mean undiscounted return of the last 100 training episodes, also across a resume.
     pub mean_return: Option<f64>,
-    /// Of how many episodes that is: of fewer than 100 only if there were fewer.
+    /// Number of episodes in that mean: 100, or all if there were fewer.
     pub mean_return_of: u64,
-    /// From the start of the first process to the end of the run.
+    /// Seconds from the start of the first process to the end of the run.
     pub wall_seconds: f64,
     /// Frames over wall seconds.
     pub frames_per_second: f64,
     /// Updates over wall seconds.
     pub updates_per_second: f64,
-    /// Mean k of the rows served with a positive; of several positives the furthest counts.
+    /// Mean k of the rows served with a positive; for several positives, of the furthest.
     pub mean_k: Option<f64>,
     /// Version of the last weights.
     pub weights_version: u64,
     /// SHA-256 of the last weights, hexadecimal.
     pub weights_sha256: String,
-    /// How often a replay server that had died was started again with what it had kept.
+    /// How often a replay server that had died was restarted with the replay that it had kept.
     pub replay_servers_restarted: u32,
-    /// How often an actor that had died was started again; what it had not delivered is in no count.
+    /// How often an actor that had died was restarted; transitions that it had not delivered are in no count.
     pub actors_restarted: u32,
     /// Highest resident memory of each process, MiB.
     pub rss_mib_max: BTreeMap<String, Option<f64>>,
-    /// What its weights earn; none where they were not played.
+    /// The returns of the weights; none if they were not played.
     pub(crate) played: Option<LastPlay>,
-    /// The replay's own account at the end; its episodes are those since the run was resumed last.
+    /// The replay's status at the end; its episodes are those since the run was last resumed.
     pub replay: ReplayStatus,
 }
 
 impl Summary {
-    /// Of a run that took so many seconds. One that was resumed and did not get anywhere still has what was done `before`.
+    /// The summary of a run that took `wall_seconds`. A resumed run without any progress still has the counts of `before`.
     pub(crate) fn of(
         outcome: Outcome,
         view: &RunView,
@@ -161,14 +161,14 @@ impl Summary {
         }
     }
 
-    /// Writes it into the run folder, whole or not at all.
+    /// Writes the summary into the run folder, whole or not at all.
     pub fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let mut text = serde_json::to_vec_pretty(self).context("writing the summary")?;
         text.push(b'\n');
         write_whole(&folder.summary(), &text)
     }
 
-    /// Reads that of the run in `folder`.
+    /// Reads the summary of the run in `folder`.
     pub fn read(folder: &RunFolder) -> anyhow::Result<Self> {
         read_json(&folder.summary())
     }
@@ -183,12 +183,12 @@ impl Summary {
         }
     }
 
-    /// Whether the run in `folder` came to its end.
+    /// Whether the run in `folder` finished.
     pub fn is_finished(folder: &RunFolder) -> bool {
         Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
     }
 
-    /// What the weights of a finished run earn, and what a person may do with them, a command a line.
+    /// The returns of a finished run's weights, and what a person may do next, one command per line.
     pub(crate) fn next_steps(&self, run_dir: &RunFolder, is_resumable: bool) -> String {
         let run = run_dir.quoted();
         let more = self.frames.saturating_mul(2);
@@ -203,7 +203,7 @@ impl Summary {
         self.earned() + &commands(&next)
     }
 
-    /// How it ended and what its weights earn.
+    /// Describes how the run ended, and the returns of its weights.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
         let (counts, earned) = (self.counts(), self.earned());
         format!("{counts}\n{earned}{}\n", run_dir.display())
@@ -240,13 +240,13 @@ impl Summary {
     }
 }
 
-/// The command that draws a run's curves, and what they are.
+/// The command that draws a run's curves, and which curves these are.
 pub(crate) fn plot(run_dir: &RunFolder) -> (String, &'static str) {
     let command = format!("plot {} --out plot.png", run_dir.quoted());
     (command, "return, losses, k and speed")
 }
 
-/// Commands and what each does, in columns.
+/// Formats commands, and what each does, in columns.
 pub(crate) fn commands(commands: &[(String, &str)]) -> String {
     let row =
         |(command, what): &(String, &str)| vec![format!("  driml {command}"), format!(" {what}")];

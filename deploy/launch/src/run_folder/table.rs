@@ -1,6 +1,6 @@
-//! A table of the run folder: a CSV file read by the names of its columns, and a log to which a run appends rows.
-//! A full disk never ends the run: rows wait in memory until they can be written, and only what is still missing at the end, or too
-//! much to keep, is lost.
+//! A table of the run folder: a CSV file whose columns are read by name, and a log to which a run appends rows.
+//! A full disk never ends the run: rows wait in memory until they can be written. Only rows that still wait at the end, or that are
+//! too many to keep, are lost.
 
 use std::{
     collections::VecDeque,
@@ -18,8 +18,8 @@ use serde::de::DeserializeOwned;
 
 use crate::console;
 
-/// Rows that are kept in memory while they cannot be written; of more the oldest are lost. A day of metrics, minutes of the episodes
-/// of a world whose episodes take milliseconds.
+/// Maximum number of rows kept in memory while they cannot be written; beyond it the oldest are lost. It suffices for a day of
+/// metrics, or for minutes in a world whose episodes take milliseconds.
 const WAITING_MAX: usize = 100_000;
 
 /// Writes a file whole or not at all.
@@ -27,24 +27,24 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     atomic_write::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
 
-/// Reads a file of JSON.
+/// Reads a JSON file.
 pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     let doing = || format!("reading {}", path.display());
     let text = fs::read(path).with_context(doing)?;
     serde_json::from_slice(&text).with_context(doing)
 }
 
-/// The whole rows of a file that a run writes.
+/// The complete rows of a CSV file that a run writes.
 #[derive(Clone, Debug, Default)]
 pub struct Table {
-    /// The columns' names.
+    /// The names of the columns.
     pub header: Vec<String>,
     /// A record for each row, without the header.
     pub rows: Vec<StringRecord>,
 }
 
 impl Table {
-    /// Reads a file's text. What follows the last line's end is still being written, or was cut off, and is left out.
+    /// Parses a file's text. Text after the last line break is left out: it was cut off, or a process still writes it.
     pub fn parse(text: &[u8]) -> Result<Self, csv::Error> {
         let whole = text.iter().rposition(|&byte| byte == b'\n');
         let mut reader = csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]);
@@ -53,7 +53,7 @@ impl Table {
         Ok(Self { header, rows })
     }
 
-    /// Reads the file at `path`; one that is not there is empty.
+    /// Reads the file at `path`; a missing file gives an empty table.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
         let reading = || format!("reading {}", path.display());
         match fs::read(path) {
@@ -62,17 +62,17 @@ impl Table {
         }
     }
 
-    /// The place of the column `name`; none if there is no such column.
+    /// The index of the column `name`; none if the table does not have it.
     pub fn place(&self, name: &str) -> Option<usize> {
         self.header.iter().position(|it| it == name)
     }
 
-    /// What `row` has in the column `name`; none if that is empty, or of another type.
+    /// The value of `row` in the column `name`; none if the cell is empty, or of another type.
     pub fn value<T: FromStr>(&self, row: &StringRecord, name: &str) -> Option<T> {
         row.get(self.place(name)?)?.parse().ok()
     }
 
-    /// What the last row has in the column `name`.
+    /// The value of the last row in the column `name`.
     pub fn last<T: FromStr>(&self, name: &str) -> Option<T> {
         self.value(self.rows.last()?, name)
     }
@@ -82,7 +82,7 @@ impl Table {
         csv_row(&self.header).into_iter().chain(rows).collect()
     }
 
-    /// The rows as `T`, whose fields have the columns' names; none if a row is something else.
+    /// The rows as `T`, whose fields have the names of the columns; none if a row does not fit.
     pub(super) fn all<T: DeserializeOwned>(&self) -> Option<Vec<T>> {
         let header = StringRecord::from(&self.header[..]);
         let rows = self.rows.iter();
@@ -90,8 +90,8 @@ impl Table {
             .collect()
     }
 
-    /// Leaves the rows in the table at `path` that are to be kept; the others are written into a file beside it, and a line names it.
-    /// Gives whether there were any.
+    /// Keeps the rows for which `is_kept` returns true. The others are written into a new file beside `path`, which a printed line
+    /// names. Returns whether there were any others.
     pub(super) fn keep<T: DeserializeOwned>(
         &mut self,
         path: &Path,
@@ -105,7 +105,11 @@ impl Table {
         for row in std::mem::take(&mut self.rows) {
             let read = row.deserialize(Some(&header)).map_err(|_| {
                 let of = path.file_stem().unwrap_or_default().display();
-                usage!("{}: {row:?} is not a row of {of}", path.display())
+                let row = row.iter().collect::<Vec<_>>().join(",");
+                usage!(
+                    "{}: {row:?} is not a row of {of}: mend or remove it",
+                    path.display()
+                )
             })?;
             match is_kept(read) {
                 true => self.rows.push(row),
@@ -134,7 +138,7 @@ impl Table {
 #[derive(Debug)]
 pub(crate) struct AppendLog {
     name: String,
-    /// What is appended: rows or lines.
+    /// The word for what is appended: rows or lines.
     unit: &'static str,
     file: File,
     waiting: VecDeque<Vec<u8>>,
@@ -144,14 +148,14 @@ pub(crate) struct AppendLog {
 }
 
 impl AppendLog {
-    /// Makes a table anew, with the bytes that it begins with.
+    /// Creates a table anew, which begins with the bytes `first`.
     pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
         write_whole(path, first)?;
         let name = path.file_name().unwrap_or_default();
         Self::open(path, name.to_string_lossy().into(), "rows", WAITING_MAX)
     }
 
-    /// Continues a file, or begins one; messages call it `name`, and what is appended `unit`, of which no more than `waiting_max` wait.
+    /// Opens a file to append, or makes it. Messages call it `name`, and its entries `unit`; at most `waiting_max` entries wait.
     pub(crate) fn open(
         path: &Path,
         name: String,
@@ -169,7 +173,7 @@ impl AppendLog {
         })
     }
 
-    /// Adds rows in one write, after those that wait. A warning is returned the first time that rows have to wait.
+    /// Adds rows after those that wait, in one write. Returns a warning the first time that rows have to wait.
     pub(crate) fn add(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
         self.waiting.extend(rows);
         let more = self.waiting.len().saturating_sub(self.waiting_max);
@@ -184,14 +188,14 @@ impl AppendLog {
         said
     }
 
-    /// Writes all rows that wait, or none.
+    /// Writes all waiting rows, or none.
     fn write(&mut self) -> io::Result<()> {
         append(&mut self.file, &self.waiting.make_contiguous().concat())?;
         self.waiting.clear();
         Ok(())
     }
 
-    /// How many rows are not in the file, and why; none if all are.
+    /// How many rows are not in the file, and why; none if all are in it.
     pub(crate) fn missing(&self) -> Option<String> {
         let rows = self.lost + self.waiting.len() as u64;
         let error = self.failed.as_ref().filter(|_| rows > 0)?;
@@ -200,27 +204,27 @@ impl AppendLog {
     }
 }
 
-/// Opens a file, which is made where there is none.
+/// Opens a file to append, and makes it if it does not exist.
 pub(super) fn open_to_append(path: &Path) -> anyhow::Result<File> {
     let file = File::options().create(true).append(true).open(path);
     file.with_context(|| format!("writing {}", path.display()))
 }
 
-/// Writes all bytes at the end of a file, or none.
+/// Appends all bytes to a file, or none.
 pub(super) fn append(file: &mut File, bytes: &[u8]) -> io::Result<()> {
     let before = file.metadata()?.len();
     let written = file.write_all(bytes);
     if written.is_err() {
-        // Half a row may be there. Should this fail too, the next try begins with half a row before it.
+        // Remove a row that was written in part. If that fails too, the next row follows this part.
         let _ = file.set_len(before);
     }
     written
 }
 
-/// A row of a CSV file, as bytes.
+/// Formats a row of a CSV file as bytes.
 ///
 /// # Panics
-/// If it cannot be made into text, which takes no file.
+/// The row cannot be formatted, which cannot happen in memory.
 pub(super) fn csv_row<T: AsRef<[u8]>>(cells: impl IntoIterator<Item = T>) -> Vec<u8> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record(cells).expect("a row in memory");
@@ -281,7 +285,7 @@ mod tests {
             let path = folder.path().join(unit);
             fs::write(&path, "a\n").unwrap();
             log.file = File::options().append(true).open(&path).unwrap();
-            // Of more than may wait the oldest are lost.
+            // If more rows wait than may, the oldest are lost.
             assert_eq!(log.add(row(3)), None);
             let kept: String = (1 + lost..=3).map(text).collect();
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("a\n{kept}"));

@@ -1,5 +1,5 @@
-//! Who waits for whom, who does not respond, and what to do about it, in sentences.
-//! It knows no more than a view.
+//! Sentences about a run: which side waits, which process does not respond, and what to do about it.
+//! This module knows only what a view contains.
 
 use std::time::Duration;
 
@@ -10,13 +10,13 @@ use driml_protocol::{
 
 use crate::run_view::{RunView, ServerAnswer};
 
-/// How long an actor may send nothing before it is unresponsive.
+/// How long an actor may send nothing before it counts as unresponsive.
 const UNRESPONSIVE_S: f64 = 30.0;
-/// How long a replay server or the learner may leave questions unanswered before a note says so.
+/// How long a replay server or the learner may leave requests unanswered before a note says so.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
 
-/// Each replay server that answered, and its account.
+/// Each replay server that answered, with its status.
 fn statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
     answered.filter_map(|server| Some((server, server.processes.as_ref()?)))
@@ -28,12 +28,12 @@ fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
         .flat_map(|(server, account)| account.processes.iter().map(|it| (&*server.endpoint, it)))
 }
 
-/// Which side waits at the rate limiter and since when.
+/// Which side waits at the rate limiter, and for how long.
 pub(super) fn waits(view: &RunView) -> Vec<String> {
     let limiter = |(_, account): (_, &ProcessesStatus)| match account.waiting {
         Waiting::Neither => None,
         Waiting::Finished => Some(account.waiting.to_string()),
-        waiting => Some(format!("{waiting} since {}", seconds(account.waiting_s))),
+        waiting => Some(format!("{waiting} ({})", seconds(account.waiting_s))),
     };
     let mut waits: Vec<_> = statuses(view).filter_map(limiter).collect();
     waits.dedup();
@@ -141,7 +141,7 @@ fn certificates(endpoint: &str) -> &'static str {
     }
 }
 
-/// What to say below the live lines: the processes that do not respond, and for how long.
+/// The notes below the live lines: which processes do not respond, and for how long.
 pub(super) fn notes(view: &RunView) -> Vec<String> {
     if view.is_learned() {
         return vec!["all frames and updates are done: the processes exit".into()];
@@ -173,13 +173,13 @@ pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
     format!("{server}: reads its replay back from disk, {progress}")
 }
 
-/// What to say of a process that answered last so long ago; nothing of one that answered just now.
+/// A note on a process that has not answered for `SILENT_MAX`; none before that.
 fn silence(process: &str, silence: Silence) -> Option<String> {
     let silent = silence.length();
     (silent >= SILENT_MAX).then(|| format!("{process}: no answer for {}", duration(silent)))
 }
 
-/// For how many seconds a connected process has said nothing, where that is worth a sentence.
+/// For how many seconds a connected process has been silent; none up to `UNRESPONSIVE_S`, or while it is held at the rate limiter.
 fn silent_for(process: &ProcessStatus) -> Option<f64> {
     let silent = process.last_seen_s.unwrap_or(process.since_s);
     let doing = process.doing.as_ref();
@@ -191,7 +191,7 @@ fn silent_for(process: &ProcessStatus) -> Option<f64> {
     .then_some(silent)
 }
 
-/// Actors that are gone or unresponsive, a few words each; the first of them.
+/// Notes on the actors that are gone or unresponsive: the first ones by name, the others as a count.
 fn unresponsive_actors(view: &RunView) -> Vec<String> {
     let words = |process: &ProcessStatus| {
         let (how, since_s) = match process.connected {
@@ -223,7 +223,7 @@ mod tests {
     use super::*;
     use crate::{run_view::Plan, testing::with};
 
-    /// A run whose only replay server does not answer any more; `waiting` is what it answered last.
+    /// A run whose only replay server does not answer any more; `waiting` is the state in its last answer.
     fn silent(is_gone: bool, waiting: Waiting) -> RunView {
         let mut view = RunView::new(Plan::default());
         view.take_replay(vec![with(|it: &mut ReplayStatus| it.waiting = waiting)]);

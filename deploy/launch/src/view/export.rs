@@ -1,5 +1,5 @@
-//! A run for programs: one JSON object, and Prometheus' text format in a file that node_exporter's textfile collector reads.
-//! Nothing is served.
+//! Exports a run for programs: one JSON object, and a file in Prometheus' text format for node_exporter's textfile collector.
+//! This module serves no requests.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -48,7 +48,7 @@ pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
     Ok(serde_json::to_string(&answer)? + "\n")
 }
 
-/// The file for Prometheus, which is written anew at each answer.
+/// The file for Prometheus, which is rewritten after each poll.
 pub(crate) struct PrometheusFile {
     path: PathBuf,
     has_warned: bool,
@@ -62,7 +62,7 @@ impl PrometheusFile {
         }
     }
 
-    /// Writes it, whole or not at all. A warning is returned the first time that it cannot be written.
+    /// Writes the file, whole or not at all. Returns a warning the first time that it cannot be written.
     pub(crate) fn write(&mut self, view: &RunView) -> Option<String> {
         let failed = atomic_write::write(&self.path, prometheus(view).as_bytes()).err()?;
         (!std::mem::replace(&mut self.has_warned, true))
@@ -70,7 +70,7 @@ impl PrometheusFile {
     }
 }
 
-/// The text, with labels on each line that tell one run from another of the same machine.
+/// The text of the file. Labels on each line distinguish the runs of one machine.
 fn prometheus(view: &RunView) -> String {
     let (plan, endpoints) = (&view.plan, view.servers.iter().map(|it| &*it.endpoint));
     let mut page = Page {
@@ -85,7 +85,7 @@ fn prometheus(view: &RunView) -> String {
     };
     let up = view.is_answered().into();
     page.gauge("up", "Whether all replay servers of the run answered.", up);
-    // What only some of them count is not the run's.
+    // The counts of only some servers are not those of the run.
     if view.is_answered() {
         page.columns(view);
         page.processes(view);
@@ -109,7 +109,7 @@ struct Page {
 }
 
 impl Page {
-    /// A metric: its head, and a sample for each member that has a value; nothing if none has. `label` tells several members apart.
+    /// Adds a metric: its head, and a sample for each member that has a value; nothing if none has. `label` distinguishes members.
     fn metric(&mut self, kind: &str, name: &str, help: &str, label: &str, members: &[Member]) {
         let members = members.iter();
         let known = members.filter_map(|(member, value)| Some((member, (*value)?)));
@@ -143,7 +143,7 @@ impl Page {
 
     fn processes(&mut self, view: &RunView) {
         let statuses = view.servers.iter().filter_map(|it| it.processes.as_ref());
-        // With several shards the learner takes part in each.
+        // With several shards, each server reports the learner.
         let mut seen = BTreeSet::new();
         let processes = statuses.flat_map(|it| &it.processes);
         let processes: Vec<_> = processes.filter(|it| seen.insert(it.who)).collect();

@@ -1,5 +1,5 @@
-//! The live lines of a run: one progress display on a terminal, a plain line now and then elsewhere.
-//! It asks no process.
+//! The live lines of a run: a progress display on a terminal, and a plain line every ten seconds elsewhere.
+//! This module asks no process.
 
 use std::time::{Duration, Instant};
 
@@ -12,9 +12,9 @@ use crate::{
     run_view::RunView,
 };
 
-/// How long updates run before the rates are steady enough to estimate the time left.
+/// How long updates must run before the rates are steady enough to estimate the time left.
 const STEADY_MIN: Duration = Duration::from_secs(5);
-/// The progress display: how far, then two lines of numbers.
+/// The template of the progress display: a bar, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
 
 /// The display name of an auxiliary loss: `DIM 4t4` of `dim_4t4`.
@@ -25,9 +25,9 @@ pub fn loss_title(name: &str) -> String {
     }
 }
 
-/// How far a run is and how fast; frames and updates are a question mark where they are not known.
+/// The progress and the speed of a run; unknown frames and updates are shown as question marks.
 pub(super) fn progress(view: &RunView, frames: Option<u64>, updates: Option<u64>) -> String {
-    // The last round may exceed what is planned.
+    // The last round may exceed the plan.
     let count = |count: Option<u64>, planned| match count {
         None => format!("?/{planned}"),
         Some(count) if count > planned => format!("{planned}/{planned} (+{})", count - planned),
@@ -50,15 +50,15 @@ fn number(value: Option<f64>) -> String {
 #[derive(Debug)]
 pub(crate) struct Display {
     pub(crate) screen: Screen,
-    /// Updates with which it began, and when the first beyond them was seen.
+    /// Updates at the start of the display, and when the first update beyond them was seen.
     updates_before: u64,
     learns_since: Option<Instant>,
-    /// When the run began: a terminal's bar has its own clock.
+    /// When the run began; a terminal's bar has a separate clock.
     pub(crate) began: Instant,
 }
 
 impl Display {
-    /// Of a run of so many frames that began at `began`, and has done so many updates.
+    /// The display of a run of `frames` frames that began at `began` and has done `updates_before` updates.
     pub(crate) fn new(frames: u64, began: Instant, updates_before: u64) -> Self {
         Self {
             screen: Screen::new(frames, TEMPLATE),
@@ -68,7 +68,7 @@ impl Display {
         }
     }
 
-    /// Shows the state of the run, and notes under it, such as who does not answer.
+    /// Shows the state of the run, and notes below it, such as which process does not answer.
     pub(crate) fn show(&mut self, view: &RunView) {
         if view.learner.updates > self.updates_before {
             self.learns_since.get_or_insert_with(Instant::now);
@@ -89,7 +89,7 @@ impl Display {
     fn text(&self, view: &RunView) -> [String; 2] {
         let (plan, speed, learner) = (&view.plan, view.speed, &view.learner);
         let (frames, updates) = (view.replay.transitions_inserted, learner.updates);
-        // Before the first update there are none.
+        // Before the first update there are no losses.
         let losses = self.learns_since.map(|_| {
             let others = learner.losses.iter();
             let others = others.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
@@ -118,7 +118,7 @@ impl Display {
     }
 }
 
-/// The line of a view without a terminal, that long after the run began.
+/// The line of a display without a terminal, `elapsed` after the run began.
 fn plain(elapsed: Duration, texts: &[String]) -> String {
     format!("{}  {}", duration(elapsed), texts.join("  "))
 }
@@ -128,7 +128,7 @@ fn waiting(replay: &ReplayStatus) -> String {
         (Waiting::ActorsWaitForLearner, waiting @ 1..) if waiting <= replay.actors => {
             format!("{waiting} of {} actors wait for learner", replay.actors)
         }
-        // The chunk of an actor that has gone waits too.
+        // The chunk of an actor that has disconnected waits too.
         (Waiting::ActorsWaitForLearner, waiting @ 1..) => {
             format!("chunks of {waiting} actors wait for learner")
         }
@@ -136,7 +136,7 @@ fn waiting(replay: &ReplayStatus) -> String {
     }
 }
 
-/// The longer of what frames and updates still take; none while something is left of which nothing happens.
+/// The longer of the times that frames and updates still take; none if one of them is incomplete and makes no progress.
 fn time_left(frames: (u64, f64), updates: (u64, f64)) -> Option<Duration> {
     let seconds = |(left, rate): (u64, f64)| match left {
         0 => Some(0.0),

@@ -1,4 +1,4 @@
-//! Looking at a run: one poller asks its processes, and what it finds is shown as live lines, as a page, as JSON and to Prometheus.
+//! Observes a run: one poller asks its processes, and their answers are shown as live lines, as a page, as JSON and to Prometheus.
 
 mod advice;
 mod export;

@@ -11,10 +11,10 @@ use crate::{
     run_view::{RunView, ServerAnswer},
 };
 
-/// Actors that have their own line; the others are counted.
+/// Actors with a separate line; further actors are only counted.
 const ACTORS_MAX: usize = 64;
 
-/// Age from which on the page tells how old a process's own report is, seconds.
+/// From this age on, in seconds, the page shows how old a process's own report is.
 const REPORT_AGE_MAX: f64 = 10.0;
 
 pub(crate) fn page(view: &RunView) -> String {
@@ -87,7 +87,7 @@ fn warning(who: &str, warning: Option<&Warning>) -> Option<String> {
     Some(format!("{who} warned {age} ago: {}", warning.text))
 }
 
-/// How the log of a replay server that keeps its replay on disk stands.
+/// Describes the log of a replay server that keeps its replay on disk.
 fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     let name = match of {
@@ -153,10 +153,10 @@ fn process_row(process: &ProcessStatus) -> Vec<String> {
     let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", seconds(age)));
     let doing = process.doing.as_ref();
     let doing = doing.map_or("-".into(), |(doing, since, said)| {
-        let doing = format!("{doing} since {}", seconds(*since));
+        let since = seconds(*since);
         match *said > REPORT_AGE_MAX {
-            true => format!("{doing} (reported {} ago)", seconds(*said)),
-            false => doing,
+            true => format!("{doing} ({since}, reported {} ago)", seconds(*said)),
+            false => format!("{doing} ({since})"),
         }
     });
     let version = process.weights_version.map(|it| it.to_string());

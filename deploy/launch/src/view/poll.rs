@@ -1,5 +1,5 @@
-//! The one poller: asks the processes of a run how they are, as any client would, and keeps what they answer in a [`RunView`].
-//! It judges nothing and changes nothing.
+//! The poller: asks the processes of a run for their status, as any client could, and keeps the answers in a [`RunView`].
+//! This module judges nothing and changes nothing.
 
 use std::time::Duration;
 
@@ -19,29 +19,29 @@ use crate::{
     run_view::{Plan, RunView, ServerAnswer},
 };
 
-/// How long an answer may take; a process that is busy answers the next time.
+/// How long an answer may take; a process that is busy may answer the next poll.
 const ANSWER_MAX: Duration = Duration::from_secs(3);
 
-/// A replay server that is reached.
+/// A replay server to which the poller is connected.
 #[derive(Debug)]
 pub struct Reached {
     name: String,
     endpoint: String,
-    /// Asks it, through a session that the poller closes.
+    /// The client of this server; the poller closes its session.
     client: RunClient,
 }
 
-/// Asks a run's processes.
+/// Polls the processes of a run.
 pub struct Poller {
     /// The run's settings.
     pub config: RunConfig,
-    /// What they have answered.
+    /// The state of the run, by the answers of its processes.
     pub view: RunView,
     servers: Vec<Reached>,
 }
 
 impl Poller {
-    /// Of the run with these settings, whose replay servers are reached already, one for each shard.
+    /// A poller for the run with these settings, connected to its replay servers already, one per shard.
     pub fn new(config: &RunConfig, servers: Vec<Reached>) -> Self {
         Self {
             view: RunView::new(Plan::of(config)),
@@ -50,10 +50,10 @@ impl Poller {
         }
     }
 
-    /// Connects to the replay servers at `endpoints`, with an observer's certificate where they want one.
+    /// Connects to the replay servers at `endpoints`, with an observer's certificate if they require one.
     ///
     /// # Errors
-    /// Nothing listens there, or something that is not a replay server of this program and namespace.
+    /// Nothing listens at an endpoint, or something that is not a replay server of this program and namespace.
     pub fn open(
         endpoints: &[String],
         namespace: &str,
@@ -64,7 +64,7 @@ impl Poller {
         let mut config: Option<RunConfig> = None;
         for endpoint in endpoints {
             let reached = Endpoints::to(vec![endpoint.clone()]);
-            // An observer does not wait for a server that is still to come.
+            // An observer does not wait for a server that does not listen yet.
             reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
             let served = settings(&session, &keys, endpoint, namespace)?;
@@ -84,10 +84,10 @@ impl Poller {
         Ok(Self::new(&config.context("no endpoint to ask")?, servers))
     }
 
-    /// Asks all processes. Those that do not answer are named in the view.
+    /// Polls all processes. The view names those that do not answer.
     pub fn ask(&mut self) -> &RunView {
         let servers: Vec<_> = self.servers.iter().map(Reached::ask).collect();
-        // The learner is asked through the first of them.
+        // The learner is asked through the first server.
         let first = self.servers.first();
         let first = first.filter(|_| servers[0].replay.is_some());
         let view = &mut self.view;
@@ -105,14 +105,14 @@ impl Poller {
         }
         view.servers = servers;
         if view.recovering().next().is_some() {
-            // It is there, and no other process can be asked through it.
+            // The server is alive, but no other process can be asked through it.
             view.replay_silence.answered();
             view.learner_silence.answered();
         }
         view
     }
 
-    /// Asks the replay servers for their counts alone.
+    /// Asks only the replay servers, for their counts.
     pub fn ask_replay(&mut self) -> anyhow::Result<()> {
         let answers = self.servers.iter().map(|it| it.client.fetch(ANSWER_MAX));
         let shards = answers.collect::<Result<Vec<ReplayStatus>, _>>()?;
@@ -120,7 +120,7 @@ impl Poller {
         Ok(())
     }
 
-    /// Asks the learner alone.
+    /// Asks only the learner.
     pub fn ask_learner(&mut self) -> anyhow::Result<()> {
         let first = self.servers.first();
         let first = first.context("a run has at least one replay server")?;
@@ -129,8 +129,8 @@ impl Poller {
         Ok(())
     }
 
-    /// Asks a shard for the episodes that ended after the first `since`, for its launcher or for another process; none if it does not
-    /// answer.
+    /// Requests the episodes of a shard that ended after the first `since`, as the launcher or as another observer. None if the shard
+    /// does not answer.
     pub(crate) fn episodes(
         &self,
         shard: usize,
@@ -143,7 +143,7 @@ impl Poller {
         reply.inspect_err(failed).ok()
     }
 
-    /// Leaves the run; the last answers stay.
+    /// Closes the sessions; the last answers stay in the view.
     pub fn close(&self) {
         for server in &self.servers {
             if let Err(e) = server.client.session().close().wait() {
@@ -154,7 +154,7 @@ impl Poller {
 }
 
 impl Reached {
-    /// Connects to a server of the run with this hash that `driml train` has started at `endpoint`.
+    /// Connects to a server that `driml train` has started at `endpoint`, of the run with this hash.
     pub fn open(name: &str, endpoint: &str, spec_hash: u64) -> anyhow::Result<Self> {
         let session = session::open(&Endpoints::to(vec![endpoint.to_owned()]))?;
         let keys = Keys::new(NAMESPACE).map_err(Usage)?;
@@ -192,7 +192,7 @@ impl Reached {
     }
 }
 
-/// The settings that a replay server hands out, also while it reads its replay back.
+/// The settings that a replay server reports, also while it reads its replay back from disk.
 fn settings(
     session: &Session,
     keys: &Keys,

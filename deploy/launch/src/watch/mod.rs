@@ -1,5 +1,5 @@
 //! `driml watch` and `driml status`: the live lines, metrics and summary of a run that other commands have started, on any machine.
-//! It asks and never tells: the run does not depend on whether it is watched.
+//! These commands only ask: the run does not depend on whether it is watched.
 
 mod watched;
 
@@ -40,19 +40,19 @@ pub struct WatchFlags {
     prometheus: Option<PathBuf>,
 }
 
-/// A connection to a run, or how it stands if no process of it can be asked.
+/// A connection to a run, or the run's state if no process of it can be asked.
 pub type Asked<T> = Result<T, Box<Over>>;
 
 const POLL: Duration = Duration::from_secs(1);
-/// The same once all frames are in: the learner's last word is not to be missed, as its process may end soon after.
+/// The time between polls once all frames are stored: shorter, as the learner may exit soon after its last status.
 const LAST_POLL: Duration = Duration::from_millis(200);
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Asks a run and prints a page or an object of JSON, once or `again` and again until the run is over or Ctrl-C. Once no process can be
-/// asked any more, the run's `folder` tells how it ended, if it is known.
+/// Polls a run and prints a page or a JSON object: once, or with `again` until the run is over or Ctrl-C. If no process can be asked
+/// any more, the run's `folder`, if it is known, tells how the run ended.
 ///
 /// # Errors
-/// [`Interrupted`] if one answer was asked for and Ctrl-C came first.
+/// [`Interrupted`] if Ctrl-C came before the first page.
 pub fn look(
     poller: &mut Poller,
     folder: Option<&RunFolder>,
@@ -60,7 +60,7 @@ pub fn look(
     as_json: bool,
 ) -> anyhow::Result<()> {
     let interrupted = Shutdown::on_signals(None)?;
-    // For the speed: what happens until the next answer.
+    // The first poll starts the speed, which counts what happens until the next.
     poller.ask();
     if interrupted.wait_timeout(POLL) {
         return Err(Interrupted.into());
@@ -83,12 +83,12 @@ pub fn look(
     }
 }
 
-/// Watches a run that was `opened`: shows and records it until it is over, or looks at it once, for scripts and monitors. The file for
-/// Prometheus tells whether it answers.
+/// Watches a run that was `opened`: shows and records it until it is over, or, with `--once`, prints one page for scripts and monitors.
+/// The file for Prometheus tells whether the run answers.
 ///
 /// # Errors
 /// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
-/// that serve another run; where it is looked at once, a run that is not well: a process is missing, gone or unresponsive.
+/// that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
 pub fn run(opened: anyhow::Result<Asked<Poller>>, flags: &WatchFlags) -> anyhow::Result<()> {
     if !matches!(opened, Ok(Ok(_)))
         && let Some(path) = &flags.prometheus
@@ -124,7 +124,7 @@ fn once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
+/// Waits until the replay servers have read their replay back and a learner has joined. Prints the progress; fails if they are silent.
 fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let mut said = LogLimiter::default();
@@ -151,7 +151,7 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
     }
 }
 
-/// Shows and records a run until it is over, or until Ctrl-C, which leaves the run alone.
+/// Shows and records a run until it is over, or until Ctrl-C, after which the run continues.
 fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
@@ -163,7 +163,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
     if is_unknown || poller.view.recovering().next().is_some() {
-        // What the run has done so far is not known before.
+        // Before that, it is not known what the run has done so far.
         wait_until_known(&mut poller, &interrupted)?;
     }
     let mut watched = Watched::new(&poller, folder.as_ref(), flags.tensorboard)?;
@@ -202,26 +202,26 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     }
 }
 
-/// How a run stands of which no process can be asked.
+/// The state of a run of which no process can be asked.
 #[derive(Serialize)]
 pub struct Over {
-    /// Whether it is complete and its processes have ended.
+    /// Whether the run is complete and its processes have ended.
     finished: bool,
     message: String,
     summary: Option<Summary>,
-    /// What follows the message for a person.
+    /// Text that follows the message in the output for a person.
     #[serde(skip)]
     details: String,
-    /// Whether it is finished, or will be without anybody's help.
+    /// Whether the run is finished, or will be without a person's help.
     #[serde(skip)]
     is_well: bool,
 }
 
 impl Over {
-    /// Prints it, as one line of JSON or for a person.
+    /// Prints the state, as one line of JSON or as text for a person.
     ///
     /// # Errors
-    /// The output cannot be written to.
+    /// Stdout cannot be written to.
     pub fn print(&self, as_json: bool) -> anyhow::Result<()> {
         console::print(&match as_json {
             true => format!("{}\n", serde_json::to_string(self)?),
@@ -230,10 +230,10 @@ impl Over {
     }
 }
 
-/// Looks into the folder of a run for the endpoints of its replay servers.
+/// Reads the endpoints of a run's replay servers from its folder.
 ///
 /// # Errors
-/// It is not a run's, or one whose processes were started by hand.
+/// The folder has no settings: it is not a run's, or the processes of the run were started by hand.
 pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
     let config = config_of(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints());
@@ -243,7 +243,7 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
         return Ok(Ok(endpoints.lines().map(str::to_owned).collect()));
     }
     let run = folder.display();
-    // A launcher that runs there holds the lock, and so does a run in lockstep.
+    // A running launcher holds the lock, and so does a run in lockstep.
     let is_locked = folder.is_locked();
     let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
     let so_far = progress(folder).map_or("nothing".into(), counts);
@@ -307,7 +307,7 @@ mod tests {
         drop(listener);
         let said = found();
         assert!(said.starts_with("no process runs in "), "{said}");
-        // As a run in lockstep.
+        // As in a run in lockstep.
         std::fs::remove_file(folder.endpoints()).unwrap();
         let _lock = folder.lock().unwrap();
         let said = found();

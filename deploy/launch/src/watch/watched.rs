@@ -1,5 +1,5 @@
-//! A run that is watched, as far as its answers tell: what is shown of it, what is recorded, and when it is over.
-//! It asks for no more than the episodes that it records.
+//! A run that is watched, as far as its answers tell: what is shown, what is recorded, and when the run is over.
+//! This module requests nothing but the episodes that it records.
 
 use std::time::{Duration, Instant};
 
@@ -17,19 +17,19 @@ use crate::{
     view::{Display, Poller},
 };
 
-/// How long replay servers that said that everything is sampled may be silent before they have ended.
+/// How long replay servers may be silent before they count as ended, once they have reported that everything is sampled.
 const FAREWELL_MAX: Duration = Duration::from_secs(5);
-/// Most seconds of a run's clock that are shown: ten years.
+/// Longest time of a run that is shown, seconds: ten years.
 const UP_MAX: f64 = 315_360_000.0;
 
 pub(super) struct Watched {
-    /// It shows the run from its beginning, as far as that is known.
+    /// Shows the run from its beginning, as far as that is known.
     pub(super) display: Display,
     recorder: Option<RunRecorder>,
 }
 
 impl Watched {
-    /// A run that has been asked once, recorded in `folder` if there is one, with TensorBoard's `events` on request.
+    /// Starts to watch a run that was polled once, recorded in `folder` if there is one, with TensorBoard's `events` on request.
     pub(super) fn new(
         poller: &Poller,
         folder: Option<&RunFolder>,
@@ -44,13 +44,13 @@ impl Watched {
         let began = now.checked_sub(up).unwrap_or(now);
         let display = Display::new(config.frames(), began, view.learner.updates);
         if let Some(bar) = display.screen.bar() {
-            // The view's clock is the run's. All copies of a bar are one.
+            // The bar's clock shows the time of the run. All clones of a bar are the same bar.
             drop(bar.clone().with_elapsed(up));
         }
         Ok(Self { display, recorder })
     }
 
-    /// Takes the poller's last answers: shows and records them. True if the run is over.
+    /// Shows and records the poller's last answers. Returns true if the run is over.
     pub(super) fn take(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
         if let Some(other) = poller.view.servers.iter().find(|it| it.is_another_run) {
             bail!(
@@ -74,8 +74,8 @@ impl Watched {
             return Ok(true);
         }
         let silent = view.replay_silence.length();
-        // They end by themselves once the learner has saved. Another client may have had its last answer, or its launcher may have ended
-        // it before it was asked again.
+        // The servers exit once the learner has saved. Another client may have received the learner's last answer, or the launcher may
+        // have stopped the learner before it was polled again.
         if silent > FAREWELL_MAX && view.replay.waiting == Waiting::Finished {
             self.learn_all_that_was_served(poller);
             return Ok(true);
@@ -106,7 +106,7 @@ impl Watched {
         }
     }
 
-    /// Takes the live lines away, says what could not be recorded, and gives the summary of a run that ended so.
+    /// Removes the live lines, prints what could not be recorded, and returns the summary of a run that ended with `outcome`.
     pub(super) fn conclude(&mut self, view: &mut RunView, outcome: Outcome) -> Summary {
         self.display.screen.clear();
         let Some(recorder) = &self.recorder else {
@@ -126,7 +126,7 @@ fn record(
     events: bool,
 ) -> anyhow::Result<RunRecorder> {
     let mut resumed = None;
-    // A learner may have just begun there.
+    // A learner may have just begun in this folder.
     if folder.config().exists() || folder.checkpoints().is_dir() {
         check_same(folder, config)?;
         resumed = Some(resume_point(folder, view)?);
@@ -168,7 +168,7 @@ fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
     ))
 }
 
-/// Which of the rows that are there stay.
+/// The point up to which the existing rows stay.
 fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoint> {
     let rows = Table::read(&folder.metrics())?;
     let last = |name| rows.last::<u64>(name).unwrap_or(0);
@@ -182,7 +182,7 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
         ));
     }
     Ok(ResumePoint {
-        // A run that was resumed makes the updates since its checkpoint again.
+        // A resumed run repeats the updates since its checkpoint.
         updates: match after_updates {
             0 => updates,
             _ => updates.min(view.learner.updates),

@@ -1,5 +1,5 @@
-//! The certificates in a folder for `--tls-dir`: whose are there, which are good, and what to do about the others.
-//! It makes none: `deploy/certs.sh` does.
+//! The certificates in a folder for `--tls-dir`: which roles have one, which are valid, and what to do about the others.
+//! This module makes no certificates: `deploy/certs.sh` does.
 
 use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 
@@ -7,11 +7,11 @@ use driml_protocol::tls::{self, Credentials, Role};
 
 use super::fact::{Fact, Found, State};
 
-/// A certificate that expires sooner is a note.
+/// A certificate that expires within this time gets the state `Note`.
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
 const DAY_S: u64 = 24 * 3600;
 
-/// What there is to say of `folder`: a line for each process that has a file there, and one for all actors that are well.
+/// The facts about `folder`: one for each process that has a file there, and a single one for all actors without a complaint.
 pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let dir = folder.display();
     let entries = match fs::read_dir(folder) {
@@ -21,7 +21,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
             return vec![Fact::new("tls folder", (State::Missing, text))];
         }
     };
-    // By the certificate or the key alone, too: then the other one is missing.
+    // A certificate or a key alone counts too: the other file is then reported as missing.
     let name = |entry: fs::DirEntry| {
         let path = entry.path();
         let extension = path.extension();
@@ -68,7 +68,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     if let Some(text) = all_well(&actors) {
         note("tls actors", (State::Ok, text));
     }
-    // Its certificate is checked with each process's.
+    // The authority's certificate is checked with each process's certificate.
     let key = tls::authority_path(folder).with_extension("key");
     if key.exists() {
         let text = format!(
@@ -80,7 +80,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     facts
 }
 
-/// What is to be done about a certificate that is good.
+/// What the user should do about a certificate that is valid; none if nothing.
 fn complaint(credentials: &Credentials) -> Option<String> {
     let (role, key) = (credentials.role, credentials.key.display());
     let left = credentials.expires_in();
@@ -109,7 +109,7 @@ fn good_until(credentials: &Credentials) -> String {
     format!("good until {} ({days} days)", credentials.expires_on)
 }
 
-/// The actors of which nothing is to be said each.
+/// One text for all actors that have no complaint.
 fn all_well(actors: &[(u32, Credentials)]) -> Option<String> {
     let (first, last) = (actors.first()?.0, actors.last()?.0);
     let (_, soonest) = actors.iter().min_by_key(|(_, it)| it.expires_in())?;

@@ -1,5 +1,5 @@
-//! Procgen's engine: whether it is there and loads, or how it would be had.
-//! It fetches nothing and plays nothing.
+//! Procgen's engine: whether it is installed and loads, or how to get it.
+//! This module fetches nothing and plays nothing.
 
 use procgen_sys::{Engine, ProcgenError};
 
@@ -20,7 +20,7 @@ pub(super) fn found() -> Found {
     }
 }
 
-/// What is so where the engine is not there; `source` is where it would come from.
+/// The fact for an engine that is not installed; `source` is where it would be downloaded from.
 fn not_there(reason: &str, source: Result<String, ProcgenError>) -> Found {
     match source {
         Ok(source) => {

@@ -1,5 +1,5 @@
 //! One fact about this machine, as a line of text and as JSON.
-//! It judges nothing: who finds a fact gives it its state.
+//! This module judges nothing: the code that finds a fact gives it its state.
 
 use std::fmt;
 
@@ -8,22 +8,22 @@ use serde::Serialize;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum State {
-    /// As it should be.
+    /// The fact is as it should be.
     Ok,
-    /// It works without, or slower.
+    /// A run works without it, or works slower.
     Note,
-    /// What is asked for cannot be had; the text says what to do.
+    /// Something required is missing; the text says what to do.
     Missing,
 }
 
-/// How something is, and what is so, with what to do if that should change.
+/// The state of a fact and its text, which says what to do if something should change.
 pub(super) type Found = (State, String);
 
-/// What was found out about one thing that a run needs.
+/// The result of the check of one thing that a run needs.
 #[derive(Debug, Serialize)]
 pub(super) struct Fact {
     pub(super) state: State,
-    /// What it is about, such as `cores`.
+    /// The subject of the fact, such as `cores`.
     pub(super) what: String,
     text: String,
 }
@@ -41,7 +41,7 @@ impl Fact {
 impl fmt::Display for Fact {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let state = format!("{:?}", self.state).to_lowercase();
-        // One line a fact, whatever an error's text has.
+        // One line per fact, even if an error's text has several.
         let text = self.text.split_whitespace().collect::<Vec<_>>().join(" ");
         write!(f, "{state:<8} {:<17} {text}", self.what)
     }

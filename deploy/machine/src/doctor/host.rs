@@ -1,5 +1,5 @@
-//! What every run needs of the machine: cores, vector instructions and what the kernels make of them, memory, shared memory, disk.
-//! The numbers are what is free now; how large a run becomes is for `plan`.
+//! What every run needs of the machine: cores, vector instructions and the kernels that use them, memory, shared memory, disk.
+//! The numbers are what is free now; `plan` says how large a run becomes.
 
 use std::path::Path;
 
@@ -13,19 +13,19 @@ use crate::{
     units::gib,
 };
 
-/// Below this a run's three processes do not fit, bytes: they take 0.9 GiB with a small replay.
+/// With less memory a run's three processes do not fit, bytes: they take 0.9 GiB with a small replay.
 const MEMORY_MIN: u64 = 1 << 30;
-/// Below this the replay sized by the machine holds less than a short run's frames, bytes.
+/// With less memory a replay sized by the machine holds fewer frames than a short run has, bytes.
 const MEMORY_ENOUGH: u64 = 4 << 30;
-/// What the batches and one actor's chunks take of it, rounded up, bytes.
+/// Shared memory that the batches and one actor's chunks take, rounded up, bytes.
 const SHARED_MEMORY_ENOUGH: u64 = 256 << 20;
-/// Below this not even one checkpoint is sure to fit, bytes.
+/// With less disk space not even one checkpoint is sure to fit, bytes.
 const DISK_MIN: u64 = 100 << 20;
-/// What a long run's checkpoints, metrics and logs take, rounded up, bytes.
+/// Disk space that a long run's checkpoints, metrics and logs take, rounded up, bytes.
 const DISK_ENOUGH: u64 = 1 << 30;
 const FRAME_BYTES: u64 = 64 * 64 * 3;
 
-/// All of them. `runs` is where run folders would be.
+/// All facts about the host. `runs` is the folder that would hold the run folders.
 pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     let machine = Machine::this();
     let [f32, bf16] = Precision::ALL.map(describe_kernels);
@@ -51,7 +51,7 @@ fn cores(machine: &Machine) -> Found {
     }
 }
 
-/// Floats that the vector instructions take at once which the kernels can use; 1 without AVX2 and FMA.
+/// Number of f32 lanes of the vector instructions that the kernels can use; 1 without AVX2 and FMA.
 #[cfg(target_arch = "x86_64")]
 fn floats_at_once() -> Option<u32> {
     let has_avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
@@ -119,7 +119,7 @@ fn shared_memory(free: Result<u64, String>) -> Found {
     (State::Note, why)
 }
 
-/// `limit` is how many bytes of shared memory a process may lock, as it has to; none if there is no limit.
+/// `limit` is the number of bytes of shared memory that a process may lock; none if unlimited. zenoh locks what it shares.
 fn locked_memory(limit: Option<u64>) -> Found {
     match limit {
         None => (State::Ok, "no limit (`ulimit -l`)".into()),
@@ -185,7 +185,7 @@ mod tests {
             (memory(&machine(2, 1 << 29)), State::Missing),
             (memory(&machine(2, 2 << 30)), State::Note),
             (memory(&machine(2, 8 << 30)), State::Ok),
-            // What docker grants unless it is told otherwise.
+            // Docker's default.
             (shared_memory(Ok(64 << 20)), State::Note),
             (shared_memory(Ok(1 << 30)), State::Ok),
             (shared_memory(Err("no such folder".into())), State::Note),

@@ -1,5 +1,5 @@
-//! `driml doctor`: what this machine can do and what it lacks, one line a fact, with what to do about it.
-//! It changes nothing, fetches nothing and measures no speed.
+//! `driml doctor`: what this machine can do and what it lacks. Each fact is one line with what to do about it.
+//! The doctor changes nothing, fetches nothing and measures no speed.
 
 mod certificates;
 mod engine;
@@ -13,7 +13,7 @@ use anyhow::ensure;
 use self::fact::{Fact, State};
 use crate::device::{self, Gpu};
 
-/// What was found out, for the CPU and for CUDA.
+/// The facts about this machine: for training on the CPU, for CUDA, and about the certificates.
 #[derive(Debug)]
 pub struct Report {
     cpu: Vec<Fact>,
@@ -21,11 +21,11 @@ pub struct Report {
     certificates: Vec<Fact>,
 }
 
-/// Looks at this machine; runs would go to `run_dir`, with the certificates in `tls_dir`, if any.
+/// Examines this machine. `run_dir` is where runs would be written; `tls_dir` holds the certificates, if any.
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
     cpu.push(Fact::new("Procgen", engine::found()));
-    // Training on the CPU needs none.
+    // Training on the CPU needs no GPU.
     let of_gpu = |(name, found): Gpu| match found {
         Ok(text) => Fact::new(name, (State::Ok, text)),
         Err(why) => Fact::new(name, (State::Missing, why)),
@@ -42,7 +42,7 @@ pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
 }
 
 impl Report {
-    /// A line a fact, and what can be trained on.
+    /// One line per fact, and a last line that says which devices this machine can train on.
     pub fn describe(&self) -> String {
         let lines = self.all().map(|fact| format!("{fact}\n"));
         let lines: String = lines.collect();
@@ -65,13 +65,13 @@ impl Report {
         self.cpu.iter().chain(&self.cuda).chain(&self.certificates)
     }
 
-    /// Whether `--device cuda` has something to compute on.
+    /// Whether a GPU is usable, so that `--device cuda` works.
     fn is_ready_for_cuda(&self) -> bool {
         self.cuda.iter().any(|fact| fact.state == State::Ok)
     }
 
-    /// Fails where something is missing that training on the CPU needs, or a certificate is not good; with `cuda`, also what training
-    /// on a GPU needs.
+    /// Fails if something is missing that training on the CPU needs, or if a certificate is not valid. With `cuda`, also fails if
+    /// something is missing that training on a GPU needs.
     pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
         let is_missing = |state| state == State::Missing;
         let missing = lacking(&self.cpu, is_missing);
@@ -87,7 +87,7 @@ impl Report {
     }
 }
 
-/// The facts whose state is bad, by name.
+/// The names of the facts whose state is bad, joined by commas.
 fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
     let bad = facts.iter().filter(|fact| bad(fact.state));
     let names: Vec<_> = bad.map(|fact| fact.what.as_str()).collect();

@@ -1,5 +1,5 @@
-//! Presets, flags, `--set` and files: what they resolve to, and the errors of those that cannot work.
-//! `tests/snapshots/refusals.txt` has the sentences.
+//! How presets, flags, `--set` and files resolve, and the errors of settings that cannot work.
+//! `tests/snapshots/refusals.txt` has the error messages.
 
 use driml_protocol::Sampling;
 use expect_test::{expect, expect_file};
@@ -75,7 +75,7 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     assert_eq!(resolved, (5 * all + 3 * games) * AGENTS.len());
 }
 
-/// Settings of earlier versions have frames whole, and stay as they are.
+/// Settings of earlier versions have whole frames and keep them.
 #[test]
 fn frames_that_are_whole_stay_whole() {
     let sizes = |config: &RunConfig| {
@@ -101,7 +101,7 @@ fn frames_that_are_whole_stay_whole() {
         .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
 }
 
-/// Settings of earlier versions say nothing of which actions there are.
+/// Settings of earlier versions do not name the set of actions.
 #[test]
 fn an_agent_has_all_actions_unless_it_chooses_among_those_that_differ() {
     let all = with("procgen:plunder", "driml-ada", &[]).unwrap();
@@ -119,7 +119,7 @@ fn an_agent_has_all_actions_unless_it_chooses_among_those_that_differ() {
     }
 }
 
-/// The rows of a file that begin with `> ` with their answers below, and its remarks.
+/// Returns the comments of a file, and its rows that begin with `> `, each with its answer below.
 fn answered(text: &str, answer: impl Fn(&str) -> String) -> String {
     let lines = text.lines().filter_map(|row| match row.strip_prefix("> ") {
         Some(asked) => Some(format!("{row}\n{}\n", answer(asked))),
@@ -128,7 +128,7 @@ fn answered(text: &str, answer: impl Fn(&str) -> String) -> String {
     lines.collect()
 }
 
-/// A row of the file is a world, an agent and what is set; the answer stands below it.
+/// A row of the file has a world, an agent and the `--set` values; the error stands below it.
 #[test]
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let text = include_str!("../../tests/snapshots/refusals.txt");
@@ -139,8 +139,8 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect_file!["../../tests/snapshots/refusals.txt"].assert_eq(&answers);
 }
 
-/// A row of the file is a preset, a world, an agent, what is set, and after a question mark the settings that stand below it, or the
-/// notes. `@bf16` is a machine that is fast in it, `@8` one with 8 GiB of memory.
+/// A row of the file has a preset, a world, an agent, the `--set` values, and after a question mark the settings or notes to print below
+/// it. `@bf16` means a machine that is fast in bf16, `@8` one with 8 GiB of memory.
 #[test]
 fn settings_follow_from_one_another() {
     let text = include_str!("../../tests/snapshots/resolved.txt");
@@ -166,7 +166,7 @@ fn settings_follow_from_one_another() {
         };
         asked.split(' ').map(value).collect::<Vec<_>>().join("\n")
     });
-    // A setting that is never set may be misspelt.
+    // A setting without a value in any row may be misspelt.
     let unset = answers.lines().map(|line| line.strip_suffix(" is not set"));
     for path in unset.flatten() {
         let is_set = answers.contains(&format!("\n{path} = "));
@@ -236,18 +236,18 @@ fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
         let capacity = config.map(|it| it.replay.capacity_transitions);
         capacity.map_err(|e| e.to_string())
     };
-    // Actors on other machines take none of its memory, and two shards have that of two machines.
+    // Actors on other machines take none of the server's memory, and two shards have the memory of two machines.
     assert!(of(false, 64, 1, &[]).unwrap_err().contains("64 actors"));
     let [one, two] = [1, 2].map(|shards| of(true, 64, shards, &[]).unwrap());
     assert_eq!((one, two), (793_014, 1_000_000));
-    // A server that starts again holds what was found to fit beside actors and learner, which now run.
+    // A restarted server keeps the size that fitted beside actors and learner, which now run.
     let most = "replay.capacity_transitions=1400000";
     let said = of(false, 4, 1, &[most]).unwrap_err();
     expect!["replay.capacity_transitions = 1400000 needs 14.1 GiB, and may take 13.8 GiB, as 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said);
     assert_eq!(of(true, 4, 1, &[most]), Ok(1_400_000));
 }
 
-/// The hash of the run's settings is that of every other rule: checkpoints stay valid.
+/// The sampling rule does not change the hash of the run's settings, so checkpoints stay valid.
 #[test]
 fn by_which_rule_rows_are_drawn_is_for_replay_and_learner_alone() {
     let all = "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";

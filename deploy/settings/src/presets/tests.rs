@@ -1,6 +1,6 @@
-//! The settings of every preset as a snapshot, `tests/snapshots/presets.txt`: a changed number shows in it (`UPDATE_EXPECT=1`
-//! rewrites it). Every number has its source beside it. `chain` and `smoke` are left out: their numbers are for tests.
-//! Which games an `[[only]]` block names is tested with `menu`.
+//! The settings of every preset as a snapshot, `tests/snapshots/presets.txt`, in which a changed number shows (`UPDATE_EXPECT=1` rewrites
+//! it). Every number must have its source beside it. `chain` and `smoke` are left out, because their numbers are for tests.
+//! A test of `menu` covers the games that `[[only]]` blocks name.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -29,7 +29,7 @@ const SOURCES: [&str; 8] = [
 /// Every layer, by its name.
 fn all_layers() -> BTreeMap<&'static str, Layer> {
     let agents = AGENTS.iter().map(|agent| agent.layer);
-    // A command is not a world's name; any one stands for all.
+    // The command of an external world is not a name; any command serves here.
     let exec = "exec:true".parse().unwrap();
     let worlds = WorldName::all().chain([exec]).map(world_layer);
     let variants = PRESETS.iter().filter_map(|it| it.layer);
@@ -75,7 +75,7 @@ fn every_number_has_its_source_beside_it() {
                     Value::Float(number) if *number == 0.0 => true,
                     Value::Integer(_) | Value::Float(_) | Value::Array(_) => is_named,
                     Value::String(word) if word == "auto" => is_named,
-                    // Faster and less exact than f32: the measured price.
+                    // A format that is faster and less exact than f32 needs its measured price.
                     Value::String(word) if word.ends_with("f16") => comment.contains('%'),
                     _ => true,
                 };

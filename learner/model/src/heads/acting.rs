@@ -1,11 +1,11 @@
-//! The one linear layer that a C51 head amounts to, for an actor: `streams` without a graph.
-//! It applies no layer.
+//! Reduces a C51 head to one linear layer for an actor, without a graph. `streams` does the same with gradients.
+//! This module applies no layer.
 
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::HeadLayer;
 use crate::layers::Layer;
 
-/// The layer of A * N outputs that a head's `layers` amount to with this noise, or without.
+/// Merges a head's `layers` into one layer of A * N outputs. Without `noise`, noisy layers are their means.
 pub(crate) fn merged(layers: &[HeadLayer<Vec<f32>>], noise: Option<&HeadNoise>) -> Layer<Vec<f32>> {
     let with_noise = |(number, layer): (usize, &HeadLayer<Vec<f32>>)| {
         let mut sum = layer.mean.clone();
@@ -37,7 +37,7 @@ pub(crate) fn merged(layers: &[HeadLayer<Vec<f32>>], noise: Option<&HeadNoise>) 
     advantage
 }
 
-/// V + A - mean_a A: `value` [N, in] or [N], and `advantage` [A * N, in] or [A * N], which becomes the result.
+/// Computes V + A - mean_a A in `advantage` [A * N, in] or [A * N], from `value` [N, in] or [N].
 fn duel(value: &[f32], advantage: &mut [f32]) {
     let mut shared = vec![0.0; value.len()];
     for action in advantage.chunks_exact(value.len()) {

@@ -1,5 +1,5 @@
-//! The C51 head: relu(f4) to a distribution over the atoms for each action, and its expectation.
-//! It computes no loss and no projection.
+//! The C51 head: computes a distribution over the atoms for each action from relu(f4), and its expectation.
+//! This module computes no loss and no projection.
 //!
 //! Source: Bellemare et al. 2017.
 
@@ -17,7 +17,7 @@ use crate::kernels::tensors::values_of;
 use crate::layers::Layer;
 use crate::parameters::Parameters;
 
-/// Distributions that one task takes.
+/// Distributions that one task processes.
 const TASK_DISTRIBUTIONS: usize = 256;
 
 #[derive(Debug)]
@@ -44,7 +44,7 @@ impl C51Head {
         })
     }
 
-    /// Logits [B, A, atoms] of f4 [B, hidden] before its ReLU; a noisy layer without noise is its mean.
+    /// Computes the logits [B, A, atoms] of f4 [B, hidden] before its ReLU. Without noise, noisy layers use their means.
     pub(crate) fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
         let layer = self.streams.layer(noise)?;
@@ -52,7 +52,7 @@ impl C51Head {
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
 
-    /// Of those logits the ones [B, atoms] of one action a row.
+    /// Computes the logits [B, atoms] of one action a row.
     pub(crate) fn taken_logits(
         &self,
         f4: &Tensor,
@@ -65,7 +65,7 @@ impl C51Head {
         Ok(with.grouped_linear(&active, &weight, &bias, actions, atoms)?)
     }
 
-    /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
+    /// Computes the expected returns [B, A] of logits [B, A, atoms], without a gradient.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         match self.kernels {
             Kernels::Fused(_) => Ok(expectations(&logits.contiguous()?, &self.support)?),
@@ -80,7 +80,7 @@ impl C51Head {
     }
 }
 
-/// [`expected_returns`] [B, A] of logits [B, A, atoms], on the pool.
+/// Computes [`expected_returns`] [B, A] of logits [B, A, atoms] on the rayon pool.
 fn expectations(logits: &Tensor, support: &[f32]) -> candle_core::Result<Tensor> {
     let (batch, actions, atoms) = logits.dims3()?;
     if atoms != support.len() {
@@ -94,15 +94,15 @@ fn expectations(logits: &Tensor, support: &[f32]) -> candle_core::Result<Tensor>
     Tensor::from_vec(values, (batch, actions), logits.device())
 }
 
-/// Largest error of an expected return beside its own last place, as a share of the support's width: what sums over a thousand
-/// atoms lose in f64.
+/// Largest error of an expected return beyond its f32 rounding, relative to the support's width. It comes
+/// from f64 sums over up to a thousand atoms.
 pub const EXPECTED_RETURN_ERROR: f64 = 8e-15;
 
-/// Expectation of softmax(logits) over atoms i of equal spacing: z_0 + spacing * sum_i w_i i / sum_i w_i with w_i = exp(l_i - max l).
+/// Expectation of softmax(logits) over equally spaced atoms: z_0 + spacing * sum_i w_i i / sum_i w_i with w_i = exp(l_i - max l).
 ///
-/// `logits` [n, atoms]; `support` [atoms], of which the ends and the length count; `values` [n]. The sum is over positions, not
-/// over returns: an error is at most [`EXPECTED_RETURN_ERROR`] of the support's width beside the value's own last place, wherever the
-/// support lies, no value is beyond its ends, and no support that f32 holds overflows. A distribution with a NaN or an infinite maximum gives NaN.
+/// `logits` [n, atoms]; `support` [atoms], of which only the ends and the length matter; `values` [n]. The sum is over atom indices,
+/// not returns. So the error beyond f32 rounding is at most [`EXPECTED_RETURN_ERROR`] times the support's width, wherever the support
+/// lies. Every value lies within the support, and no f32 support overflows. A NaN, or a maximum that is infinite, gives NaN.
 pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f32]) {
     let (v_min, spacing) = ends(support);
     let v_max = f64::from(support[support.len() - 1]);
@@ -122,7 +122,7 @@ pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f3
     }
 }
 
-/// The first of two or more atoms, and the distance from each to the next.
+/// Returns the first of two or more atoms, and the spacing of the atoms.
 fn ends(support: &[f32]) -> (f64, f64) {
     let (v_min, v_max) = (f64::from(support[0]), f64::from(support[support.len() - 1]));
     (v_min, (v_max - v_min) / (support.len() - 1) as f64)
@@ -132,7 +132,7 @@ fn ends(support: &[f32]) -> (f64, f64) {
 mod tests {
     use super::*;
 
-    /// On supports within 1e30 the table of properties of `driml experiment stability` holds values to float64.
+    /// The property table of `driml experiment stability` compares values with float64 for supports within 1e30.
     #[test]
     fn no_support_overflows() {
         for (share, expected) in [(0.0, 0.0), (1e4, 3e38), (-1e4, -3e38)] {

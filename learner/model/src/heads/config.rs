@@ -1,11 +1,11 @@
-//! How the C51 head is made: of one linear layer or of two streams, and whether these are noisy.
-//! It computes nothing.
+//! The structure of the C51 head: one linear layer or two streams, with or without noise.
+//! This module computes nothing.
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::{ModelError, Result};
 
-/// Name of the head, and of its streams if it is a dueling one.
+/// Layer name of a plain head, then those of a dueling head's two streams.
 pub(crate) const HEAD: &str = "head";
 pub(crate) const VALUE: &str = "head.value";
 pub(crate) const ADVANTAGE: &str = "head.advantage";
@@ -13,16 +13,16 @@ pub(crate) const ADVANTAGE: &str = "head.advantage";
 /// Largest sigma_0; a configuration beyond it is rejected.
 const NOISY_SIGMA_MAX: f64 = 100.0;
 
-/// How the C51 head is made, the table `[model.head]`.
+/// The structure of the C51 head: the table `[model.head]`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HeadConfig {
-    /// A stream for the state's value and one for what each action is better than the mean of all, added before the softmax.
-    /// Source: Wang et al. 2016; per atom as in Hessel et al. 2018.
+    /// Whether the head is dueling: a stream for the state's value and one for each action's advantage over
+    /// the mean, added before the softmax. Source: Wang et al. 2016; per atom as in Hessel et al. 2018.
     #[serde(default)]
     pub dueling: bool,
-    /// Of noisy layers sigma_0, above 0 and at most 100: the weights' noise at the start of a run, in units of 1 / sqrt(inputs). Not
-    /// there: layers without noise. Source: Fortunato et al. 2018, who take 0.5.
+    /// sigma_0 of noisy layers, above 0 and at most 100: the initial scale of the weights' noise, in units of
+    /// 1 / sqrt(inputs). Absent: no noisy layers. Source: Fortunato et al. 2018, who use 0.5.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub noisy_sigma: Option<f64>,
 }
@@ -50,7 +50,7 @@ impl HeadConfig {
         }
     }
 
-    /// Whether it is one linear layer: what it then says need not be said.
+    /// Whether the head is one linear layer without noise. Serialised settings then omit the table.
     #[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks by reference")]
     pub(crate) fn is_plain(&self) -> bool {
         *self == Self::PLAIN

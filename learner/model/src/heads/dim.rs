@@ -1,5 +1,5 @@
-//! The DIM heads Psi and Phi: residual blocks from features, and for Psi the action, to the space of dot products.
-//! They compute no score and no loss.
+//! The DIM heads Psi and Phi: residual blocks that map features, and for Psi the action, to vectors for dot products.
+//! This module computes no score and no loss.
 //!
 //! A block is out(relu(hidden(x))) + skip(x). Source: Mazoure et al. 2020, appendix.
 
@@ -11,7 +11,7 @@ use crate::error::{ModelError, Result};
 use crate::kernels::residual::{BlockParameters, residual_block};
 use crate::parameters::Parameters;
 
-/// A residual block on features, to which an action's embedding may be joined.
+/// A residual block on features, optionally with an action embedding joined to them.
 #[derive(Debug)]
 pub(crate) struct Head {
     kernels: Kernels,
@@ -34,10 +34,10 @@ impl Head {
         })
     }
 
-    /// Vectors [.., outputs] of `x` [.., f], or of [x; joined].
+    /// Computes vectors [.., outputs] of `x` [.., f], or of [x; joined].
     ///
-    /// `joined` [B, e] serves all locations of its row, so its products are biases of one group a row, and the tiled concatenation
-    /// is never built.
+    /// A row of `joined` [B, e] serves all locations of its state. So its products become one bias vector per
+    /// group of rows, and the tiled concatenation is never built.
     pub(crate) fn forward(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
         let Kernels::Fused(precision) = self.kernels else {
             return self.of_layers(x, joined);
@@ -45,7 +45,7 @@ impl Head {
         Ok(residual_block(x, joined, &self.parameters, precision)?)
     }
 
-    /// The same of candle's operations, layer by layer: W [x; joined] = W_x x + W_joined joined.
+    /// Computes the same with candle's operations, layer by layer: W [x; joined] = W_x x + W_joined joined.
     fn of_layers(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
         let with = self.kernels;
         let features = x.dim(D::Minus1)?;
@@ -63,13 +63,13 @@ impl Head {
         let hidden_weight = block.hidden_weight.narrow(1, 0, features)?;
         let skip_weight = block.skip_weight.narrow(1, 0, features)?;
         let hidden = with.relu(&with.linear(x, &hidden_weight, &hidden_bias)?)?;
-        // The skip's result is the bias of `out`, so nothing is added separately.
+        // The skip's result serves as the bias of `out`, which saves an addition.
         let skip = with.linear(x, &skip_weight, &skip_bias)?;
         Ok(with.linear(&hidden, &block.out_weight, &skip)?)
     }
 }
 
-/// The action's embedding: one-hot through a residual block, whose skip has a bias.
+/// The action embedding: a one-hot vector through a residual block whose skip layer has a bias.
 #[derive(Debug)]
 pub(crate) struct ActionEmbedding {
     block: Head,
@@ -91,7 +91,7 @@ impl ActionEmbedding {
         })
     }
 
-    /// Embeddings [B, e] of `actions` [B], integers below the number of actions; best on the CPU, where they are looked at.
+    /// Computes embeddings [B, e] of `actions` [B], integers below the number of actions. They are read on the CPU and best stored there.
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
         let one_hot = self.one_hot(actions)?;
         self.block.forward(&one_hot, None)

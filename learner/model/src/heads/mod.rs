@@ -1,4 +1,4 @@
-//! The heads on the torso: C51's distribution of returns, and DIM's vectors that are compared.
+//! The heads on the torso: C51 for return distributions, and DIM for the vectors that are compared.
 
 pub(crate) mod acting;
 pub(crate) mod c51;

@@ -1,5 +1,5 @@
-//! The noise of the C51 head's noisy layers: factorised Gaussian noise, one number for each input and output of a layer.
-//! It knows no weight and no generator's seed.
+//! The noise of the C51 head's noisy layers: factorised Gaussian noise, one number per input and output of a layer.
+//! This module knows no weights and no seeds.
 //!
 //! Source: Fortunato et al. 2018, section 3.1 (b).
 
@@ -11,11 +11,11 @@ use crate::init::normals;
 /// One draw of the noise of all noisy layers of a head.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeadNoise {
-    /// In the order of the head's layers.
+    /// One entry per layer, in the order of the head's layers.
     layers: Vec<LayerNoise>,
 }
 
-/// f(eps) of one layer, f(x) = sgn(x) sqrt|x|: its weight's noise is the product of an output's and an input's, its bias's the output's.
+/// f(eps) of one layer, with f(x) = sgn(x) sqrt|x|. A weight's noise is its output's times its input's, a bias's is its output's.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct LayerNoise {
     pub(crate) inputs: Vec<f64>,
@@ -23,20 +23,20 @@ pub(crate) struct LayerNoise {
 }
 
 impl HeadNoise {
-    /// Draws noise for the head of `config`; none if it has no noisy layer.
+    /// Draws noise for the head of `config`; `None` if the head has no noisy layer.
     pub fn draw(config: &ModelConfig, rng: &mut ChaCha8Rng) -> Option<Self> {
         let drawn = Self::of_normals(config, |_, _, len| Ok::<_, ()>(normals(len, rng)));
         drawn.unwrap_or_default()
     }
 
-    /// The noise that `normals` make, standard normal numbers: of a layer's name, `in` or `out`, as many as there are such; none for
-    /// a head without noisy layers.
+    /// Builds noise from standard normal numbers. `normals` receives a layer's name, `in` or `out`, and the
+    /// count, and returns the numbers. Returns `None` for a head without noisy layers.
     ///
     /// # Errors
-    /// The first of `normals`.
+    /// The first error of `normals`.
     ///
     /// # Panics
-    /// If they are more or fewer.
+    /// If `normals` returns another count.
     pub fn of_normals<E>(
         config: &ModelConfig,
         mut normals: impl FnMut(&str, &str, usize) -> Result<Vec<f64>, E>,
@@ -60,12 +60,12 @@ impl HeadNoise {
         Ok(Some(Self { layers }))
     }
 
-    /// The noise of the head's layer with this number.
+    /// Returns the noise of the head's layer with this index.
     pub(crate) fn of_layer(&self, number: usize) -> &LayerNoise {
         &self.layers[number]
     }
 
-    /// The noise of the weight [out, in] and of the bias [out] of the head's layer with this number.
+    /// Returns the noise of the weight [out, in] and the bias [out] of the head's layer with this index.
     pub fn of_parameters(&self, number: usize) -> (Vec<f64>, Vec<f64>) {
         let LayerNoise { inputs, outputs } = self.of_layer(number);
         let mut weight = Vec::with_capacity(inputs.len() * outputs.len());
@@ -83,7 +83,7 @@ mod tests {
     use super::*;
     use crate::HeadConfig;
 
-    /// f(eps) has mean 0 and E f^2 = E|eps| = sqrt(2 / pi); that of a product of two is their product, and both layers are drawn apart.
+    /// f(eps) has mean 0 and E f^2 = E|eps| = sqrt(2 / pi). Moments of a product are products of moments. Layers are independent.
     #[test]
     fn it_has_the_moments_of_the_paper_s_noise() {
         let config = ModelConfig {

@@ -1,9 +1,9 @@
-//! The parameters of the C51 head, and the one linear layer that they amount to.
-//! It applies no layer.
+//! The parameters of the C51 head, and their reduction to one linear layer.
+//! This module applies no layer.
 //!
-//! Both streams of a dueling head are linear in the same relu(f4), so V + A - mean_a A is a linear layer too, whose weight is made of
-//! theirs in the same way; and a noisy layer is mu + sigma * eps before it is anything. The layer is made once a pass, whatever the
-//! number of rows, and from there on any head costs what a plain one does: of the actions taken alone if that is all that is asked for.
+//! Both streams of a dueling head are linear in the same relu(f4). So V + A - mean_a A is a linear layer too, and its weight is
+//! the same combination of the streams' weights. A noisy layer is mu + sigma * eps. The layer is built once a pass, whatever
+//! the number of rows. Every head then costs as much as a plain one, also if only the logits of the taken actions are computed.
 
 use candle_core::{D, Tensor};
 
@@ -13,7 +13,7 @@ use crate::heads::noise::HeadNoise;
 use crate::layers::Layer;
 use crate::parameters::Parameters;
 
-/// A layer of the head: what it is without noise, and what scales its noise if it is a noisy one.
+/// A layer of the head: its mean, and the scale of its noise if it is noisy.
 #[derive(Debug)]
 pub(crate) struct HeadLayer<T> {
     pub(crate) mean: Layer<T>,
@@ -21,8 +21,8 @@ pub(crate) struct HeadLayer<T> {
 }
 
 impl<T> HeadLayer<T> {
-    /// The layers of the head of `config`: the value's and the advantage's of a dueling head, else one. `take` gives a parameter by
-    /// its layer's name and its own.
+    /// Collects the layers of the head of `config`: value and advantage if dueling, else one. `take` returns
+    /// a parameter by the layer's name and the parameter's, such as `weight_mu`.
     pub(crate) fn all<E>(
         config: &ModelConfig,
         mut take: impl FnMut(&str, &str) -> std::result::Result<T, E>,
@@ -48,7 +48,7 @@ impl<T> HeadLayer<T> {
 }
 
 impl HeadLayer<Tensor> {
-    /// mu + sigma * eps, of the noise of the head's layer with this number; mu without noise.
+    /// Returns mu + sigma * eps for the head's layer with this index, or mu without noise.
     fn with_noise(&self, noise: Option<&HeadNoise>, number: usize) -> Result<Layer<Tensor>> {
         let (Some(noise), Some(sigma)) = (noise, &self.sigma) else {
             if noise.is_some() {
@@ -84,8 +84,8 @@ impl Streams {
         })
     }
 
-    /// The layer of A * N outputs that they amount to with this noise, or without; of a plain head its own, whose parameters then are
-    /// variables.
+    /// Reduces the head to one layer of A * N outputs, with or without noise. For a plain head without noise,
+    /// this is the head's layer itself, whose parameters are variables.
     pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Result<Layer<Tensor>> {
         let first = self.layers[0].with_noise(noise, 0)?;
         let Some(advantage) = self.layers.get(1) else {
@@ -100,9 +100,9 @@ impl Streams {
     }
 }
 
-/// V + A - mean_a A of outputs: `value` [N, in], `advantage` [A * N, in], result [A * N, in].
+/// Computes V + A - mean_a A of outputs: `value` [N, in], `advantage` [A * N, in], result [A * N, in].
 ///
-/// Source: Wang et al. 2016, equation 9, for each atom.
+/// Source: Wang et al. 2016, equation 9, per atom.
 fn dueling(value: &Tensor, advantage: &Tensor, atoms: usize) -> candle_core::Result<Tensor> {
     let (outputs, inputs) = advantage.dims2()?;
     let by_action = advantage.reshape((outputs / atoms, atoms, inputs))?;

@@ -1,5 +1,5 @@
-//! 3 x 3 convolutions with a border of zeros, forward and backward, as unpadded ones of images that have the border in memory.
-//! It knows neither tensors nor threads, and nothing of what comes between two convolutions.
+//! 3 x 3 convolutions with padding 1, forward and backward, as unpadded convolutions of images stored with their border of zeros.
+//! This module knows neither tensors nor threads, and nothing of what comes between two convolutions.
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::{ALIGNMENT, Buffer};
@@ -11,33 +11,33 @@ use crate::kernels::isa::{Element, Mode, Simd, vectorized};
 use crate::kernels::linear::relu_of;
 use crate::kernels::rounding::{store, store_bytes};
 
-/// What is put into a border.
+/// The content that is written inside a border.
 #[derive(Clone, Copy)]
 pub(crate) enum Inside<'a> {
-    /// Pixels, which products scale.
+    /// Pixels. Products with them are scaled afterwards, by `Element::BYTE_SCALE`.
     Bytes(&'a [u8]),
-    /// Maps as they are.
+    /// Maps, unchanged.
     Maps(&'a [f32]),
     /// max(x, 0) of maps.
     Active(&'a [f32]),
 }
 
-/// Of a shape that is one of [`ConvShape::bordered`]: its input in memory, with a border of zeros, a pixel wide.
+/// Methods of shapes from [`ConvShape::bordered`]: the input in memory, with a border of zeros one pixel wide.
 impl ConvShape {
-    /// Scalars of an input: where a row of a window is an odd number of them, products of pairs read a zero behind the last one.
-    /// Whole lines of the cache, so that what lies behind begins with one.
+    /// Returns the scalars of an input in memory. If a window's row has an odd number of scalars, products of pairs read a
+    /// zero behind the last one. The length is a whole number of cache lines, so that the next input begins on one.
     pub(crate) fn bordered_len<E: Element>(&self) -> usize {
         let all = self.image_len() + E::DEPTH - 1;
         all.next_multiple_of(ALIGNMENT / size_of::<E>())
     }
 
-    /// Row `y` of the maps inside the border.
+    /// Returns the range of row `y` of the maps inside the border.
     pub(crate) const fn inside(&self, y: usize) -> std::ops::Range<usize> {
         let start = ((y + 1) * self.width + 1) * self.channels_in;
         start..start + (self.width - 2) * self.channels_in
     }
 
-    /// Writes the zeros.
+    /// Writes the zeros of the border.
     pub(crate) fn clear_border<E: Element>(&self, room: &mut [E]) {
         let mut end = 0;
         for y in 0..self.height - 2 {
@@ -47,7 +47,7 @@ impl ConvShape {
         room[end..].fill(E::default());
     }
 
-    /// Writes the zeros, and `inside` between them.
+    /// Writes the zeros of the border, and `inside` between them.
     pub(crate) fn put_inside<S: Simd>(&self, simd: S, inside: Inside<'_>, room: &mut [S::Element]) {
         self.clear_border(room);
         let len = (self.width - 2) * self.channels_in;
@@ -63,7 +63,7 @@ impl ConvShape {
 }
 
 vectorized! {
-    /// Rounds max(x, 0) of `floats` into `values`, which is as long.
+    /// Rounds max(x, 0) of `floats` into `values`, which has the same length.
     pub(crate) fn store_active<S, M>(simd, floats: &'a [f32], values: &'a mut [M]) {
         for (value, &float) in values.iter_mut().zip(floats) {
             *value = M::of(relu_of(float));
@@ -71,16 +71,16 @@ vectorized! {
     }
 }
 
-/// A convolution with its parameters as the kernels want them.
+/// A convolution with padding 1, its parameters packed for the kernels.
 pub(crate) struct BorderedConvolution<E: Element> {
     forward: Convolution<E>,
-    /// What turns the gradient of its output into that of its input: the same with each kernel turned by 180 degrees.
+    /// Turns the output's gradient into the input's: in and out are swapped, and each kernel is rotated by 180 degrees.
     backward: Option<Convolution<E>>,
 }
 
 impl<E: Element> BorderedConvolution<E> {
-    /// `shape` is one of [`ConvShape::bordered`], `weight` [out, in, 3, 3], `bias` [out]; `backward` says whether its input will need
-    /// a gradient.
+    /// `shape` is from [`ConvShape::bordered`]; `weight` [out, in, 3, 3], `bias` [out]. `backward` says
+    /// whether the input needs a gradient.
     pub(crate) fn new<S: Simd<Element = E>>(
         simd: S,
         shape: ConvShape,
@@ -111,7 +111,7 @@ impl<E: Element> BorderedConvolution<E> {
         &self.forward.bias
     }
 
-    /// Convolves an image in its border, row by row: `then` gets the number of each row and its sums [width, out], without bias.
+    /// Convolves an image with its border, row by row: `then` receives each row's index and its sums [width, out], without bias.
     pub(crate) fn forward<S: Simd<Element = E>>(
         &self,
         simd: S,
@@ -122,10 +122,10 @@ impl<E: Element> BorderedConvolution<E> {
         multiply_windows(simd, &self.forward, image, &mut row, then);
     }
 
-    /// The gradient of an image, row by row as [`BorderedConvolution::forward`], for that of its map, `grad_map` [height, width, out].
+    /// Computes the gradient of an image from its map's, `grad_map` [height, width, out], row by row as [`BorderedConvolution::forward`].
     ///
     /// # Panics
-    /// If it was not made for that.
+    /// If the convolution was built without `backward`.
     pub(crate) fn image_gradient<S: Simd<Element = E>>(
         &self,
         simd: S,
@@ -142,8 +142,8 @@ impl<E: Element> BorderedConvolution<E> {
         multiply_windows(simd, backward, &room, &mut row, then);
     }
 
-    /// Adds the gradients of weight [3, 3, in, out] and bias [out] for an image in its border, whose scale the weight's does not have
-    /// yet, and the gradient of its map.
+    /// Adds the gradients of weight [3, 3, in, out] and bias [out] for an image with its border and the
+    /// gradient of its map. The weight's gradient is not yet multiplied by the image's scale.
     pub(crate) fn parameter_gradients<S: Simd<Element = E>>(
         &self,
         simd: S,
@@ -161,7 +161,7 @@ impl<E: Element> BorderedConvolution<E> {
     }
 }
 
-/// `weight` [out, in, 3, 3] as [in, out, 3, 3], each kernel turned by 180 degrees.
+/// Reorders `weight` [out, in, 3, 3] to [in, out, 3, 3] and rotates each kernel by 180 degrees.
 fn turned(shape: &ConvShape, weight: &[f32]) -> Vec<f32> {
     let (inputs, taps) = (shape.channels_in, shape.kernel * shape.kernel);
     let mut turned = Vec::with_capacity(weight.len());

@@ -1,4 +1,4 @@
-//! Memory that is used again: buffers which return to a pool instead of the allocator.
+//! Recycled memory: buffers that return to a pool instead of the allocator.
 //! Fresh memory costs a page fault every 4 KiB, which would take a third of a forward pass.
 
 use std::ops::{Deref, DerefMut};
@@ -6,14 +6,14 @@ use std::sync::{Mutex, PoisonError};
 
 use half::bf16;
 
-/// Where a buffer begins is a multiple of so many bytes, a line of a cache: AMX takes six times as long for rows that cross lines.
+/// Alignment of a buffer in bytes: one cache line. AMX takes six times as long for rows that cross cache lines.
 pub(crate) const ALIGNMENT: usize = 64;
-/// Buffers that the pool of each type keeps; more go back to the allocator.
+/// Largest number of free buffers in each type's pool. Beyond it, the smallest one returns to the allocator.
 const KEPT_MAX: usize = 1024;
 
-/// Scalars that a pool holds.
+/// A scalar type with a buffer pool.
 pub(crate) trait Pooled: Copy + Default + 'static {
-    /// The type's pool, in ascending order of capacity.
+    /// Returns the type's pool, in ascending order of capacity.
     fn pool() -> &'static Mutex<Vec<Vec<Self>>>;
 }
 
@@ -30,29 +30,29 @@ macro_rules! pooled {
 
 pooled!(f32 bf16 u8);
 
-/// A slice of memory from the pool, to which it returns.
+/// A slice of memory from the pool, which returns there when dropped.
 pub(crate) struct Buffer<T: Pooled> {
     memory: Vec<T>,
-    /// The first scalar at a multiple of `ALIGNMENT`.
+    /// Index in `memory` of the first scalar at a multiple of `ALIGNMENT`.
     start: usize,
     len: usize,
 }
 
 impl<T: Pooled> Buffer<T> {
-    /// `len` scalars, with what the last user left in them.
+    /// Takes a buffer of `len` scalars with arbitrary old content.
     pub(crate) fn new(len: usize) -> Self {
         let most = len + ALIGNMENT / size_of::<T>();
         let mut pool = T::pool().lock().unwrap_or_else(PoisonError::into_inner);
         let fitting = pool.partition_point(|memory| memory.len() < most);
         let memory = (fitting < pool.len()).then(|| pool.remove(fitting));
         drop(pool);
-        // A little more than asked for, so that the next a little longer fits too.
+        // A little larger than requested, so that it also serves slightly longer requests.
         let memory = memory.unwrap_or_else(|| vec![T::default(); most + len / 8]);
         let start = memory.as_ptr().align_offset(ALIGNMENT);
         Self { memory, start, len }
     }
 
-    /// `len` scalars of 0.
+    /// Takes a buffer of `len` zeros.
     pub(crate) fn zeros(len: usize) -> Self {
         let mut buffer = Self::new(len);
         buffer.fill(T::default());
@@ -81,13 +81,13 @@ impl<T: Pooled> Drop for Buffer<T> {
         let place = pool.partition_point(|kept| kept.len() < memory.len());
         pool.insert(place, memory);
         if pool.len() > KEPT_MAX {
-            // The smallest is the cheapest to make anew.
+            // The smallest is the cheapest to allocate again.
             drop(pool.remove(0));
         }
     }
 }
 
-/// Scalars where they are, or a copy of them.
+/// Scalars borrowed in place, or a copy.
 pub(crate) enum Scalars<'a, T: Pooled> {
     InPlace(&'a [T]),
     Copied(Buffer<T>),

@@ -1,8 +1,8 @@
-//! The network's layers as compositions of candle's own operations, for devices that this project has no kernels for.
-//! Same arguments, results and gradients as in `conv`, `linear`, `impala`, `grouped` and `dots`; only shapes are checked there and not here.
+//! The network's layers as compositions of candle's operations, for devices without kernels of this project.
+//! Arguments, results and gradients are those of `conv`, `linear`, `impala`, `grouped` and `dots`. Only those modules check shapes.
 //!
-//! candle's convolution has a naive backward pass on every device. A convolution here is a matrix product of patches with the
-//! kernel, so that its gradients are matrix products too.
+//! candle's convolution has a naive backward pass on every device. Here a convolution is a matrix product of
+//! patches with the kernel, so its gradients are matrix products too.
 
 use candle_core::{DType, Result, Tensor};
 
@@ -11,7 +11,7 @@ use crate::geometry::{STAGE_CONVOLUTIONS, pooled};
 /// Weight [out, in, k, k], bias [out] and stride of a convolution.
 pub(crate) type ConvLayerTensors<'a> = (&'a Tensor, &'a Tensor, usize);
 
-/// Weight [out, in, 3, 3] and bias [out] of a convolution with a border of zeros.
+/// Weight [out, in, 3, 3] and bias [out] of a convolution with zero padding.
 pub(crate) type BorderedTensors<'a> = (&'a Tensor, &'a Tensor);
 
 /// As `conv::conv_stack`: images [B, H, W, C] to maps [B, h, w, c].
@@ -23,7 +23,7 @@ pub(crate) fn conv_stack(images: &Tensor, layers: &[ConvLayerTensors<'_>]) -> Re
     Ok(maps)
 }
 
-/// Bytes as floats from 0 to 1; floats as they are.
+/// Scales bytes to floats from 0 to 1, and returns floats unchanged.
 fn scaled(images: &Tensor) -> Result<Tensor> {
     match images.dtype() {
         DType::U8 => images.to_dtype(DType::F32)?.affine(1.0 / 255.0, 0.0),
@@ -44,16 +44,16 @@ pub(crate) fn residual_stages(images: &Tensor, layers: &[BorderedTensors<'_>]) -
     relu(&x)
 }
 
-/// A 3 x 3 convolution of images [B, H, W, in] with a border of zeros, without ReLU.
+/// A 3 x 3 convolution of images [B, H, W, in] with zero padding, without ReLU.
 fn bordered(images: &Tensor, (weight, bias): BorderedTensors<'_>) -> Result<Tensor> {
     let images = images.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
     conv2d(&images, weight, bias, 1)
 }
 
-/// As `pool::pool`: the largest of 3 x 3 windows at a distance of 2, the first of equal ones; maps [B, H, W, C].
+/// As `pool::pool`: a 3 x 3 max pool of stride 2 on maps [B, H, W, C]. Of equal values the first is taken.
 ///
-/// Between borders of minus infinity the maps are cut into blocks of 2 x 2 pixels: a window's pixels are then the same place of each of
-/// four neighbouring blocks, at most.
+/// The maps, padded with minus infinity, are cut into blocks of 2 x 2 pixels. Pixel (row, col) of every
+/// window then has the same place in its block. A window touches four neighbouring blocks.
 fn max_pool(maps: &Tensor) -> Result<Tensor> {
     let (batch, height, width, channels) = maps.dims4()?;
     let (rows, cols, _) = pooled((height, width, channels));
@@ -101,7 +101,7 @@ pub(crate) fn linear(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {
     y.reshape(shape)
 }
 
-/// As `grouped::grouped_linear`: the whole layer, of which a row keeps its group.
+/// As `grouped::grouped_linear`: computes the whole layer and keeps one group per row.
 pub(crate) fn grouped_linear(
     x: &Tensor,
     w: &Tensor,
@@ -118,7 +118,7 @@ pub(crate) fn grouped_linear(
     all.gather(&groups, 1)?.squeeze(1)
 }
 
-/// max(x, 0), whose gradient at exactly 0 is 0, unlike that of candle's `relu`; it keeps NaN.
+/// max(x, 0). Its gradient at exactly 0 is 0, unlike that of candle's `relu`. It keeps NaN.
 pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
     let above = x.gt(0f32)?.to_dtype(x.dtype())?.detach();
     x * above
@@ -139,7 +139,7 @@ fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Res
     let (batch, height, width, _) = images.dims4()?;
     let (outputs, _, kernel, _) = weight.dims4()?;
     if !kernel.is_multiple_of(stride) {
-        // Backwards, candle takes both sides for reached as far as the height is.
+        // candle's backward pass computes the covered width from the height, so uncovered pixels are cut off first.
         let reached = |side: usize| (side - kernel) / stride * stride + kernel;
         let maps = images
             .narrow(1, 0, reached(height))?
@@ -156,10 +156,10 @@ fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Res
     linear(&patches, &as_patches(weight, stride)?, bias)?.reshape((batch, rows, cols, outputs))
 }
 
-/// The patches [B * h * w, k * k * c] under each output of a convolution with a kernel of `blocks` strides.
+/// Returns the patches [B * h * w, k * k * c] under each output of a convolution whose kernel is `blocks` strides wide.
 ///
-/// The image is cut into blocks of stride x stride pixels; a patch is `blocks` x `blocks` neighbouring ones. Its numbers are in
-/// the order block row, block column, row, column, channel.
+/// The image is cut into blocks of stride x stride pixels; a patch is `blocks` x `blocks` neighbouring
+/// blocks. A patch's scalars are in the order block row, block column, row, column, channel.
 fn patches(
     images: &Tensor,
     (rows, cols): (usize, usize),
@@ -186,7 +186,7 @@ fn patches(
     Tensor::cat(&neighbours, 3)?.reshape((batch * rows * cols, blocks * blocks * block_len))
 }
 
-/// A kernel [out, in, k, k] as a matrix [out, k * k * in], in the order of [`patches`].
+/// Reorders a kernel [out, in, k, k] to a matrix [out, k * k * in], in the order of [`patches`].
 fn as_patches(weight: &Tensor, stride: usize) -> Result<Tensor> {
     let (outputs, inputs, kernel, _) = weight.dims4()?;
     let blocks = kernel / stride;

@@ -1,9 +1,9 @@
-//! A stack of convolutions as one candle operation with gradients, its batch split over the rayon pool.
-//! It supports what the torso needs: the CPU, square kernels, no padding, no dilation, always bias and ReLU.
+//! A stack of convolutions as one candle operation with gradients. The batch is split over the rayon pool.
+//! It supports only what the torso needs: CPU, square kernels, no padding, no dilation, always bias and ReLU.
 //!
-//! candle's own backward pass is about 10 times slower on the CPU: it has no matrix product for the image's gradient, a
-//! single thread for the bias's, and it always computes both. The layers are one operation because candle adds every
-//! gradient to fresh zeros; here the maps between layers, and their gradients, stay in the cache of the core at work.
+//! candle's own backward pass is about 10 times slower on the CPU. It has no matrix product for the image's gradient, sums
+//! the bias's on one thread, and always computes both. The layers are one operation because candle adds every gradient to
+//! fresh zeros. Here the maps between layers, and their gradients, stay in the cache of the core that computes them.
 
 use candle_core::{DType, Result, Tensor, bail};
 
@@ -16,7 +16,7 @@ use crate::kernels::stack::{SavedActivations, Stack};
 use crate::kernels::tasks::Tasks;
 use crate::kernels::tensors::{Input, cpu, values_of};
 
-/// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
+/// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
 const TASK_IMAGES: usize = 16;
 
 /// relu(conv2d(images, weight) + bias) without padding: [`conv_stack`] of one layer.
@@ -32,11 +32,11 @@ pub fn conv2d_relu(
 
 /// Convolutions without padding, each with bias and ReLU, differentiable in all floating-point arguments.
 ///
-/// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias [out]
-/// f32, stride) and turns [B, h, w, in] into [B, (h - k) / stride + 1, (w - k) / stride + 1, out], channels last. Where an
-/// output is 0 its gradient is 0, as in PyTorch. Operands of products, and maps between layers, are rounded to `precision`.
-/// Each result of a layer and each gradient of its parameters is right to [`Precision::product_error`] of what it is the sum of.
-/// Results and gradients have the same bits whatever the number of threads.
+/// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias
+/// [out] f32, stride) and turns [B, h, w, in] into [B, (h - k) / stride + 1, (w - k) / stride + 1, out], channels
+/// last. The gradient at an output of exactly 0 is 0, as in PyTorch. Operands of products, and maps between layers,
+/// are rounded to `precision`. The error of each layer's result, and of each parameter's gradient, is at most
+/// [`Precision::product_error`] given its inputs. Their bits do not depend on the number of threads.
 ///
 /// # Errors
 /// No layer, shapes that do not match, a kernel that is not square or larger than its input, a stride of 0, other types.
@@ -54,7 +54,7 @@ pub fn conv_stack(
     })
 }
 
-/// The shapes of `layers` on `images`, and their parameters, which are small, as one vector: an operation has at most three arguments.
+/// Returns the shapes of `layers` on `images`, and all parameters as one vector, because an operation has at most three arguments.
 pub(crate) fn stack_of(
     images: &Tensor,
     layers: &[ConvLayerTensors<'_>],
@@ -87,9 +87,9 @@ pub(crate) fn stack_of(
 /// Convolutions on a batch of images.
 pub(crate) struct ConvStack<S: Simd> {
     pub(crate) simd: S,
-    /// At least one.
+    /// The shapes of the layers, at least one.
     pub(crate) shapes: Vec<ConvShape>,
-    /// Images of the batch.
+    /// The number of images in the batch.
     pub(crate) count: usize,
 }
 
@@ -98,7 +98,7 @@ impl<S: Simd> ConvStack<S> {
         &self.shapes[self.shapes.len() - 1]
     }
 
-    /// The layers of `parameters` for a pass forward, or backward; `images` says whether these will need a gradient.
+    /// Prepares the layers of `parameters` for a forward pass, or for a `backward` pass. `images` says whether the images need a gradient.
     pub(crate) fn layers(&self, parameters: &[f32], backward: bool, images: bool) -> Stack<S> {
         Stack::new(self.simd, &self.shapes, parameters, backward, images)
     }
@@ -116,7 +116,7 @@ impl<S: Simd> ConvStack<S> {
 impl<S: Simd> Operation<2> for ConvStack<S> {
     const NAME: &'static str = "conv-stack";
 
-    /// Of each task, the maps of all layers but the last.
+    /// The maps of all layers but the last, for each task.
     type Kept = Vec<SavedActivations<S::Element>>;
 
     fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {

@@ -1,9 +1,9 @@
-//! Convolution with bias and ReLU over a few images, forward and backward, as products of windows that are read in place.
-//! It knows neither tensors nor threads: callers split the batch.
+//! Convolution with bias and ReLU over a few images, forward and backward, as matrix products of windows that are read in place.
+//! This module knows neither tensors nor threads: callers split the batch.
 //!
-//! Images and maps are channels-last, so a window is one run of kernel * channels_in scalars for each row of the kernel, and
-//! windows beside each other lie stride * channels_in scalars apart: a tile's rows, without a copy of any window. The gradient
-//! of an image is added straight to the windows it came from.
+//! Images and maps are channels-last. So each row of a window is one run of kernel * channels_in scalars, and
+//! neighbouring windows lie stride * channels_in scalars apart. Windows are thus a tile's rows, and no window
+//! is copied. The gradient of an image is added directly to the windows it came from.
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
@@ -24,12 +24,12 @@ impl ConvShape {
         self.kernel * self.channels_in
     }
 
-    /// Scalars from a window to its right neighbour.
+    /// Scalars from a window to its neighbour on the right.
     pub(crate) fn shift(&self) -> usize {
         self.stride * self.channels_in
     }
 
-    /// Weight [out, in, k, k] as [k, k, in, out]: the matrix that windows are multiplied by.
+    /// Reorders the weight [out, in, k, k] to [k, k, in, out], the matrix that multiplies windows.
     fn pack_weight(&self, weight: &[f32]) -> Vec<f32> {
         let (taps, inputs) = (self.kernel * self.kernel, self.channels_in);
         let mut packed = vec![0.0; weight.len()];
@@ -43,7 +43,7 @@ impl ConvShape {
         packed
     }
 
-    /// The inverse of `pack_weight`, into `weight`.
+    /// The inverse of `pack_weight`; writes into `weight`.
     pub(crate) fn unpack_weight(&self, packed: &[f32], weight: &mut [f32]) {
         let (taps, inputs) = (self.kernel * self.kernel, self.channels_in);
         for (out, weight) in weight.chunks_exact_mut(inputs * taps).enumerate() {
@@ -58,14 +58,14 @@ impl ConvShape {
     }
 }
 
-/// One convolution with its parameters as the kernels want them.
+/// One convolution, its parameters packed for the kernels.
 pub(crate) struct Convolution<E: Element> {
     pub(crate) shape: ConvShape,
-    /// Of the product window x weight: every row of the kernel begins with a new step.
+    /// Right operand of window x weight. Every row of the kernel begins with a new step.
     forward: Panels<E>,
-    /// Of the product gradient x weight, for each row of the kernel; there if images get a gradient.
+    /// Right operands of gradient x weight, one for each row of the kernel. Empty if the images need no gradient.
     backward: Vec<Panels<E>>,
-    /// For every location of a row: [out_width, out].
+    /// The bias repeated for every location of a row: [out_width, out].
     pub(crate) bias: Vec<f32>,
 }
 
@@ -97,7 +97,7 @@ impl<E: Element> Convolution<E> {
     }
 }
 
-/// maps = relu(conv(images, weight) + bias), as `maps` [n, out_height, out_width, out] stores them.
+/// Computes relu(conv(images, weight) + bias) into `maps` [n, out_height, out_width, out].
 pub(crate) fn forward<S: Simd, M: Element>(
     simd: S,
     layer: &Convolution<S::Element>,
@@ -107,7 +107,7 @@ pub(crate) fn forward<S: Simd, M: Element>(
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
     let (mut room, mut row) = (Room::new(), Buffer::new(out_width * out));
-    // Where a run is odd, the last step of the last window reads one scalar further, times 0.
+    // If a run is odd, the last step of the last window reads one scalar beyond the image and multiplies it by 0.
     let len = (shape.image_len(), shape.run() % S::Element::DEPTH);
     for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
         let image = images.image(simd, index, len, &mut room);
@@ -120,8 +120,8 @@ pub(crate) fn forward<S: Simd, M: Element>(
     }
 }
 
-/// Multiplies the windows of one image by the weight, row by row: `then` gets the number of each row of the map and its sums
-/// [out_width, out], which are in `row`. Where a run is odd, an image may have to have a scalar more.
+/// Multiplies the windows of one image by the weight, row by row. `then` receives the index of each row of the map
+/// and its sums [out_width, out], stored in `row`. If a run is odd, the image needs one more scalar in bf16.
 #[inline(always)]
 pub(crate) fn multiply_windows<S: Simd>(
     simd: S,
@@ -152,7 +152,7 @@ pub(crate) fn multiply_windows<S: Simd>(
 }
 
 vectorized! {
-    /// relu(scale * row + bias), there and rounded into `maps`.
+    /// Computes relu(scale * row + bias) in place, and stores it in `maps`, rounded.
     pub(crate) fn finish_row<S, M>(
         simd,
         row: &'a mut [f32],
@@ -167,9 +167,9 @@ vectorized! {
     }
 }
 
-/// The gradients of `forward` for `grad_maps` [n, out_h, out_w, out], one image or more, whose entries count only where `maps` is above
-/// 0, as in PyTorch. Those of the weight [k, k, in, out], still to be multiplied by the images' scale, and the bias [out] are written into
-/// `packed` and `bias`; the images' [n, height, width, in] are added to `grad_images`, where they are wanted.
+/// Computes the gradients of `forward` for `grad_maps` [n, out_h, out_w, out], n >= 1. Entries count only where `maps` is above
+/// 0, as in PyTorch. The gradients of weight [k, k, in, out], not yet multiplied by the images' scale, and bias [out] overwrite
+/// `packed` and `bias`. The gradient of the images [n, height, width, in] is added to `grad_images`, if that is wanted.
 pub(crate) fn backward<S: Simd, M: Element>(
     simd: S,
     layer: &Convolution<S::Element>,
@@ -181,7 +181,7 @@ pub(crate) fn backward<S: Simd, M: Element>(
 ) {
     let (shape, len) = (&layer.shape, layer.shape.image_len());
     let (map_len, out) = (shape.map_len(), shape.channels_out);
-    // One image's gradients where its maps are above 0, [locations, out], and as the operands of two products.
+    // One image's gradients, 0 where its map is 0, as [locations, out] and as operands of two products.
     let mut masked = Buffer::<f32>::new(map_len);
     let stride = out.next_multiple_of(S::Element::DEPTH);
     let mut rows = Buffer::<S::Element>::new(shape.locations() * stride);
@@ -205,7 +205,7 @@ pub(crate) fn backward<S: Simd, M: Element>(
 }
 
 vectorized! {
-    /// The gradients before a ReLU that gave `active`.
+    /// Computes the gradients before a ReLU whose output was `active`.
     pub(crate) fn pass_active<S, M>(simd, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, active), &grad) in to.iter_mut().zip(active).zip(grads) {
             *to = relu_gradient(active.value(), grad);
@@ -240,14 +240,14 @@ fn add_channels<const N: usize>(map: &[f32], first: usize, out: usize, sums: &mu
     sums[first..][..N].copy_from_slice(&each);
 }
 
-/// Memory for the panels of an image's gradients.
+/// Allocates panels for the gradient of one image's map.
 pub(crate) fn gradient_panels<S: Simd>(simd: S, shape: &ConvShape) -> Panels<S::Element> {
     let steps = shape.out_height() * shape.out_width().div_ceil(S::Element::DEPTH);
     Panels::new(simd, steps, shape.channels_out)
 }
 
-/// One image's part of the weight's gradient: windows, transposed, times the gradients `grad_map` [locations, out], for which `panels`
-/// is room from [`gradient_panels`]. `image` is from [`Images::steps`].
+/// Computes one image's part of the weight's gradient: transposed windows times the gradient `grad_map`
+/// [locations, out]. `panels` is scratch memory from [`gradient_panels`], `image` is from [`Images::steps`].
 pub(crate) fn weight_gradient<S: Simd>(
     simd: S,
     shape: &ConvShape,
@@ -277,7 +277,7 @@ pub(crate) fn weight_gradient<S: Simd>(
     }
 }
 
-/// Adds the gradient of one image: masked gradients times the weight, each to the window it belongs to.
+/// Adds the gradient of one image: the masked gradients times the weight, each added to its window.
 fn image_gradient<S: Simd>(
     simd: S,
     layer: &Convolution<S::Element>,

@@ -1,5 +1,5 @@
-//! A fully connected layer as an actor applies it, on slices, on the calling thread.
-//! It has no gradient; `linear` is the layer with one.
+//! A fully connected layer for an actor: on slices, on the calling thread.
+//! It has no gradient; `linear` has one.
 
 use crate::kernels::bordered::store_active;
 use crate::kernels::buffer::Buffer;
@@ -15,13 +15,13 @@ pub(crate) struct Dense<S: Simd> {
     inputs: usize,
 }
 
-/// A layer on what passes a ReLU first, whatever multiplies it.
+/// A fully connected layer after a ReLU, for any instruction set.
 pub(crate) trait ActiveLayer: Send + Sync {
-    /// [n, out] of relu(`hidden`) [n, in].
+    /// Computes [n, out] from relu(`hidden`) [n, in].
     fn forward_active(&self, hidden: &[f32]) -> Buffer<f32>;
 }
 
-/// The layer for the fastest instruction set of this processor.
+/// Builds the layer for the fastest instruction set of this processor.
 pub(crate) fn active_layer(
     precision: Precision,
     Layer { weight, bias }: Layer<Vec<f32>>,
@@ -39,7 +39,7 @@ impl<S: Simd> ActiveLayer for Dense<S> {
 }
 
 impl<S: Simd> Dense<S> {
-    /// `weight` [out, in], `bias` [out].
+    /// Builds a layer of `weight` [out, in] and `bias` [out].
     fn new(simd: S, weight: &[f32], bias: Vec<f32>) -> Self {
         let inputs = weight.len() / bias.len();
         let weight = Matrix::new(weight, bias.len(), inputs).transposed();
@@ -51,8 +51,8 @@ impl<S: Simd> Dense<S> {
         }
     }
 
-    /// A layer of `weight` [out, in] and `bias` [out] on maps of `channels`, whose inputs are row, column, channel here, and channel, row,
-    /// column in PyTorch's weight.
+    /// Builds a layer of `weight` [out, in] and `bias` [out] on maps of `channels`. The layer reads inputs in
+    /// the order row, column, channel; PyTorch's weight has channel, row, column.
     pub(crate) fn of_maps(simd: S, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
         let inputs = weight.len() / bias.len();
         let locations = inputs / channels;
@@ -68,12 +68,12 @@ impl<S: Simd> Dense<S> {
         self.inputs
     }
 
-    /// Scalars of a row of inputs, which begins at a whole step.
+    /// Scalars from one row of inputs to the next: `inputs` rounded up to whole steps of `DEPTH`.
     pub(crate) fn row_len(&self) -> usize {
         self.inputs.next_multiple_of(S::Element::DEPTH)
     }
 
-    /// [count, out] of `x` [count, in], rows of [`Dense::row_len`].
+    /// Computes [count, out] of `x` [count, in], whose rows are [`Dense::row_len`] long.
     pub(crate) fn forward(&self, x: &[S::Element], count: usize) -> Buffer<f32> {
         let (outputs, simd) = (self.bias.len(), self.simd);
         let mut y = Buffer::new(count * outputs);
@@ -87,7 +87,7 @@ impl<S: Simd> Dense<S> {
     }
 }
 
-/// Rows of `len` scalars as rows of whole steps.
+/// Pads rows of `len` scalars with zeros to whole steps of `DEPTH`.
 pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
     let stride = len.next_multiple_of(E::DEPTH);
     if stride == len {
@@ -101,7 +101,7 @@ pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> 
     padded
 }
 
-/// relu of `hidden` [rows, cols] as rows of whole steps.
+/// Writes relu(`hidden`) [rows, cols] into rows padded to whole steps of `DEPTH`.
 fn activate<S: Simd>(simd: S, hidden: &[f32], cols: usize, active: &mut [S::Element]) {
     let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
     for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {

@@ -1,7 +1,7 @@
 //! Dot products of every anchor with every candidate, location by location, as one candle operation with gradients.
-//! It makes no score of them; it runs on the CPU only.
+//! This module computes no scores and runs on the CPU only.
 //!
-//! Products are f32 in every precision: gradients of scores that cancel each other would be lost in bf16, and they are few.
+//! Products are f32 in every precision: bf16 would lose gradients of scores that cancel each other, and the products are few.
 
 use candle_core::{Result, Tensor, bail};
 use rayon::prelude::*;
@@ -14,10 +14,10 @@ use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
 use crate::kernels::tensors::{Input, values_of};
 
-/// Dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] where one vector meets every location of the other.
+/// Computes dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] for a vector paired with every location of the other.
 ///
-/// Entry (l, i, j) is psi of row i times phi of row j, at location l. Differentiable in both; all f32. Results and gradients have
-/// the same bits whatever the number of threads.
+/// Entry (l, i, j) is psi of row i times phi of row j at location l. It is differentiable in both; all
+/// tensors are f32. The bits of results and gradients do not depend on the number of threads.
 pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     let sizes = |vectors: &Tensor| match *vectors.dims() {
         [rows, embedding_dim] => Some((rows, 1, embedding_dim)),
@@ -56,7 +56,7 @@ struct DotProducts {
 }
 
 impl DotProducts {
-    /// The vectors [B, R] of location `at` among `vectors` [B, locations, R].
+    /// Returns the vectors [B, R] of location `at` in `vectors` [B, locations, R].
     fn located<'a>(&self, vectors: &'a [f32], locations: usize, at: usize) -> Scalars<'a, f32> {
         if locations == 1 {
             return Scalars::InPlace(vectors);
@@ -76,8 +76,8 @@ impl DotProducts {
         })
     }
 
-    /// For each location the product of `grad` [L, B, B], or of its transposed, with the others' vectors, as the gradient [B, own
-    /// locations, R].
+    /// Multiplies `grad` [L, B, B], or its transpose, by the others' vectors at each location. Returns the
+    /// gradient [B, own locations, R], summed over locations if there is one own location.
     fn gradient(
         &self,
         grad: &[f32],

@@ -1,15 +1,15 @@
 //! Exponentials of many numbers at once, in f64: the soft clip of scores with its slope, and the weights of a softmax.
-//! It sums nothing, so that what is summed has the same bits on every processor.
+//! This module computes no sums, so that sums of its results have the same bits on every processor.
 
 use crate::kernels::isa::{AnySimd, vectorized, with_simd};
 use crate::kernels::precision::Precision;
 
-/// Scores `c tanh(x / c)` of x = `scale` * dot, and their slopes by the dot.
+/// Computes scores `c tanh(x / c)` of x = `scale` * dot, and their derivatives with respect to the dot.
 ///
-/// `dots`, `scores` and `slopes` have one length; the bound c is above 0. With `e = exp(-2 |x| / c)`: `tanh = (1 - e) / (1 + e)`
-/// and its slope `4 e / (1 + e)^2`, which, unlike `1 - tanh^2`, keeps its precision where the score saturates. `1 - e` is taken as
-/// `expm1`, which keeps its own where the bound is far above the score: both results are within a relative 2e-15 for scores
-/// and bounds from 1e-150 to 1e150. A slope below 1e-307 is 0; a NaN gives NaN.
+/// `dots`, `scores` and `slopes` have the same length; the bound c is above 0. With `e = exp(-2 |x| / c)`:
+/// `tanh = (1 - e) / (1 + e)`, and its slope is `4 e / (1 + e)^2`. Unlike `1 - tanh^2`, the slope keeps its precision where the
+/// score saturates. `1 - e` is computed as `expm1`, which keeps its precision if the bound is far above the score. Both results
+/// are within a relative 2e-15 for scores and bounds from 1e-150 to 1e150. A slope below 1e-307 is 0; a NaN gives NaN.
 ///
 /// # Panics
 /// If the lengths differ.
@@ -21,8 +21,8 @@ pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slope
     with_simd!(AnySimd::of(Precision::F32), simd => clip(simd, dots, scale, bound, scores, slopes));
 }
 
-/// Puts `exp(value - max)` in the place of each value, none of which is above `max`: right to a relative 1e-15 beside the rounding
-/// of the difference; 0 below 1e-307; NaN of a NaN.
+/// Replaces each value by `exp(value - max)`; no value may exceed `max`. The relative error is at most 1e-15
+/// in addition to the rounding of the difference. A result below 1e-307 is 0; a NaN gives NaN.
 pub fn exp_below(values: &mut [f64], max: f64) {
     with_simd!(AnySimd::of(Precision::F32), simd => exp_of_differences(simd, values, max));
 }
@@ -54,17 +54,17 @@ vectorized! {
     }
 }
 
-/// Below this the result is 0, so that no step meets a subnormal number.
+/// Below this x, exp(x) is 0, so that no step computes with a subnormal number.
 const LEAST: f64 = -707.0;
-/// Adding it rounds a number of size below 2^51 to an integer, which is then in its lowest bits.
+/// Adding this constant rounds a number of magnitude below 2^51 to an integer, which is then in the sum's lowest bits.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
 /// ln 2 in two parts, the first with so few bits that its multiples up to 1100 are exact.
 const LN_2_HIGH: f64 = f64::from_bits(0x3fe6_2e42_fee0_0000);
 const LN_2_LOW: f64 = f64::from_bits(0x3dea_39ef_3579_3c76);
 
-/// exp(x) and exp(x) - 1 of x <= 0, without a branch, so that loops over it are vectorised.
+/// Computes exp(x) and exp(x) - 1 for x <= 0, without a branch, so that loops over it are vectorised.
 ///
-/// x = k ln 2 + r with |r| <= ln 2 / 2; expm1(r) by its Taylor series, which is 4e-18 off after the 13th power.
+/// x = k ln 2 + r with |r| <= ln 2 / 2. expm1(r) is a Taylor series up to the 13th power, with an error of 4e-18.
 #[inline(always)]
 fn exp_pair(x: f64) -> (f64, f64) {
     let tiny = x < LEAST;
@@ -134,7 +134,7 @@ mod tests {
                 let sech = 1.0 / (x / bound).cosh();
                 prop_assert!(close(score, bound * (x / bound).tanh(), 2e-15), "{dot}: {score}");
                 let slope_wanted = 0.25 * sech * sech;
-                // The argument's rounding is as large as its size.
+                // The relative error of an exponential grows with the magnitude of its argument.
                 let relative = 4e-16 * (4.0 + (2.0 * x / bound).abs());
                 prop_assert!(slope < 1e-300 || close(slope, slope_wanted, relative), "{dot}: {slope}");
             }

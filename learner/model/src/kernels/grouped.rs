@@ -1,8 +1,8 @@
-//! A fully connected layer of which each row wants one group of outputs: the C51 head for the action that a row took.
-//! It knows no network; it runs on the CPU only.
+//! A fully connected layer of which each row needs one group of outputs: the C51 head for the action that the row took.
+//! This module knows no network and runs on the CPU only.
 //!
-//! All other outputs would be computed to be dropped, and their gradients are exactly 0. Rows of one group are put beside each
-//! other, so that each group is one product; sums are taken in the order in which the whole layer takes them.
+//! Other outputs would be dropped after computing, and their gradients are 0. Rows are sorted by group, so that
+//! each group is one product. Each output is summed in the same order as in the whole layer.
 
 use std::ops::Range;
 
@@ -19,10 +19,10 @@ use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
 use crate::kernels::tensors::{Input, values_of};
 
-/// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
+/// Computes y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
 ///
-/// `x` [rows, in]; `w` [groups * out, in]; `b` [groups * out]; result [rows, out]. All f32; operands of products are rounded to
-/// `precision`. Results have the bits that [`super::linear::linear`] gives, whatever the number of threads.
+/// `x` [rows, in]; `w` [groups * out, in]; `b` [groups * out]; result [rows, out]. All f32; operands of products are
+/// rounded to `precision`. Results have the same bits as [`super::linear::linear`], whatever the number of threads.
 pub(crate) fn grouped_linear(
     x: &Tensor,
     w: &Tensor,
@@ -59,9 +59,9 @@ pub(crate) fn grouped_linear(
 }
 
 struct Grouped {
-    /// Rows by group, and within a group in their order.
+    /// Row indices, sorted by group and ascending within a group.
     order: Vec<usize>,
-    /// Where in `order` the rows of each group are.
+    /// The range of each group's rows in `order`.
     parts: Vec<Range<usize>>,
     inputs: usize,
     out: usize,
@@ -69,7 +69,7 @@ struct Grouped {
 }
 
 impl Grouped {
-    /// Rows of `values` by group.
+    /// Copies the rows of `values`, sorted by group.
     fn sort(&self, values: &[f32]) -> Buffer<f32> {
         let mut sorted = Buffer::new(values.len());
         let len = values.len() / self.order.len();
@@ -89,7 +89,7 @@ impl Grouped {
         values
     }
 
-    /// Calls `each` with every group and its rows of `values`, all rows of `len` scalars, on the pool.
+    /// Calls `each` on the pool with every group, its range in `order`, and its rows of `values`, each `len` scalars long.
     fn for_each_part(
         &self,
         mut values: &mut [f32],
@@ -106,7 +106,7 @@ impl Grouped {
         tasks.for_each(|(group, (rows, values))| each(group, rows, values));
     }
 
-    /// A group's rows of a sorted matrix.
+    /// Returns a group's rows of a sorted matrix.
     fn rows<'a>(sorted: &'a [f32], rows: &Range<usize>, len: usize) -> Matrix<'a> {
         Matrix::new(&sorted[rows.start * len..rows.end * len], rows.len(), len)
     }
@@ -138,7 +138,7 @@ impl Grouped {
 impl Operation<3> for Grouped {
     const NAME: &'static str = "grouped-linear";
 
-    /// x by group.
+    /// x, sorted by group.
     type Kept = Buffer<f32>;
 
     fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Kept)> {
@@ -195,7 +195,7 @@ mod tests {
     use crate::kernels::linear::linear;
     use crate::kernels::reference::apart;
 
-    /// What the whole layer gives, of which all but one group a row is dropped.
+    /// Compares with the whole layer, of which one group a row is kept.
     #[test]
     fn it_is_the_whole_layer_s_output_and_gradient_for_each_row_s_group() -> Result<()> {
         const GROUPS: usize = 5;
@@ -210,7 +210,7 @@ mod tests {
             let w = Var::from_vec(values(wide * inputs, 11), (wide, inputs), &Device::Cpu)?;
             let b = Var::from_vec(values(wide, 5), wide, &Device::Cpu)?;
             let slope = Tensor::from_vec(values(rows * out, 13), (rows, out), &Device::Cpu)?;
-            // Group 3 never occurs, group 0 in most rows.
+            // Group 3 never occurs, group 0 in half of the rows.
             let groups: Vec<u8> = (0..rows).map(|row| [0, 4, 0, 1, 0, 2][row % 6]).collect();
             for precision in Precision::ALL {
                 let of_groups = grouped_linear(&x, &w, &b, &groups, out, precision)?;
@@ -231,7 +231,7 @@ mod tests {
                 let (y, wanted) = (of_groups.to_vec2::<f32>()?, of_all.to_vec2::<f32>()?);
                 assert_eq!(y, wanted, "{precision}: the same bits");
                 for (got, wanted) in gradients[..3].iter().zip(&gradients[3..]) {
-                    // Sums in another order: some last places of an f32.
+                    // Sums in another order differ in the last places of an f32.
                     let apart = apart(got, wanted);
                     assert!(apart <= 1e-6, "{precision}: {apart:e}");
                 }

@@ -1,13 +1,13 @@
-//! Images and maps as convolutions take them: as they are stored, and one by one as operands of products.
+//! Inputs of convolutions: images and maps as they are stored, and one by one as operands of products.
 
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::{Element, Simd};
 use crate::kernels::rounding::{store, store_bytes, store_steps_of, store_steps_of_bytes};
 
-/// Images [n, height, width, channels_in], as they are stored.
+/// Stored images [n, height, width, channels_in].
 #[derive(Clone, Copy)]
 pub(crate) enum Pixels<'a> {
-    /// Scaled by 1/255 when read.
+    /// Bytes that stand for byte / 255.
     Bytes(&'a [u8]),
     Floats(&'a [f32]),
 }
@@ -20,7 +20,7 @@ impl Pixels<'_> {
         }
     }
 
-    /// The scalars `range` of all images.
+    /// Returns the scalars `range` of all images.
     pub(crate) fn slice(&self, range: std::ops::Range<usize>) -> Self {
         match self {
             Self::Bytes(bytes) => Self::Bytes(&bytes[range]),
@@ -31,13 +31,13 @@ impl Pixels<'_> {
 
 #[derive(Clone, Copy)]
 pub(crate) enum Images<'a, E> {
-    /// Images that are not operands yet: each becomes one when its turn comes, and stays in the first cache meanwhile.
+    /// Images that are not operands yet. Each is converted when it is needed, and then stays in the L1 cache.
     Pixels(Pixels<'a>),
     Maps(&'a [E]),
 }
 
 impl<E: Element> Images<'_, E> {
-    /// What a product with them is multiplied by.
+    /// The factor that a product with these images must be multiplied by.
     pub(crate) const fn scale(&self) -> f32 {
         match self {
             Self::Pixels(Pixels::Bytes(_)) => E::BYTE_SCALE,
@@ -45,9 +45,9 @@ impl<E: Element> Images<'_, E> {
         }
     }
 
-    /// The image with this index as an operand, `len` scalars and `padding` zeros after them; `room` is for those that have to be made.
+    /// Returns image `index` as an operand: `len` scalars, then `padding` zeros. `room` is scratch memory for conversions and copies.
     ///
-    /// What lies behind an image in memory is the next one, which is not padding: 0 times a NaN in it is NaN.
+    /// The next image in memory cannot serve as padding: 0 times a NaN in it is NaN.
     pub(crate) fn image<'r, S: Simd<Element = E>>(
         &'r self,
         simd: S,
@@ -70,8 +70,8 @@ impl<E: Element> Images<'_, E> {
         operand
     }
 
-    /// The image with this index as the operand of a sum over windows: each of its `len` scalars with the one `shift` further if
-    /// steps are pairs, or with 0 where the image ends before.
+    /// Returns image `index` as the operand of a sum over windows. If `DEPTH` is 2, each of its `len` scalars
+    /// is paired with the one `shift` further, or with 0 beyond the end.
     pub(crate) fn steps<'r, S: Simd<Element = E>>(
         &'r self,
         simd: S,
@@ -95,7 +95,7 @@ impl<E: Element> Images<'_, E> {
     }
 }
 
-/// Memory for one image at a time.
+/// Scratch memory for one image at a time.
 pub(crate) struct Room<E: Element>(Option<Buffer<E>>);
 
 impl<E: Element> Room<E> {
@@ -103,7 +103,7 @@ impl<E: Element> Room<E> {
         Self(None)
     }
 
-    /// `len` scalars, with what was there before; the same number every time.
+    /// Returns `len` scalars with old content. `len` must be the same in every call.
     fn of(&mut self, len: usize) -> &mut [E] {
         self.0.get_or_insert_with(|| Buffer::new(len))
     }

@@ -1,5 +1,5 @@
-//! The stages of an IMPALA torso as one candle operation with gradients, its batch split over the rayon pool.
-//! It runs on the CPU only; the layer after f3 is another operation.
+//! The stages of an IMPALA torso as one candle operation with gradients. The batch is split over the rayon pool.
+//! It runs on the CPU only. The layer after f3 is a separate operation.
 
 use candle_core::{Result, Tensor, bail};
 
@@ -13,16 +13,16 @@ use crate::kernels::stages::{Saved, Stages};
 use crate::kernels::tasks::Tasks;
 use crate::kernels::tensors::{Input, cpu, values_of};
 
-/// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
+/// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
 const TASK_IMAGES: usize = 8;
 
-/// f3 [B, h, w, c] of `images` [B, H, W, C] u8, which are scaled by 1/255: stages of a convolution, a max pool and two residual blocks
-/// x + conv(relu(conv(relu(x)))), then ReLU.
+/// Computes f3 [B, h, w, c] of `images` [B, H, W, C] u8, scaled by 1/255: stages of a convolution, a max pool
+/// and two residual blocks x + conv(relu(conv(relu(x)))), then ReLU.
 ///
-/// `layers` has the weight [out, in, 3, 3] and the bias [out] of each convolution in the order in which they are applied. Convolutions
-/// have a border of zeros; the pool is 3 x 3 of stride 2, with padding 1 that is never the largest. Of equal values in it the first takes
-/// the gradient, and where a ReLU gives 0 the gradient is 0, as in PyTorch. Operands of products are rounded to `precision`; what residual
-/// blocks add up is f32. Results and gradients have the same bits whatever the number of threads.
+/// `layers` holds the weight [out, in, 3, 3] and the bias [out] of each convolution in the order of application. Convolutions
+/// have zero padding. The pool is 3 x 3 with stride 2 and padding 1, which is never the largest. As in PyTorch, the first of
+/// equal values in a window receives the gradient, and the gradient at a ReLU output of 0 is 0. Operands of products are
+/// rounded to `precision`; residual sums are f32. The bits of results and gradients do not depend on the number of threads.
 pub(crate) fn residual_stages(
     images: &Tensor,
     layers: &[BorderedTensors<'_>],
@@ -54,7 +54,7 @@ pub(crate) fn residual_stages(
 struct ResidualStages<S: Simd> {
     simd: S,
     shapes: Vec<ConvShape>,
-    /// Images of the batch.
+    /// The number of images in the batch.
     count: usize,
 }
 
@@ -79,7 +79,7 @@ fn bytes(images: Input<'_>) -> Result<&[u8]> {
 impl<S: Simd> Operation<2> for ResidualStages<S> {
     const NAME: &'static str = "residual-stages";
 
-    /// Of each task.
+    /// The state of each task.
     type Kept = Vec<Saved<S::Element>>;
 
     fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {

@@ -1,8 +1,8 @@
-//! The fully connected layer as a candle operation with gradients, also on maps, and ReLU by itself.
-//! It knows no network; it runs on the CPU only.
+//! The fully connected layer, on rows or on maps, and ReLU, as candle operations with gradients.
+//! This module knows no network and runs on the CPU only.
 //!
-//! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
-//! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
+//! candle's own layer is a matrix product and a broadcast addition, whose backward pass sums the bias on a
+//! single thread. candle's ReLU passes a gradient at exactly 0, unlike PyTorch's.
 
 use std::ops::Deref;
 
@@ -19,7 +19,7 @@ use crate::kernels::product::Product;
 use crate::kernels::rounding::transpose;
 use crate::kernels::tensors::{Input, floats, values_of};
 
-/// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
+/// Rows that one task sums. The number is fixed, so that the order of additions does not depend on the number of threads.
 const TASK_ROWS: usize = 256;
 /// Scalars that one task of an elementwise pass takes.
 const TASK_LEN: usize = 1 << 15;
@@ -29,13 +29,13 @@ const SUM_LEN: usize = 1 << 12;
 
 /// y = x w^T + b, differentiable in all arguments.
 ///
-/// `x` [..., in]; `w` [out, in]; `b` [out]. Result [..., out]. All f32. Operands of products are rounded to `precision`: each result and
-/// gradient is right to [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
+/// `x` [..., in]; `w` [out, in]; `b` [out]. Result [..., out]. All f32. Operands of products are rounded to `precision`, and the
+/// error of each result and gradient is at most [`Precision::product_error`]. Their bits do not depend on the number of threads.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
     apply(x, w, b, None, precision)
 }
 
-/// [`linear`] on maps [B, height, width, channels], flattened in the order of PyTorch's weights: channel, row, column.
+/// [`linear`] on maps [B, height, width, channels], flattened as PyTorch's weights expect: channel, row, column.
 pub(crate) fn linear_of_maps(
     maps: &Tensor,
     w: &Tensor,
@@ -46,12 +46,12 @@ pub(crate) fn linear_of_maps(
     apply(maps, w, b, Some((height * width, channels)), precision)
 }
 
-/// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
+/// max(x, 0). Its gradient at exactly 0 is 0, as in PyTorch.
 pub fn relu(x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Relu)
 }
 
-/// `maps` are (locations, channels) if x is to be flattened.
+/// Applies the layer. `maps` is (locations, channels) if x must be flattened.
 fn apply(
     x: &Tensor,
     w: &Tensor,
@@ -150,7 +150,7 @@ impl Operation<3> for Linear {
 
 /// Transposes every image [rows, cols] of a batch.
 pub(crate) fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
-    // Nothing is rounded.
+    // Transposing rounds nothing, so f32 serves both precisions.
     with_simd!(AnySimd::of(Precision::F32), simd => {
         result
             .par_chunks_mut(rows * cols)
@@ -160,7 +160,7 @@ pub(crate) fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &
     });
 }
 
-/// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].
+/// Sums the rows of each group: `grads` [rows, outputs] to [groups, outputs].
 pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f32> {
     if groups > 1 {
         let mut sums = vec![0.0; groups * outputs];
@@ -177,14 +177,14 @@ pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f3
     add_in_order(&parts.collect::<Vec<_>>(), outputs)
 }
 
-/// `part` and the sum so far, if there is one.
+/// Adds `part` to the sum so far, if there is one.
 pub(crate) fn add_to(sum: Option<Vec<f32>>, part: Vec<f32>) -> Vec<f32> {
     let Some(mut sum) = sum else { return part };
     add_rows(&mut sum, &part);
     sum
 }
 
-/// Adds `rows`, one after the other, to `sum`, which is as long as each.
+/// Adds `rows` to `sum` one after the other. Each row is as long as `sum`.
 pub(crate) fn add_rows(sum: &mut [f32], rows: &[f32]) {
     for row in rows.chunks_exact(sum.len()) {
         for (sum, value) in sum.iter_mut().zip(row) {
@@ -193,7 +193,7 @@ pub(crate) fn add_rows(sum: &mut [f32], rows: &[f32]) {
     }
 }
 
-/// Sum of equally long vectors, first to last; `len` zeros if there are none.
+/// Sums vectors of length `len`, first to last. Without vectors the result is zeros.
 pub(crate) fn add_in_order<P>(parts: &[P], len: usize) -> Vec<f32>
 where
     P: Deref<Target = [f32]> + Sync,
@@ -220,13 +220,13 @@ pub(crate) fn relu_in_place(values: &mut [f32]) {
     }
 }
 
-/// max(value, 0); unlike `f32::max` it keeps NaN, so that a diverged network shows.
+/// max(value, 0). Unlike `f32::max` it keeps NaN, so that a diverged network is noticed.
 #[inline(always)]
 pub(crate) fn relu_of(value: f32) -> f32 {
     if value < 0.0 { 0.0 } else { value }
 }
 
-/// The gradient at ReLU's input, from its output `y` and the gradient there.
+/// Returns the gradient before a ReLU, given the ReLU's output `y` and the gradient `grad` after it.
 #[inline(always)]
 pub(crate) fn relu_gradient(y: f32, grad: f32) -> f32 {
     if y <= 0.0 { 0.0 } else { grad }

@@ -1,12 +1,12 @@
-//! What the network is computed with: this project's kernels for the CPU, and the same from candle's operations for the rest.
+//! The kernels of the network: this project's own for the CPU, and compositions of candle's operations for other devices.
 //!
 //! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`] and [`dots`] are operations with
-//! gradients, which [`operation`] makes candle's and which split their work over the rayon pool, images into [`tasks`].
-//! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does,
-//! with [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of
-//! [`panels`] and in tiles for an instruction set of [`isa`] with the type that it multiplies; all unsafe code of the crate is there.
-//! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`tensors`] reads candle's,
-//! [`precision`] is the setting. [`candle`] needs none of them.
+//! gradients. [`operation`] turns them into candle's. These operations split their work over the rayon pool, and images into
+//! [`tasks`]. [`stack`] passes a task's images through all convolutions, and [`convolution`] computes one of them. [`stages`]
+//! does so for an IMPALA torso, with [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's
+//! linear layer. All of them use operands from [`panels`] and tiles for an instruction set of [`isa`], where all unsafe code of
+//! the crate is. [`rounding`] rounds operands, [`exponentials`] computes what losses need, [`buffer`] recycles memory,
+//! [`tensors`] reads candle's tensors, and [`precision`] is the setting. [`candle`] needs none of these modules.
 
 pub(crate) mod bordered;
 pub(crate) mod buffer;

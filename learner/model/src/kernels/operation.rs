@@ -1,5 +1,5 @@
-//! What an operation of this project is, and how it becomes one of candle's: scalars in, scalars out, on the CPU.
-//! It computes nothing.
+//! An operation of this project and its conversion to a candle operation: scalars in, scalars out, on the CPU.
+//! This module computes nothing itself.
 
 use std::sync::OnceLock;
 
@@ -7,16 +7,16 @@ use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tenso
 
 use crate::kernels::tensors::{Input, values_of};
 
-/// An operation with gradients on `N` tensors, for one pass forward and then backward.
+/// An operation with gradients on `N` tensors, used for one forward and one backward pass.
 pub(crate) trait Operation<const N: usize>: Send + Sync + 'static {
     const NAME: &'static str;
 
-    /// What the forward pass leaves to the backward pass.
+    /// State that the forward pass keeps for the backward pass.
     type Kept: Send + Sync;
 
     fn forward(&self, inputs: [Input<'_>; N]) -> Result<(Vec<f32>, Self::Kept)>;
 
-    /// The gradients of those inputs that want one, for the gradient `grad_y` of the result `y`.
+    /// Computes the gradients of the inputs that need one, given the gradient `grad_y` of the result `y`.
     fn backward(
         &self,
         inputs: [&Tensor; N],
@@ -26,7 +26,7 @@ pub(crate) trait Operation<const N: usize>: Send + Sync + 'static {
     ) -> Result<[Option<Vec<f32>>; N]>;
 }
 
-/// The result of `operation`, which has this shape.
+/// Applies `operation` to two tensors. `shape` is the shape of the result.
 pub(crate) fn apply_to_two<O: Operation<2>>(
     operation: O,
     [a, b]: [&Tensor; 2],
@@ -36,7 +36,7 @@ pub(crate) fn apply_to_two<O: Operation<2>>(
     a.contiguous()?.apply_op2(&b.contiguous()?, pass)
 }
 
-/// As [`apply_to_two`].
+/// Applies `operation` to three tensors, as [`apply_to_two`].
 pub(crate) fn apply_to_three<O: Operation<3>>(
     operation: O,
     [a, b, c]: [&Tensor; 3],

@@ -1,5 +1,5 @@
-//! Operands of products, rounded and laid out as tiles read them: right ones in panels, left ones in rows.
-//! It splits no output.
+//! Operands of products, rounded and laid out as tiles read them: right operands in panels, left operands in rows.
+//! This module splits no output.
 
 use rayon::prelude::*;
 
@@ -9,19 +9,19 @@ use crate::kernels::isa::{
 };
 use crate::kernels::rounding::write_rows;
 
-/// A matrix laid over a slice: its rows are runs of it, or its columns if it is transposed.
+/// A matrix view of a slice. Contiguous runs of the slice are its rows, or its columns if it is transposed.
 #[derive(Clone, Copy)]
 pub(crate) struct Matrix<'a> {
     data: &'a [f32],
     pub(crate) rows: usize,
     pub(crate) cols: usize,
-    /// Scalars from the start of a run to the next one's.
+    /// Scalars from the start of one run to the start of the next.
     stride: usize,
     transposed: bool,
 }
 
 impl<'a> Matrix<'a> {
-    /// Rows one after the other, `data` [rows, cols].
+    /// Creates a matrix of `data` [rows, cols], row after row.
     pub(crate) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
         assert!(
             data.len() == rows * cols,
@@ -37,10 +37,10 @@ impl<'a> Matrix<'a> {
         }
     }
 
-    /// Some of the columns, where they are. They serve as a right operand; a left one has its runs one after the other.
+    /// Selects columns without copying. The result can be a right operand. A left operand needs adjacent runs.
     ///
     /// # Panics
-    /// If it is transposed, or has not these columns.
+    /// If the matrix is transposed or lacks these columns.
     pub(crate) fn columns(self, columns: std::ops::Range<usize>) -> Self {
         assert!(
             !self.transposed && !columns.is_empty() && columns.end <= self.cols,
@@ -75,7 +75,7 @@ pub(crate) enum Threads {
     Pool,
 }
 
-/// A right operand, cut into panels of columns, each [k / DEPTH, columns, DEPTH] with zeros where it ends before they do.
+/// A right operand, cut into panels of columns. Each panel is [k / DEPTH, columns, DEPTH], padded with zeros.
 pub(crate) struct Panels<E: Element> {
     values: Buffer<E>,
     steps: usize,
@@ -84,7 +84,7 @@ pub(crate) struct Panels<E: Element> {
 }
 
 impl<E: Element> Panels<E> {
-    /// Memory for the panels of an operand of so many steps.
+    /// Allocates panels for an operand of `steps` steps and `cols` columns.
     pub(crate) fn new<S: Simd<Element = E>>(_: S, steps: usize, cols: usize) -> Self {
         let vecs = tile_vecs::<S>(cols);
         let width = vecs * LANES;
@@ -96,14 +96,14 @@ impl<E: Element> Panels<E> {
         }
     }
 
-    /// The panels of `b` [k, n].
+    /// Packs `b` [k, n] into panels.
     pub(crate) fn pack<S: Simd<Element = E>>(simd: S, b: Matrix<'_>, threads: Threads) -> Self {
         let mut panels = Self::new(simd, b.rows.div_ceil(E::DEPTH), b.cols);
         panels.fill(simd, b, b.rows, threads);
         panels
     }
 
-    /// Packs `b` [parts * rows, n], each of whose parts begins with a new step; of a transposed matrix there is one part.
+    /// Packs `b` [parts * rows, n]. Each part begins with a new step. A transposed matrix is one part.
     pub(crate) fn fill<S: Simd<Element = E>>(
         &mut self,
         simd: S,
@@ -131,14 +131,14 @@ impl<E: Element> Panels<E> {
         }
     }
 
-    /// Registers in the width of a panel.
+    /// The width of a panel in registers.
     pub(crate) const fn vecs(&self) -> usize {
         self.vecs
     }
 
-    /// Multiplies any number of rows of one run into `out`, whose rows begin `stride` scalars apart.
+    /// Multiplies any number of `left` rows of one run each into `out`, whose rows begin `stride` scalars apart.
     ///
-    /// A block of a panel stays in the first cache while all rows pass it.
+    /// A block of a panel stays in the L1 cache while all rows are multiplied by it.
     pub(crate) fn multiply_rows<S: Simd<Element = E>>(
         &self,
         simd: S,
@@ -176,7 +176,7 @@ impl<E: Element> Panels<E> {
         }
     }
 
-    /// Multiplies `rows` rows, no more than a tile's, into `out`, whose rows begin `stride` scalars apart.
+    /// Multiplies `rows` rows, at most one tile, into `out`, whose rows begin `stride` scalars apart.
     pub(crate) fn multiply<S: Simd<Element = E>>(
         &self,
         simd: S,
@@ -202,7 +202,7 @@ impl<E: Element> Panels<E> {
 }
 
 vectorized! {
-    /// Packs columns `first..` of `b`, in parts of so many rows, as one panel of this width.
+    /// Packs the columns of `b` from `first` on, in parts of `rows` rows, as one panel of this width.
     fn pack_panel<S>(
         simd,
         b: Matrix<'a>,
@@ -229,7 +229,7 @@ vectorized! {
     }
 }
 
-/// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks of steps are transposed in registers.
+/// [`pack_panel`] for a transposed matrix: square blocks of steps are transposed in registers.
 #[inline(always)]
 fn pack_transposed<S: Simd>(
     simd: S,
@@ -260,7 +260,7 @@ fn pack_transposed<S: Simd>(
     }
 }
 
-/// A left operand as tiles read it.
+/// A left operand, laid out as tiles read it.
 pub(crate) struct Rows<'a, E: Element> {
     values: Scalars<'a, E>,
     row_stride: usize,
@@ -269,10 +269,10 @@ pub(crate) struct Rows<'a, E: Element> {
 }
 
 impl<'a, E: Element> Rows<'a, E> {
-    /// The rows of `a` [m, k]: where they are if that is possible, else a rounded copy.
+    /// Packs the rows of `a` [m, k]: in place if they need no rounding, else as a rounded copy.
     ///
     /// # Panics
-    /// If the runs of `a` do not follow each other.
+    /// If the runs of `a` are not adjacent.
     pub(crate) fn pack<S: Simd<Element = E>>(simd: S, a: Matrix<'a>, threads: Threads) -> Self {
         assert!(
             a.data.len() == a.rows * a.cols,
@@ -323,7 +323,7 @@ impl<'a, E: Element> Rows<'a, E> {
 /// Scalars that one task rounds.
 const TASK_LEN: usize = 1 << 15;
 
-/// Rounds rows of `cols` scalars into rows of `stride`, with zeros after them.
+/// Rounds rows of `cols` scalars into rows of `stride`, padded with zeros.
 fn pack_rows<S: Simd>(
     simd: S,
     data: &[f32],
@@ -345,7 +345,7 @@ fn pack_rows<S: Simd>(
     }
 }
 
-/// Columns of `a` [k, m] as rows of `stride`, which is a multiple of `LANES` steps, with zeros after them.
+/// Packs the columns of `a` [k, m] as rows of `stride`, a multiple of `LANES` steps, padded with zeros.
 fn pack_turned<S: Simd>(
     simd: S,
     a: Matrix<'_>,
@@ -404,7 +404,7 @@ vectorized! {
     }
 }
 
-/// Packs all columns of `b` as one panel, a share of the steps on each thread.
+/// Packs all columns of `b` as one panel. On the pool, each task packs a share of the steps.
 fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], threads: Threads) {
     let (depth, cols) = (S::Element::DEPTH, b.cols);
     let steps = (TASK_LEN / (cols * depth)).max(1);

@@ -16,7 +16,7 @@ fn scalars<E: Element>(rows: &Rows<'_, E>, m: usize) -> Vec<f32> {
     (0..m * k).map(|at| scalar(at / k, at % k)).collect()
 }
 
-/// Sums that are longer than what a task rounds, too.
+/// Covers rows that are longer than what one task rounds, too.
 #[test]
 fn every_instruction_set_packs_the_rows_of_a_transposed_matrix() {
     for (m, k) in [(1, 1), (16, 32), (37, 75), (3, TASK_LEN + 1)] {
@@ -25,7 +25,7 @@ fn every_instruction_set_packs_the_rows_of_a_transposed_matrix() {
         let turned: Vec<f32> = (0..m * k).map(|at| value(at % m, at / m)).collect();
         for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
             for threads in [Threads::Caller, Threads::Pool] {
-                // What the last user left in the memory.
+                // Memory with old content, so that missing zeros are noticed.
                 Buffer::<bf16>::new(m * (k + 64)).fill(bf16::NAN);
                 with_simd!(simd, simd => {
                     let wanted = Rows::pack(simd, Matrix::new(&dense, m, k), threads);

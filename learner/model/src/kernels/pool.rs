@@ -1,7 +1,7 @@
 //! The 3 x 3 max pool of stride 2 with padding 1 over one image's maps, forward and backward.
-//! It knows neither tensors nor threads.
+//! This module knows neither tensors nor threads.
 //!
-//! What lies beyond the maps is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
+//! The padding is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
 
 use crate::geometry::pooled;
 use crate::kernels::isa::{LANES, vectorized};
@@ -9,7 +9,7 @@ use crate::kernels::isa::{LANES, vectorized};
 /// Height, width and channels of maps.
 pub(crate) type Size = (usize, usize, usize);
 
-/// The windows of maps of this size, row by row.
+/// Iterates over the windows of maps of this size, row by row.
 #[inline(always)]
 fn windows(size: Size) -> impl Iterator<Item = Window> {
     let (rows, cols, channels) = pooled(size);
@@ -22,19 +22,19 @@ fn windows(size: Size) -> impl Iterator<Item = Window> {
     })
 }
 
-/// 3 x 3 pixels, some of which may lie beyond the maps.
+/// A window of 3 x 3 pixels, some of which may lie outside the maps.
 #[derive(Clone, Copy)]
 struct Window {
-    /// Its first scalar in the pooled maps.
+    /// Index of the window's first scalar in the pooled maps.
     start: usize,
-    /// The row and the column at which it begins, where those of the maps begin at 1.
+    /// Row and column of the window's first pixel, where index 0 is the padding and the maps begin at 1.
     corner: (usize, usize),
-    /// Of the maps.
+    /// The size of the maps.
     size: Size,
 }
 
 impl Window {
-    /// The pixels inside the maps: the number of each, 0 to 8, and its first scalar in the maps.
+    /// Iterates over the pixels inside the maps: index in the window, 0 to 8, and index of the first scalar in the maps.
     #[inline(always)]
     fn pixels(self) -> impl Iterator<Item = (u32, usize)> {
         let (height, width, channels) = self.size;
@@ -50,8 +50,8 @@ impl Window {
 }
 
 vectorized! {
-    /// Writes the largest of each window of `maps` into `largest`, and which of its pixels that is into `taken`. A NaN is the largest.
-    /// Channels that do not fill a register go one by one.
+    /// Writes the maximum of each window of `maps` into `largest`, and the index of its pixel, 0 to 8, into
+    /// `taken`. A NaN counts as the largest. Channels that do not fill a register are processed one by one.
     pub(crate) fn pool<S>(
         simd,
         maps: &'a [f32],
@@ -99,7 +99,7 @@ fn pool_block<const N: usize>(
 }
 
 vectorized! {
-    /// The inverse of [`pool`] for gradients: adds that of each window, of `grads`, to the pixel it was taken from, in `grad_maps`.
+    /// The backward pass of [`pool`]: adds each window's gradient, from `grads`, to the pixel of `grad_maps` with the maximum.
     pub(crate) fn unpool<S>(
         simd,
         grads: &'a [f32],
@@ -150,7 +150,7 @@ mod tests {
     use crate::kernels::isa::{AnySimd, with_simd};
     use crate::kernels::precision::Precision;
 
-    /// On every instruction set the largest, and the gradients of the maps where those of the windows are 1, 2, 3 and so on.
+    /// Returns the maxima on every instruction set, and the gradients of the maps for window gradients of 1, 2, 3 and so on.
     fn pooled_and_back(maps: &[f32], size: Size) -> Vec<(Vec<f32>, Vec<f32>)> {
         let (rows, cols, channels) = pooled(size);
         let len = rows * cols * channels;
@@ -170,7 +170,7 @@ mod tests {
             .collect()
     }
 
-    /// By the definition: the first of the largest pixels of each window, or the first NaN.
+    /// The same by definition: the first of the largest pixels of each window, or the first NaN.
     fn wanted(maps: &[f32], size: Size) -> (Vec<f32>, Vec<f32>) {
         let ((height, width, channels), (rows, cols, _)) = (size, pooled(size));
         let (mut largest, mut grads) = (Vec::new(), vec![0.0; maps.len()]);
@@ -199,7 +199,7 @@ mod tests {
     fn the_first_of_the_largest_is_taken_whatever_the_size() {
         for size in [(1, 1, 1), (2, 3, 5), (7, 4, 16), (6, 6, 33), (5, 1, 17)] {
             let len = size.0 * size.1 * size.2;
-            // All different, a few values that tie everywhere, all the same; below 0, where a border of zeros would win.
+            // All different, a few values with ties everywhere, all the same. All are below 0, where zero padding would win.
             for values in [1009, 3, 1] {
                 let maps: Vec<f32> = (0..len)
                     .map(|at| (at * 383 % 1009 % values) as f32 - 2000.0)

@@ -1,30 +1,30 @@
-//! In which numbers the products of the network are computed.
+//! The precision of the network's matrix products.
 
 use std::{fmt, str::FromStr};
 
 use serde::{Deserialize, Serialize};
 
-/// What the operands of matrix products are rounded to. Sums, losses, weights and moments are f32 in either.
+/// The type to which the operands of matrix products are rounded. Sums, losses, weights and moments are always f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// 24 bits of significand: operands as they are.
+    /// 24 bits of significand: operands are not rounded.
     #[default]
     F32,
-    /// 8 bits of significand, the exponents of f32: operands rounded to nearest, ties to even. Processors that multiply bf16 take
-    /// operands, products and sums below 1.2e-38 for 0; an operand above 3.3895e38 rounds to an infinity.
+    /// 8 bits of significand and f32's exponents: operands are rounded to nearest, ties to even. Processors with bf16
+    /// products flush operands, products and sums below 1.2e-38 to 0. An operand above 3.3895e38 rounds to infinity.
     Bf16,
 }
 
 impl Precision {
-    /// All of them.
+    /// Every precision.
     pub const ALL: [Self; 2] = [Self::F32, Self::Bf16];
 
-    /// Largest error of a sum of `terms` products of f32 numbers, as a share of the sum of the products' sizes, beside
-    /// [`Precision::product_floor`]: both operands' rounding, and an f32's last place for each sum, in whatever order they are taken.
+    /// Largest error of a sum of `terms` products of f32 numbers, relative to the sum of the products' magnitudes, in addition
+    /// to [`Precision::product_floor`]. It covers the rounding of both operands and of each f32 addition, in any order.
     ///
-    /// It holds where the sum of the products' sizes is a finite f32. Source: Higham 2002, Accuracy and Stability of Numerical
-    /// Algorithms, section 3.1.
+    /// The bound holds if the sum of the products' magnitudes is a finite f32. Source: Higham 2002, Accuracy
+    /// and Stability of Numerical Algorithms, section 3.1.
     pub fn product_error(self, terms: usize) -> f64 {
         let operand: f64 = match self {
             Self::F32 => 0.0,
@@ -35,8 +35,8 @@ impl Precision {
         (1.0 + operand).powi(2) * (1.0 + sums) - 1.0
     }
 
-    /// What such a sum may lose beside that where numbers are below 1.2e-38, the least normal one: in f32 half of the least number a
-    /// product; in bf16 operands, products and sums count as 0. `largest` is the size of the largest operand.
+    /// Largest further error of such a sum through subnormal numbers, which are below 1.2e-38. In f32, it is the smallest subnormal
+    /// number per product. In bf16, such operands, products and sums count as 0. `largest` is the magnitude of the largest operand.
     pub fn product_floor(self, terms: usize, largest: f64) -> f64 {
         let least = f64::from(f32::MIN_POSITIVE);
         match self {
@@ -60,7 +60,7 @@ impl fmt::Display for Precision {
     }
 }
 
-/// Not the name of a precision.
+/// The error for a name that is not a precision.
 #[derive(Debug, thiserror::Error)]
 #[error("{0:?} is not a precision: use f32 or bf16")]
 pub struct UnknownPrecision(String);

@@ -1,5 +1,5 @@
-//! Matrix products over slices, the output split over the rayon pool.
-//! It knows nothing of layers.
+//! Matrix products over slices. The output is split over the rayon pool.
+//! This module knows nothing of layers.
 
 use rayon::prelude::*;
 
@@ -7,18 +7,18 @@ use crate::kernels::isa::{AnySimd, Element, Mode, Simd, with_simd};
 use crate::kernels::panels::{Matrix, Panels, Rows, Threads};
 use crate::kernels::precision::Precision;
 
-/// Rows of the output that one task computes. Fixed, so that a product's bits do not depend on the number of threads.
+/// Output rows that one task computes. The number is fixed, so that a product's bits do not depend on the number of threads.
 const TASK_ROWS: usize = 32;
-/// Multiplications below which a product is not split.
+/// Multiplications below which a product stays on one thread.
 const SPLIT_MIN: usize = 1 << 18;
 
-/// What a task does with its finished rows of the output: gets the number of the first one, and the rows one after the other.
+/// Work on a task's finished output rows. It receives the index of the first row, and the rows one after the other.
 pub(crate) type RowsWork<'a> = &'a (dyn Fn(usize, &mut [f32]) + Sync);
 
 /// A product of `a` [m, k] and `b` [k, n], to be computed into rows of n scalars.
 ///
-/// Operands are rounded to `precision`. Each entry is summed in the order of k, in f32, whatever the number of threads; it is right to
-/// [`Precision::product_error`].
+/// Operands are rounded to `precision`. Each entry is summed in f32 in the order of k, whatever the number of
+/// threads. Its error is at most [`Precision::product_error`].
 #[derive(Clone, Copy)]
 pub(crate) struct Product<'a> {
     precision: Precision,
@@ -30,7 +30,7 @@ pub(crate) struct Product<'a> {
 }
 
 impl<'a> Product<'a> {
-    /// On the pool.
+    /// Creates a product that is computed on the rayon pool.
     ///
     /// # Panics
     /// If the shapes do not match.
@@ -57,11 +57,11 @@ impl<'a> Product<'a> {
         Self { threads, ..self }
     }
 
-    /// Added to `biases` [groups, n], each of which serves an equal share of consecutive rows. They are written in the cache of the core
-    /// that multiplies.
+    /// Adds the product to `biases` [groups, n]. Each bias row serves an equal share of consecutive output
+    /// rows. It is copied in the cache of the core that multiplies.
     ///
     /// # Panics
-    /// If the rows cannot be shared so.
+    /// If the rows cannot be shared equally.
     pub(crate) fn added_to(self, biases: &'a [f32]) -> Self {
         let (rows, cols) = (self.a.rows, self.b.cols);
         let groups = biases.len() / cols;
@@ -74,13 +74,13 @@ impl<'a> Product<'a> {
         Self { biases, ..self }
     }
 
-    /// With `after` on each row that is done.
+    /// Calls `after` on the finished rows of each task.
     pub(crate) fn then(self, after: RowsWork<'a>) -> Self {
         let after = Some(after);
         Self { after, ..self }
     }
 
-    /// Into `out` [m, n].
+    /// Computes the product into `out` [m, n].
     ///
     /// # Panics
     /// If `out` has another length.
@@ -95,10 +95,10 @@ impl<'a> Product<'a> {
         self.run(out, self.b.cols, mode);
     }
 
-    /// Added to columns of `sums` from `first` on, whose rows are `stride` long.
+    /// Adds the product to the columns of `sums` from `first` on. The rows of `sums` are `stride` long.
     ///
     /// # Panics
-    /// If they do not have these columns, or rows are worked on before or after.
+    /// If `sums` lacks these columns, or if the product has biases or a function for finished rows.
     pub(crate) fn add_to_columns(self, sums: &mut [f32], stride: usize, first: usize) {
         let end = first + self.b.cols;
         assert!(
@@ -119,14 +119,14 @@ impl<'a> Product<'a> {
     pub(crate) fn to_vec(self) -> Vec<f32> {
         let len = self.a.rows * self.b.cols;
         with_simd!(AnySimd::of(self.precision), simd => {
-            // Clearing memory takes a core about as long as laying out the operands.
+            // Clearing the output takes a core about as long as packing the operands, so both run at once.
             let (mut out, operands) = self.both(|| vec![0.0; len], || Operands::new(simd, self));
             self.multiply(simd, operands, &mut out, self.b.cols, Mode::Replace);
             out
         })
     }
 
-    /// Added to `sum` [m, n], if there is one.
+    /// Returns `sum` [m, n] plus the product, or the product alone if `sum` is `None`.
     pub(crate) fn summed(self, sum: Option<Vec<f32>>) -> Vec<f32> {
         match sum {
             None => self.to_vec(),
@@ -143,12 +143,12 @@ impl<'a> Product<'a> {
         });
     }
 
-    /// Whether it is split, as it is large enough and may be.
+    /// Whether the product is split over the pool, because it is large enough and may use the pool.
     fn splits(self) -> bool {
         self.threads == Threads::Pool && self.a.rows * self.a.cols * self.b.cols >= SPLIT_MIN
     }
 
-    /// Both at once, if it is split.
+    /// Runs both closures, in parallel if the product is split.
     fn both<A: Send, B: Send>(
         self,
         a: impl FnOnce() -> A + Send,
@@ -205,14 +205,14 @@ impl<'a> Product<'a> {
     }
 }
 
-/// A product's operands as an instruction set reads them.
+/// A product's operands, packed for an instruction set.
 struct Operands<'a, E: Element> {
     panels: Panels<E>,
     rows: Rows<'a, E>,
 }
 
 impl<'a, E: Element> Operands<'a, E> {
-    /// Those of `product`, if there is anything to sum.
+    /// Packs the operands of `product`; `None` if there is nothing to sum.
     fn new<S: Simd<Element = E>>(simd: S, product: Product<'a>) -> Option<Self> {
         let (a, b) = (product.a, product.b);
         if a.rows * a.cols * b.cols == 0 {
@@ -238,7 +238,7 @@ mod tests {
         (0..len).map(|i| (i * by % 23) as f32 / 4.0 - 2.7).collect()
     }
 
-    /// [m, n] by its definition, of operands rounded to `precision`.
+    /// Computes the product [m, n] by definition, with operands rounded to `precision`.
     fn plain(precision: Precision, a: &[f32], b: &[f32], [m, k, n]: [usize; 3]) -> Vec<f64> {
         let round = |x: f32| match precision {
             Precision::F32 => f64::from(x),
@@ -257,7 +257,7 @@ mod tests {
             .collect()
     }
 
-    /// Compares a product, and what is added to by it, with `wanted` on every instruction set.
+    /// Compares a product, both written and added to an output, with `wanted` on every instruction set.
     fn check(product: Product<'_>, wanted: &[f64]) {
         for simd in AnySimd::every(product.precision) {
             for (mode, start, threads) in [
@@ -280,7 +280,7 @@ mod tests {
 
     #[test]
     fn products_of_odd_sizes_are_those_of_a_plain_loop_on_every_instruction_set() {
-        // The last three are split, and operands too. The last one's sums are longer than what a task rounds.
+        // The last three products are split, and so is their packing. The sums of the last are longer than what one task rounds.
         for [m, k, n] in [
             [1, 1, 1],
             [7, 3, 17],
@@ -332,7 +332,7 @@ mod tests {
                         Some(column) => whole[row * n + column],
                         None => 0.0,
                     };
-                    // On AMX a sum begins with what is there, so that it is rounded along the way.
+                    // On AMX the accumulators start from the output, so rounding differs.
                     let error = match precision {
                         Precision::F32 => 0.0,
                         Precision::Bf16 => 1e-4,
@@ -357,7 +357,7 @@ mod tests {
 
     #[test]
     fn rows_start_from_biases_and_are_worked_on_after() {
-        // Split and not.
+        // One product that is not split, and one that is.
         for [m, k, n] in [[3, 2, 5], [100, 77, 64]] {
             let (a, b) = (values(m * k, 7), values(k * n, 11));
             let values: Vec<f32> = (0..m * n).map(|at| (at / n) as f32).collect();

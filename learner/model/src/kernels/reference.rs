@@ -1,5 +1,5 @@
-//! Convolutions of a task on every instruction set against candle's operations and derivatives in f64: tests of `stack` and `stages`.
-//! One layer against another library's is tested in `tests/model`.
+//! Tests of `stack` and `stages`: convolutions of a task on every instruction set against candle's operations and derivatives in f64.
+//! Single layers are tested against candle in `tests/model`.
 #![cfg(test)]
 
 use candle_core::{DType, Device, Result, Tensor, Var};
@@ -16,7 +16,7 @@ use crate::kernels::tasks::{cut, parameters_len, unpacked};
 /// Images of a task.
 const COUNT: usize = 3;
 
-/// The 2-norm of the difference, as a share of that of `wanted`.
+/// The 2-norm of the difference, relative to the 2-norm of `wanted`.
 pub(crate) fn apart<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
     assert_eq!(found.len(), wanted.len());
     let (mut error, mut size) = (0f64, 0f64);
@@ -52,7 +52,7 @@ impl Case<'_> {
         values(COUNT * last.map_len(), 571, 1.0)
     }
 
-    /// Maps, and the gradients of parameters and, of plain convolutions, of images.
+    /// Returns the maps, and the gradients of the parameters and, for plain convolutions, of the images.
     fn on<S: Simd>(&self, simd: S) -> Vec<Vec<f32>> {
         let (shapes, parameters, grad_maps) = (self.shapes, self.parameters(), self.grad_maps());
         let mut maps = vec![f32::NAN; grad_maps.len()];
@@ -74,7 +74,7 @@ impl Case<'_> {
         vec![maps, unpacked(shapes, &sums), grad_images]
     }
 
-    /// The same by candle, images too.
+    /// Computes the same with candle, always with the gradients of the images.
     fn reference(&self) -> Result<Vec<Vec<f64>>> {
         let images: Vec<f64> = match self.images {
             Pixels::Bytes(bytes) => bytes.iter().map(|&it| f64::from(it) / 255.0).collect(),
@@ -141,11 +141,10 @@ fn every_instruction_set_gives_what_candle_does_in_f64() -> Result<()> {
         };
         let wanted = case.reference()?;
         for precision in Precision::ALL {
-            // What is computed is so far from the reference, and from what another instruction set gives.
+            // Largest distance from the reference, and from the first instruction set's result.
             let (tolerance, of_sets) = match precision {
                 Precision::F32 => (3e-6, 3e-6),
-                // ReLUs and pools choose otherwise. A sum that lands on the other side of a bf16 moves what is computed from it by its
-                // 256th part.
+                // ReLUs and pools may choose differently. A sum rounded to the neighbouring bf16 changes what follows by 1/256.
                 Precision::Bf16 => (0.3, 1e-2),
             };
             let on = |simd| with_simd!(simd, simd => case.on(simd));

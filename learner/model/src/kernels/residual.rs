@@ -1,8 +1,8 @@
 //! A residual block, out(relu(hidden(x))) + skip(x), as one candle operation with gradients.
-//! It knows no action and no level of features; it runs on the CPU only.
+//! This module knows no actions and no feature levels, and runs on the CPU only.
 //!
-//! As three layers, each would hand the other a gradient through candle, which adds every one of them to fresh zeros on a single thread;
-//! so would the parts of a weight that x and what is joined to it have.
+//! As three candle layers, the block would pass gradients through candle, which adds each one to fresh zeros
+//! on a single thread. That includes the two parts of a weight, for x and for the joined input.
 
 use candle_core::{Result, Tensor, bail};
 
@@ -16,7 +16,7 @@ use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
 use crate::kernels::tensors::{Input, values_of};
 
-/// The parameters of a block on x, or on x with `joined` behind it.
+/// The parameters of a block on x, or on x with `joined` appended to each row.
 #[derive(Clone, Debug)]
 pub(crate) struct BlockParameters {
     /// [hidden, features + joined]
@@ -27,15 +27,15 @@ pub(crate) struct BlockParameters {
     pub(crate) out_weight: Tensor,
     /// [outputs, features + joined]
     pub(crate) skip_weight: Tensor,
-    /// The biases of `out` and, where it has one, of `skip`, which are added up: [outputs] each.
+    /// The biases of `out` and, if it has one, of `skip`, [outputs] each. The block adds them up.
     pub(crate) out_biases: Vec<Tensor>,
 }
 
-/// `out(relu(hidden([x, joined]))) + skip([x, joined])`, [..., outputs], of x [..., features].
+/// Computes `out(relu(hidden([x, joined]))) + skip([x, joined])`, [..., outputs], of x [..., features].
 ///
-/// `joined` [groups, joined] serves an equal share of consecutive rows of x, and is never written out for each. Gradients of parameters
-/// that are variables are summed in place, so that a backward pass has to be one of [`Backward::of`](crate::Backward::of); those of
-/// other parameters are not computed. Results and gradients have the same bits whatever the number of threads.
+/// Each row of `joined` [groups, joined] serves an equal share of consecutive rows of x, without a copy per row. Gradients of
+/// parameters that are variables are summed in place, so only [`Backward::of`](crate::Backward::of) can run the backward pass.
+/// Gradients of other parameters are not computed. The bits of results and gradients do not depend on the number of threads.
 pub(crate) fn residual_block(
     x: &Tensor,
     joined: Option<&Tensor>,
@@ -82,7 +82,7 @@ pub(crate) fn residual_block(
         precision,
     };
     let shape = [&x.dims()[..x.rank() - 1], &[outputs]].concat();
-    // As an input a parameter ties the result to the backward pass, whatever x is.
+    // A parameter as an input ties the result to the backward pass, even if x has no gradient.
     let second = joined.unwrap_or(&parameters.hidden_bias);
     apply_to_two(block, [x, second], shape)
 }
@@ -90,10 +90,10 @@ pub(crate) fn residual_block(
 struct Block {
     parameters: BlockParameters,
     rows: usize,
-    /// Rows of what is joined; 1 if nothing is.
+    /// Rows of the joined input; 1 if nothing is joined.
     groups: usize,
     features: usize,
-    /// Columns of what is joined.
+    /// Columns of the joined input; 0 if nothing is joined.
     joins: usize,
     hidden: usize,
     outputs: usize,
@@ -105,7 +105,7 @@ impl Block {
         self.joins > 0
     }
 
-    /// What `weight` [outputs, features + joined] multiplies x by, and what is joined.
+    /// Splits `weight` [outputs, features + joined] into the columns that multiply x and those that multiply the joined input.
     fn parts<'a>(&self, weight: &'a [f32]) -> (Matrix<'a>, Option<Matrix<'a>>) {
         let inputs = self.features + self.joins;
         let weight = Matrix::new(weight, weight.len() / inputs, inputs);
@@ -119,7 +119,7 @@ impl Block {
         Product::new(self.precision, a, b)
     }
 
-    /// The biases [groups, outputs] of each row of what is joined: `bias`, and its product with its part of a weight.
+    /// Returns the biases [groups, outputs], one for each row of the joined input: `bias` plus that row times its part of a weight.
     fn biases(&self, bias: &[f32], joined: Option<(Matrix<'_>, Matrix<'_>)>) -> Vec<f32> {
         match joined {
             None => bias.to_vec(),
@@ -130,7 +130,7 @@ impl Block {
         }
     }
 
-    /// The gradient of a weight, of which x's columns are the first and those of what is joined the others, added to `sum`.
+    /// Returns `sum` plus the gradient of a weight, whose first columns belong to x and the others to the joined input.
     fn of_weight(
         &self,
         sum: Option<Vec<f32>>,
@@ -151,7 +151,7 @@ impl Block {
     }
 }
 
-/// Of x, and of what is joined to it or the hidden layer's bias.
+/// The inputs are x, and the joined input or, without one, the hidden layer's bias.
 impl Operation<2> for Block {
     const NAME: &'static str = "residual-block";
 
@@ -192,7 +192,7 @@ impl Operation<2> for Block {
         Ok((y, hidden))
     }
 
-    /// The parameters' gradients are summed in place.
+    /// Sums the gradients of the parameters in place.
     fn backward(
         &self,
         [x, joined]: [&Tensor; 2],
@@ -222,7 +222,7 @@ impl Operation<2> for Block {
             .then(&mask)
             .write(&mut grad_hidden, Mode::Replace);
 
-        // Of a group's rows, the gradients of the hidden layer's and of the outputs' biases.
+        // For each group, the summed gradients of its rows with respect to the hidden layer's biases and the outputs' biases.
         let of_groups = |grads: &[f32], width: usize| -> Option<Vec<f32>> {
             (self.groups < self.rows).then(|| group_sums(grads, self.groups, width))
         };

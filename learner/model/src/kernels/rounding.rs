@@ -1,4 +1,4 @@
-//! From f32 and bytes to the operands of products, element by element; images turned.
+//! Conversion of f32 values and bytes to operands of products, element by element, and transposition of images.
 
 use crate::kernels::isa::{Element, LANES, vectorized};
 
@@ -10,7 +10,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// Stores pixels as operands of a sum over windows, as [`Element::steps_of_bytes`].
+    /// Stores pixels as operands of a sum over windows: [`Element::steps_of_bytes`].
     pub(crate) fn store_steps_of_bytes<S>(
         simd,
         bytes: &'a [u8],
@@ -22,14 +22,14 @@ vectorized! {
 }
 
 vectorized! {
-    /// Rounds `floats` into `values`, which is as long.
+    /// Rounds `floats` into `values`, which has the same length.
     pub(crate) fn store<S>(simd, floats: &'a [f32], values: &'a mut [S::Element]) {
         S::Element::store(simd, floats, values);
     }
 }
 
 vectorized! {
-    /// Rounds rows of `cols` scalars into rows of `stride`, with zeros after them.
+    /// Rounds rows of `cols` scalars into rows of `stride`, padded with zeros.
     pub(crate) fn write_rows<S>(
         simd,
         values: &'a [f32],
@@ -47,7 +47,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// Elements as operands of a sum over windows, as [`Element::steps_of`].
+    /// Stores elements as operands of a sum over windows: [`Element::steps_of`].
     pub(crate) fn store_steps_of<S>(
         simd,
         values: &'a [S::Element],

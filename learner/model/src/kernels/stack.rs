@@ -1,5 +1,5 @@
 //! A stack of convolutions over one task's images, forward and backward, on slices.
-//! It knows no tensors; `conv` splits the batch and `convolution` computes each layer.
+//! This module knows no tensors: `conv` splits the batch and `convolution` computes each layer.
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
@@ -8,18 +8,18 @@ use crate::kernels::images::{Images, Pixels};
 use crate::kernels::isa::{Element, Simd};
 use crate::kernels::tasks::{cut_mut, parameters_len, prepared};
 
-/// The maps of each layer but the last: what forward leaves to backward.
+/// The maps of all layers but the last, which the forward pass keeps for the backward pass.
 pub(crate) type SavedActivations<E> = Vec<Buffer<E>>;
 
-/// Convolutions with their parameters as the kernels want them.
+/// Convolutions, their parameters packed for the kernels.
 pub(crate) struct Stack<S: Simd> {
     simd: S,
     layers: Vec<Convolution<S::Element>>,
 }
 
 impl<S: Simd> Stack<S> {
-    /// At least one layer; `parameters` has for each its weight [out, in, k, k], then its bias [out]. `images` says whether the images of
-    /// the first will need a gradient; all other layers' do in a backward pass, for which `backward` stands.
+    /// Prepares at least one layer. `parameters` holds each layer's weight [out, in, k, k], then its bias [out]. `backward` says whether
+    /// a backward pass follows. It computes the inputs' gradients of all layers but the first, and of the first if `images` is set.
     pub(crate) fn new(
         simd: S,
         shapes: &[ConvShape],
@@ -38,7 +38,7 @@ impl<S: Simd> Stack<S> {
         self.layers[0].shape.image_len()
     }
 
-    /// Runs `images` through the layers into `maps`, the last layer's output.
+    /// Passes `images` through the layers and writes the last layer's output into `maps`.
     pub(crate) fn forward<M: Element>(
         &self,
         images: Pixels<'_>,
@@ -59,10 +59,10 @@ impl<S: Simd> Stack<S> {
         saved
     }
 
-    /// Gradients for `grad_maps`, the gradient of the last layer's output `maps`; `saved` is from [`Stack::forward`].
+    /// Computes the gradients for `grad_maps`, the gradient of the last layer's output `maps`. `saved` is from [`Stack::forward`].
     ///
-    /// The result is the parameters' gradients, for each layer the weight's [k, k, in, out], then the bias's. The images' are
-    /// added to `grad_images`, if it is there.
+    /// Returns the parameters' gradients: for each layer the weight's [k, k, in, out], then the bias's. Adds
+    /// the images' gradient to `grad_images`, if given.
     pub(crate) fn backward(
         &self,
         images: Pixels<'_>,
@@ -74,7 +74,7 @@ impl<S: Simd> Stack<S> {
         let simd = self.simd;
         let shapes: Vec<_> = self.layers.iter().map(|layer| layer.shape).collect();
         let mut sums = Buffer::new(parameters_len(&shapes));
-        // Of the layer at hand; the last layer's is not ours.
+        // The gradient of the current layer's output. `None` for the last layer, whose gradient is `grad_maps`.
         let mut grad_output: Option<Buffer<f32>> = None;
         let layers = self.layers.iter().zip(cut_mut(&shapes, &mut sums));
         for (index, (layer, sums)) in layers.enumerate().rev() {
@@ -87,12 +87,12 @@ impl<S: Simd> Stack<S> {
             };
             match (saved.get(index), &grad_output) {
                 (Some(output), Some(grad)) => backward(simd, layer, input, output, grad, sums, to),
-                // Its output is f32.
+                // The last layer's output is f32.
                 _ => backward(simd, layer, input, maps, grad_maps, sums, to),
             }
             grad_output = grad_input;
         }
-        // Products with bytes that are scaled after them.
+        // Products with bytes are scaled only now.
         let scale = Images::<S::Element>::Pixels(images).scale();
         if scale != 1.0 {
             for sum in &mut sums[..shapes[0].weight_len()] {
@@ -103,7 +103,7 @@ impl<S: Simd> Stack<S> {
     }
 }
 
-/// What a layer takes: the maps of the one before it, or the images.
+/// Returns the input of a layer: the maps of the layer before it, or the images.
 fn input_of<'a, E: Element>(images: Pixels<'a>, before: Option<&'a Buffer<E>>) -> Images<'a, E> {
     before.map_or(Images::Pixels(images), |maps| Images::Maps(maps))
 }

@@ -1,5 +1,5 @@
 //! The stages of an IMPALA torso over one task's images, forward and backward, on slices: a convolution, a max pool, and two residual
-//! blocks x + conv(relu(conv(relu(x)))) each. It knows no tensors; `impala` splits the batch and `bordered` computes each convolution.
+//! blocks x + conv(relu(conv(relu(x)))) each. It knows no tensors: `impala` splits the batch, `bordered` computes each convolution.
 
 use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, pooled};
 use crate::kernels::bordered::{BorderedConvolution, Inside, store_active};
@@ -10,24 +10,24 @@ use crate::kernels::linear::relu_gradient;
 use crate::kernels::pool::{pool, unpool};
 use crate::kernels::tasks::{cut_mut, parameters_len, prepared};
 
-/// Every stage with its parameters as the kernels want them.
+/// All stages, their parameters packed for the kernels.
 pub(crate) struct Stages<S: Simd> {
     simd: S,
     convolutions: Vec<BorderedConvolution<S::Element>>,
 }
 
-/// What the forward pass of some images leaves to the backward pass.
+/// State that the forward pass of some images keeps for the backward pass.
 pub(crate) struct Saved<E: Element> {
-    /// Of each image, in their borders, the inputs of all convolutions but the first: each is the operand of a product, and above 0 where a
-    /// gradient passes the ReLU before it.
+    /// For each image, the inputs of all convolutions but the first, with their borders. Each is the operand
+    /// of a product. If a ReLU comes before it, it is above 0 exactly where a gradient passes that ReLU.
     inputs: Buffer<E>,
-    /// Of each image, the pixels that the pools took.
+    /// For each image, the index of the pixel that each pool window took.
     taken: Buffer<u8>,
 }
 
 impl<S: Simd> Stages<S> {
-    /// Stages of convolutions of these sizes; `parameters` has for each its weight [out, in, 3, 3], then its bias [out]. `backward` says
-    /// whether there will be a backward pass.
+    /// Prepares stages of convolutions with these shapes. `parameters` holds each one's weight
+    /// [out, in, 3, 3], then its bias [out]. `backward` says whether a backward pass follows.
     pub(crate) fn new(simd: S, shapes: &[ConvShape], parameters: &[f32], backward: bool) -> Self {
         let convolutions = prepared(shapes, parameters, |index, shape, [weight, bias]| {
             BorderedConvolution::new(simd, shape, weight, bias, backward && index > 0)
@@ -40,14 +40,14 @@ impl<S: Simd> Stages<S> {
         (first.height - 2) * (first.width - 2) * first.channels_in
     }
 
-    /// Scalars of an image's f3.
+    /// The number of scalars in f3 of one image.
     pub(crate) fn output_len(&self) -> usize {
         self.convolutions[self.convolutions.len() - 1]
             .shape()
             .map_len()
     }
 
-    /// Memory for what the forward pass of so many images leaves.
+    /// Allocates memory for what the forward pass of this many images keeps.
     pub(crate) fn saved(&self, images: usize) -> Saved<S::Element> {
         let (inputs, taken) = self.saved_lens();
         Saved {
@@ -56,7 +56,7 @@ impl<S: Simd> Stages<S> {
         }
     }
 
-    /// Scalars of an image in the two parts of [`Saved`].
+    /// The numbers of scalars per image in the two fields of [`Saved`].
     fn saved_lens(&self) -> (usize, usize) {
         let inputs = self.convolutions[1..].iter();
         let inputs = inputs.map(|it| it.shape().bordered_len::<S::Element>());
@@ -67,7 +67,7 @@ impl<S: Simd> Stages<S> {
         )
     }
 
-    /// f3 of some images, one after the other.
+    /// Computes f3 of some images, one after the other.
     pub(crate) fn forward(&self, images: &[u8], saved: &mut Saved<S::Element>, f3: &mut [f32]) {
         let (inputs, taken) = self.saved_lens();
         images
@@ -125,8 +125,8 @@ impl<S: Simd> Stages<S> {
         store_active(simd, &x, f3);
     }
 
-    /// The gradients of all parameters for `grad_f3`, where `saved` and `f3` are from the forward pass of `images`: for each
-    /// convolution the weight's [3, 3, in, out], then the bias's.
+    /// Computes the gradients of all parameters for `grad_f3`. `saved` and `f3` are from the forward pass of
+    /// `images`. Returns for each convolution the weight's gradient [3, 3, in, out], then the bias's.
     pub(crate) fn backward(
         &self,
         images: &[u8],
@@ -147,14 +147,14 @@ impl<S: Simd> Stages<S> {
                 pass_active(self.simd, f3, grad_f3, &mut grad);
                 self.backward_one(image, inputs, taken, grad, cut_mut(&shapes, &mut sums));
             });
-        // Products with bytes that are scaled after them.
+        // Products with bytes are scaled only now.
         for sum in &mut sums[..shapes[0].weight_len()] {
             *sum *= S::Element::BYTE_SCALE;
         }
         sums
     }
 
-    /// Adds one image's part to the `sums` of each convolution; `grad` is the gradient of the last stage's output.
+    /// Adds one image's gradients to the `sums` of each convolution. `grad` is the gradient of the last stage's output.
     fn backward_one(
         &self,
         image: &[u8],
@@ -208,27 +208,27 @@ impl<S: Simd> Stages<S> {
     }
 }
 
-/// Scalars of what the pool after `conv` makes.
+/// The number of scalars in the output of the pool after `conv`.
 fn pooled_len<E: Element>(conv: &BorderedConvolution<E>) -> usize {
     let (height, width, channels) = pooled(conv.shape().output());
     height * width * channels
 }
 
-/// Memory for the input of `of` at the start of `inputs`, which are shortened by it.
+/// Takes the memory for the input of `of` off the start of `inputs`.
 fn cut_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a mut [E]) -> &'a mut [E] {
     let (own, rest) = std::mem::take(inputs).split_at_mut(of.shape().bordered_len::<E>());
     *inputs = rest;
     own
 }
 
-/// The input of `of` at the end of `inputs`, which are shortened by it.
+/// Takes the input of `of` off the end of `inputs`.
 fn last_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a [E]) -> &'a [E] {
     let own;
     (*inputs, own) = cut_last(inputs, of.shape().bordered_len::<E>());
     own
 }
 
-/// All but the last `len`, and those.
+/// Splits `values` into all but the last `len`, and the last `len`.
 fn cut_last<T>(values: &[T], len: usize) -> (&[T], &[T]) {
     values.split_at(values.len() - len)
 }
@@ -250,7 +250,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// Adds the gradients before a ReLU that gave `active`.
+    /// Adds to `to` the gradients before a ReLU whose output was `active`.
     fn add_active<S>(simd, active: &'a [S::Element], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
             *to += relu_gradient(active.value(), grad);

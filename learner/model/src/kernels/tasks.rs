@@ -1,5 +1,5 @@
-//! How a batch of images is cut into tasks, and a vector of parameters into those of convolutions.
-//! It knows neither tensors nor instruction sets.
+//! Cuts a batch of images into tasks, and a vector of parameters into those of the convolutions.
+//! This module knows neither tensors nor instruction sets.
 
 use std::ops::Range;
 
@@ -11,15 +11,15 @@ use crate::kernels::linear::add_in_order;
 
 /// A batch whose images are taken a few at a time.
 pub(crate) struct Tasks {
-    /// Images of the batch.
+    /// The number of images in the batch.
     pub(crate) count: usize,
-    /// Images of a task. Fixed, so that sums are taken in the same order whatever the number of threads.
+    /// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
     pub(crate) images: usize,
     pub(crate) image_len: usize,
     pub(crate) map_len: usize,
 }
 
-/// Where the scalars of a task's images are, and those of their maps.
+/// The ranges of the scalars of a task's images and of their maps.
 pub(crate) struct Task {
     pub(crate) images: Range<usize>,
     pub(crate) maps: Range<usize>,
@@ -35,7 +35,7 @@ impl Tasks {
         }
     }
 
-    /// Has `forward` make the maps of every task's images, whose scalars it gets the place of; what it leaves of each task.
+    /// Calls `forward` for each task with the range of its images' scalars and the maps to fill. Returns the results in task order.
     pub(crate) fn forward<T: Send>(
         &self,
         maps: &mut [f32],
@@ -48,8 +48,8 @@ impl Tasks {
             .collect()
     }
 
-    /// The gradient of the parameters of `shapes`, of which `backward` gives each task's part with weights as [k, k, in, out]. It gets what
-    /// the forward pass left, and the task's gradients in `grad_images`, which has one for every scalar or none.
+    /// Returns the gradient of the parameters of `shapes`. `backward` computes each task's part, with weights as [k, k, in, out].
+    /// It receives the task's `saved` and its part of `grad_images`, which is empty or has one scalar for each of the images'.
     pub(crate) fn backward<T: Sync>(
         &self,
         shapes: &[ConvShape],
@@ -68,12 +68,12 @@ impl Tasks {
     }
 }
 
-/// Scalars of all layers' parameters.
+/// Returns the number of scalars in all layers' parameters.
 pub(crate) fn parameters_len(shapes: &[ConvShape]) -> usize {
     shapes.iter().map(ConvShape::parameters_len).sum()
 }
 
-/// The weight and the bias of each convolution, one after the other in `parameters`.
+/// Cuts `parameters` into the weight and the bias of each convolution.
 pub(crate) fn cut<'a>(shapes: &[ConvShape], mut parameters: &'a [f32]) -> Vec<[&'a [f32]; 2]> {
     let mut parts = Vec::with_capacity(shapes.len());
     for shape in shapes {
@@ -84,7 +84,7 @@ pub(crate) fn cut<'a>(shapes: &[ConvShape], mut parameters: &'a [f32]) -> Vec<[&
     parts
 }
 
-/// As [`cut`].
+/// As [`cut`], but mutable.
 pub(crate) fn cut_mut<'a>(
     shapes: &[ConvShape],
     mut parameters: &'a mut [f32],
@@ -98,7 +98,7 @@ pub(crate) fn cut_mut<'a>(
     parts
 }
 
-/// What `prepare` makes of each convolution's number, sizes, and weight and bias in `parameters`; on the pool, which all wait for.
+/// Calls `prepare` with each convolution's index, shape, weight and bias. Runs on the pool, because every task waits for the result.
 pub(crate) fn prepared<C: Send>(
     shapes: &[ConvShape],
     parameters: &[f32],
@@ -111,7 +111,7 @@ pub(crate) fn prepared<C: Send>(
         .collect()
 }
 
-/// `sums` with the weights back as [out, in, k, k].
+/// Returns `sums` with the weights reordered to [out, in, k, k].
 pub(crate) fn unpacked(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
     let mut result = vec![0.0; sums.len()];
     let (from, to) = (cut(shapes, sums), cut_mut(shapes, &mut result));

@@ -1,4 +1,4 @@
-//! The scalars behind candle's tensors and storages on the CPU.
+//! Access to the scalars of candle's CPU tensors and storages.
 
 use std::ops::{Deref, Range};
 
@@ -6,12 +6,12 @@ use candle_core::{CpuStorage, Layout, Result, Storage, StorageRef, Tensor, bail}
 
 use crate::kernels::images::Pixels;
 
-/// The scalars of a contiguous f32 storage.
+/// Returns the scalars of a contiguous f32 storage.
 pub fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     Ok(&storage.as_slice::<f32>()?[range(layout)?])
 }
 
-/// What an operation is given.
+/// An input of an operation.
 #[derive(Clone, Copy)]
 pub(crate) struct Input<'a> {
     storage: &'a CpuStorage,
@@ -27,7 +27,7 @@ impl<'a> Input<'a> {
         floats(self.storage, self.layout)
     }
 
-    /// Contiguous images of u8 or f32.
+    /// Returns contiguous images of u8 or f32.
     pub(crate) fn pixels(self) -> Result<Pixels<'a>> {
         match self.storage {
             CpuStorage::U8(bytes) => Ok(Pixels::Bytes(&bytes[range(self.layout)?])),
@@ -36,7 +36,7 @@ impl<'a> Input<'a> {
     }
 }
 
-/// The storage, which must be on the CPU.
+/// Returns the storage, or an error if it is not on the CPU.
 pub(crate) fn cpu(storage: &Storage) -> Result<&CpuStorage> {
     match storage {
         Storage::Cpu(storage) => Ok(storage),
@@ -51,13 +51,13 @@ fn range(layout: &Layout) -> Result<Range<usize>> {
     }
 }
 
-/// The scalars of a tensor, which is locked as long as they are held.
+/// The scalars of a tensor. The tensor's storage is locked while this value lives.
 pub struct Values<'a> {
     storage: StorageRef<'a>,
     range: Range<usize>,
 }
 
-/// The scalars of a contiguous f32 tensor on the CPU.
+/// Returns the scalars of a contiguous f32 tensor on the CPU.
 pub fn values_of(tensor: &Tensor) -> Result<Values<'_>> {
     let (storage, layout) = tensor.storage_and_layout();
     cpu(&storage)?.as_slice::<f32>()?;

@@ -1,8 +1,8 @@
 //! Convolutions and the fully connected layer on their maps as one candle operation with gradients.
 //! It runs on the CPU only.
 //!
-//! Where nothing but that layer reads the maps they are no tensor: candle would add their gradient to fresh zeros on a single thread,
-//! and they are turned into the order of the layer's weight in the cache of the core that made them.
+//! If only that layer reads the maps, they need not be a tensor, whose gradient candle would add to fresh zeros on a
+//! single thread. Here the core that computes the maps transposes them in its cache to the order of the layer's weight.
 
 use candle_core::{Result, Tensor, bail};
 
@@ -19,11 +19,11 @@ use crate::kernels::product::Product;
 use crate::kernels::stack::SavedActivations;
 use crate::kernels::tensors::{Input, cpu, values_of};
 
-/// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack), to the last bit: [B, outputs] of
-/// `images` [B, H, W, C] u8.
+/// Computes [B, outputs] of `images` [B, H, W, C] u8: bit for bit
+/// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack).
 ///
-/// Gradients of `weight` [outputs, inputs] and `bias` [outputs] are summed in place, so that a backward pass has to be one of
-/// [`Backward::of`](crate::Backward::of).
+/// Gradients of `weight` [outputs, inputs] and `bias` [outputs] are summed in place, so only
+/// [`Backward::of`](crate::Backward::of) can run the backward pass.
 pub(crate) fn torso(
     images: &Tensor,
     layers: &[ConvLayerTensors<'_>],
@@ -56,7 +56,7 @@ pub(crate) fn torso(
 
 struct Torso<S: Simd> {
     stack: ConvStack<S>,
-    /// Of the fully connected layer.
+    /// Weight of the fully connected layer, whose bias is `bias`.
     weight: Tensor,
     bias: Tensor,
     inputs: usize,
@@ -64,9 +64,9 @@ struct Torso<S: Simd> {
     precision: Precision,
 }
 
-/// What the forward pass leaves to the backward pass.
+/// State that the forward pass keeps for the backward pass.
 struct Kept<E: Element> {
-    /// Of each task, the maps of all layers but the last, and those of the last.
+    /// For each task, the maps of all layers but the last, and those of the last.
     tasks: Vec<(SavedActivations<E>, Buffer<f32>)>,
     /// The last layer's maps, flattened.
     flat: Buffer<f32>,

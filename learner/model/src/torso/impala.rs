@@ -1,6 +1,6 @@
-//! `impala`: stages of a convolution, a max pool and two residual blocks, and a fully connected layer on all of the last one's map.
+//! `impala`: stages of a convolution, a max pool and two residual blocks, then a fully connected layer on the whole last map.
 //! Source: Espeholt et al. 2018, the residual network of the Procgen paper (Cobbe et al. 2020).
-//! `impoola`: the same with a fully connected layer on the mean of the map over its locations. Source: Trumpp et al. 2025 (arXiv 2503.05546).
+//! `impoola`: the same, with the fully connected layer on the map's mean over locations. Source: Trumpp et al. 2025 (arXiv 2503.05546).
 
 use candle_core::{Result, Tensor};
 
@@ -25,14 +25,14 @@ const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "block2.conv2",
 ];
 
-/// On an input of (height, width, channels).
+/// The torso `impala` or `impoola`, on an input of (height, width, channels).
 #[derive(Debug)]
 pub(crate) struct Impala {
     pub(super) input: (usize, usize, usize),
     pub(super) widths: Vec<usize>,
-    /// Whether the second convolution of each block starts smaller, by the square root of the number of blocks.
+    /// Whether the initial weight of each block's second convolution is divided by the square root of the number of blocks.
     pub(super) scale_blocks: bool,
-    /// Whether the fully connected layer takes the mean of f3 over its locations, as `impoola`'s does.
+    /// Whether the fully connected layer takes the mean of f3 over its locations, as in `impoola`.
     pub(super) takes_mean: bool,
 }
 
@@ -130,7 +130,7 @@ impl<S: Simd> ActingTorso for ActingStages<S> {
     }
 }
 
-/// The mean of `map` [locations, channels] over its locations.
+/// Computes the mean of `map` [locations, channels] over its locations.
 fn mean_of_locations(map: &[f32], channels: usize) -> Vec<f32> {
     let mut sums = vec![0.0; channels];
     add_rows(&mut sums, map);

@@ -1,5 +1,5 @@
-//! The menu of torsos: a line of [`TorsoName::build`] each; `impoola` is `impala` with another last layer.
-//! What a torso is stands in `interface`.
+//! The menu of torsos, one arm of [`TorsoName::build`] each. `impoola` is `impala` with another last layer.
+//! The interface of a torso is in `interface`.
 
 mod impala;
 pub(crate) mod interface;
@@ -13,20 +13,20 @@ use self::{impala::Impala, interface::Torso, nature::Nature};
 use crate::error::{ModelError, Result};
 use crate::geometry::{ConvLayer, reach};
 
-/// Which torso a network has: `model.torso`.
+/// The torso of a network: `model.torso`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TorsoName {
     /// The convolutions of `conv`. Source: Mnih et al. 2015.
     #[default]
     Nature,
-    /// A residual network, a stage for each width of `channels`. Source: Espeholt et al. 2018.
+    /// A residual network with a stage for each entry of `channels`. Source: Espeholt et al. 2018.
     Impala,
-    /// The same, and f4 takes the mean of its map. Source: Trumpp et al. 2025.
+    /// As `Impala`, but f4 reads the mean of f3 over its locations. Source: Trumpp et al. 2025.
     Impoola,
 }
 
-/// The settings of all torsos; each reads its part.
+/// The settings of all torsos. Each torso reads its own.
 pub(crate) struct TorsoSettings<'a> {
     pub(crate) conv: &'a [ConvLayer],
     pub(crate) channels: &'a [usize],
@@ -43,7 +43,7 @@ impl TorsoName {
         }
     }
 
-    /// The settings that are others' alone.
+    /// Returns the settings that only other torsos use.
     pub const fn settings_of_others(self) -> &'static [&'static str] {
         match self {
             Self::Nature => &["channels", "scale_blocks"],
@@ -51,7 +51,7 @@ impl TorsoName {
         }
     }
 
-    /// The torso on an input of (height, width, channels).
+    /// Builds the torso for an input of (height, width, channels).
     pub(crate) fn build(
         self,
         input: (usize, usize, usize),
@@ -68,16 +68,16 @@ impl TorsoName {
         }
     }
 
-    /// Rows and columns, from the upper left corner of an image of (height, width), that it reads; `None` if layers of `conv` do not fit.
+    /// Returns (height, width) of the part of `image` that the torso reads, from the upper left corner. `None` if `conv` does not fit.
     pub fn reach(self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
         match self {
             Self::Nature => reach(conv, image),
-            // With a border of zeros around it, every pixel is in a window.
+            // With zero padding, every pixel is in a window.
             Self::Impala | Self::Impoola => Some(image),
         }
     }
 
-    /// Checks that `settings` has what this torso needs, and nothing that is another's.
+    /// Checks that `settings` has what this torso needs and no setting of another torso.
     ///
     /// # Errors
     /// [`ModelError::Config`] names the setting and the torso.

@@ -1,4 +1,4 @@
-//! `nature`: convolutions without padding, each followed by ReLU, and a fully connected layer on all of the last one's map.
+//! `nature`: convolutions without padding, each followed by ReLU, then a fully connected layer on the whole last map.
 //! Source: Mnih et al. 2015, the paper's network.
 
 use candle_core::{Result, Tensor};
@@ -19,14 +19,14 @@ use crate::layers::LayerShape;
 #[derive(Debug)]
 pub(crate) struct Nature {
     input: (usize, usize, usize),
-    /// Up to the first layer that does not fit.
+    /// Shapes of the layers before the first one that does not fit.
     shapes: Vec<ConvShape>,
-    /// All layers, those that do not fit included.
+    /// All layers, including those that do not fit.
     conv: Vec<ConvLayer>,
 }
 
 impl Nature {
-    /// On an input of (height, width, channels).
+    /// Builds the torso for an input of (height, width, channels).
     pub(crate) fn new(input: (usize, usize, usize), conv: &[ConvLayer]) -> Self {
         let mut maps = input;
         let shapes = conv.iter().map_while(|layer| {

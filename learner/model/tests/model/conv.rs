@@ -1,12 +1,12 @@
-//! The convolution against candle's own, computed in f64.
-//! Its speed is measured in the benches.
+//! The convolution compared with candle's own, computed in f64.
+//! The benches measure its speed.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use driml_model::{Precision, conv_stack, conv2d_relu};
 
 use crate::support::{assert_layer, bytes, double, floats, rng, rounded, values, variable};
 
-/// Images [batch, height, width, channels], channels of the output, kernel, stride.
+/// Images [batch, height, width, channels], output channels, kernel, stride.
 type Shape = ([usize; 4], usize, usize, usize);
 
 const SHAPES: [Shape; 8] = [
@@ -20,9 +20,9 @@ const SHAPES: [Shape; 8] = [
     ([17, 6, 6, 16], 16, 3, 1),
 ];
 
-/// relu(conv2d + bias) of channels-last images by candle's operations.
+/// Computes relu(conv2d + bias) of channels-last images with candle's operations.
 ///
-/// Pixels that no window reaches are cut off first: candle's backward pass fails on them.
+/// Pixels that no window covers are cut off first, because candle's backward pass fails on them.
 fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
     let used = |size: usize, kernel: usize| (size - kernel) / stride * stride + kernel;
     let (height, width) = (
@@ -37,7 +37,7 @@ fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Resu
     maps.permute((0, 2, 3, 1))?.broadcast_add(bias)?.relu()
 }
 
-/// Where operands are bf16 already, nothing is rounded, and results are as exact as in f32.
+/// Operands that are bf16 already are not rounded, so bf16 results are as exact as in f32.
 #[test]
 fn images_of_floats_and_of_bytes_match_candle_forward_and_backward() -> Result<()> {
     let rng = &mut rng(2);

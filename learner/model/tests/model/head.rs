@@ -1,5 +1,5 @@
-//! The head: its streams, its noise, and values over the atoms of a support; and the layers of a loss.
-//! What comes before it is `network`'s.
+//! The C51 head: its streams, its noise, and values for different supports; and loss layers.
+//! The layers before the head are tested in `network`.
 
 use candle_core::{Device, Result, Tensor};
 use driml_model::{Backward, HeadNoise, Kernels, LossLayer, ModelConfig, Network};
@@ -8,7 +8,7 @@ use crate::support::{
     NOISY, assert_close, floats, frames, parameters, rng, small, small_with, values,
 };
 
-/// At the start of a run every sigma is 0.5 / sqrt(19); noise is for noisy layers alone.
+/// Every sigma starts at 0.5 / sqrt(19). Noise for a head without noisy layers is an error.
 #[test]
 fn a_noisy_layer_starts_with_its_sigma() {
     let noisy = small_with(NOISY);
@@ -24,7 +24,7 @@ fn a_noisy_layer_starts_with_its_sigma() {
     assert!(plain.logits(&f4, noise.as_ref()).is_err());
 }
 
-/// An offset of the support is one of the values, whatever computes them.
+/// Moving the support moves the values by the same offset, with every kind of kernels.
 #[test]
 fn values_over_a_support_far_from_0_are_those_near_it_moved() {
     let near = ModelConfig {
@@ -48,7 +48,7 @@ fn values_over_a_support_far_from_0_are_those_near_it_moved() {
         for kernels in [Kernels::FUSED, Kernels::Candle] {
             for (found, near) in q_values(&far, kernels).iter().zip(&expected) {
                 let error = (found - offset - near).abs();
-                // Half of a value's last place, and what the sums of f32 have by themselves.
+                // Half of a value's last place, and the error of the f32 sums.
                 let allowed = offset.abs() / 2f64.powi(24) + 4e-7;
                 assert!(error <= allowed, "{kernels:?} at {offset}: {error:e} off");
             }

@@ -1,12 +1,11 @@
-//! The fully connected layer against candle's own operations, computed in f64, for every way to give its bias.
-//! The same for ReLU at zero.
+//! The fully connected layer compared with candle's operations in f64, for every way to give its bias; and ReLU at zero.
 
 use candle_core::{Device, Result, Tensor, Var};
 use driml_model::{Precision, linear, relu};
 
 use crate::support::{assert_layer, double, floats, rng, rounded, values, variable};
 
-/// The layer by candle's operations: x [rows, in], b [out].
+/// Computes the layer with candle's operations: x [rows, in], b [out].
 fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
     let y = x.matmul(&w.t()?)?.broadcast_add(b)?;
     if with_relu { y.relu() } else { Ok(y) }
@@ -27,7 +26,7 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
             .into_iter()
             .flat_map(|with_relu| Precision::ALL.map(|precision| (with_relu, precision)))
         {
-            // What is bf16 already is not rounded, and the result is as exact as in f32.
+            // Operands that are bf16 already are not rounded, so the result is as exact as in f32.
             let args = [
                 rounded(&variable(&[rows, inputs], rng), precision),
                 rounded(&variable(&[outputs, inputs], rng), precision),

@@ -1,5 +1,5 @@
-//! Tests of the network from outside: kernels against stock candle operations, weights, the policy.
-//! They know nothing of losses; the learner's tests check the gradients of those.
+//! Tests of the network through its public interface: kernels against candle's operations, weights, the policy.
+//! They know nothing of losses, whose gradients the learner's tests check.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 mod conv;

@@ -1,5 +1,5 @@
-//! The whole network: the DIM heads against their plain formula, determinism, and errors for what does not fit.
-//! Values against another framework are the learner's `parity`.
+//! The whole network: the DIM heads against their plain formula, determinism, and errors for wrong inputs.
+//! The learner's `parity` tests compare values with another framework.
 
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
@@ -12,7 +12,7 @@ use crate::support::{
     small, variable, with_biases,
 };
 
-/// Every output of the network for a batch, one after the other, and the gradients of their weighted sum.
+/// Returns every output of the network for a batch, one after the other, and the gradients of their weighted sum.
 fn outputs_and_gradients(
     config: &ModelConfig,
     parameters: &Parameters,
@@ -43,8 +43,8 @@ fn outputs_and_gradients(
 
 #[test]
 fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
-    // The small ones have strides that divide their kernels and one that does not. In the second layer of this one, rows are left over
-    // and columns are not.
+    // The small networks have two strides that divide the kernel and one that does not. In the second layer
+    // of this one, rows are left over but no columns.
     let uneven = ModelConfig {
         width: 48,
         ..small()
@@ -192,7 +192,7 @@ fn configurations_that_cannot_work_are_errors() {
         for channels in [&[][..], &[0], &[8, 0], &[usize::MAX], &[65_536]] {
             assert!(with(channels).validate().is_err(), "{channels:?}");
         }
-        // The smallest frame that there is.
+        // The smallest possible frame.
         let one = ModelConfig {
             height: 1,
             width: 1,
@@ -211,7 +211,7 @@ fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
     let config = small();
     let (parameters, batch) = (with_biases(&config), frames(&config, 9, &mut rng(4)));
     let network = Network::new(&config, &parameters, Kernels::FUSED).unwrap();
-    // Every parameter twice, once through each half of the batch.
+    // Every parameter is used twice, once for each half of the batch.
     let features = network.features(&batch).unwrap();
     let halves = [features.narrow(0, 4)?, features.narrow(4, 5)?];
     let losses = halves.map(|half| network.logits(&half.f4, None).unwrap().sqr()?.sum_all());

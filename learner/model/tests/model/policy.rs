@@ -1,5 +1,5 @@
-//! The policy against the network it must agree with.
-//! Loading broken weights is tested with the weights.
+//! The policy compared with the network, with which it must agree.
+//! `weights` tests the loading of broken weights.
 
 use driml_model::{HeadConfig, HeadNoise, Kernels, Network, PolicyNetwork, Precision, TorsoName};
 
@@ -44,10 +44,10 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
     }
 }
 
-/// An actor leaves states out in which chance decides: the others' values must not depend on it.
+/// An actor skips states in which chance decides. The values of other states must not depend on that.
 #[test]
 fn a_state_has_the_same_values_in_any_company() {
-    // The last layer's maps are an even and an odd number of scalars.
+    // The last layer's maps have an even number of scalars, and then an odd number.
     let mut odd = small();
     (odd.conv[2].out, odd.conv[2].kernel, odd.conv[2].stride) = (7, 3, 2);
     for config in [small(), odd, residual(TorsoName::Impala)] {
@@ -86,7 +86,7 @@ fn new_weights_take_effect() {
     assert_eq!(q_values(&mut policy, &config, &frames), first);
 }
 
-/// Values that are not finite are in the table of properties of `driml experiment stability`.
+/// The property table of `driml experiment stability` covers values that are not finite.
 #[test]
 fn wrong_lengths_are_errors() {
     let config = small().without_dim();
@@ -99,7 +99,7 @@ fn wrong_lengths_are_errors() {
     assert!(policy.q_values(&frames, &mut [0.0; 9]).is_err());
 }
 
-/// Weights that come have no noise until it is drawn: evaluation, which draws none, acts by the means.
+/// New weights have no noise until noise is drawn. Evaluation draws none and thus acts by the means.
 #[test]
 fn noise_is_drawn_when_it_is_asked_for() {
     let config = small_with(HeadConfig::RAINBOW);

@@ -1,5 +1,5 @@
-//! What several tests need: random tensors, comparisons, a small network.
-//! No test lives here.
+//! Helpers of several tests: random tensors, comparisons, small networks.
+//! This file holds no tests.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use driml_model::{
@@ -49,7 +49,7 @@ pub(crate) fn bits(tensor: &Tensor) -> Vec<u32> {
     values.iter().map(|value| value.to_bits()).collect()
 }
 
-/// Asserts equal shapes, and a difference whose 2-norm is at most `tolerance` of the wanted tensor's.
+/// Asserts equal shapes, and a difference whose 2-norm is at most `tolerance` times that of `wanted`.
 #[track_caller]
 pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, tolerance: f64) {
     assert_eq!(found.dims(), wanted.dims(), "{what}");
@@ -63,7 +63,7 @@ pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, toleranc
     );
 }
 
-/// Asserts that a layer of `args` and the gradients of their weighted sum are those of `reference`, which gets the same in f64.
+/// Asserts that a layer of `args`, and the gradients of its weighted sum, match those of `reference` on the same `args` in f64.
 ///
 /// The slopes are rounded to `precision`: where operands are rounded already, results are as exact in bf16 as in f32.
 pub(crate) fn assert_layer(
@@ -90,7 +90,7 @@ pub(crate) fn assert_layer(
     Ok(())
 }
 
-/// A small network with all heads; its sizes are no multiples of anything.
+/// A small network with all heads, whose widths do not fill registers.
 pub(crate) fn small() -> ModelConfig {
     ModelConfig {
         height: 36,
@@ -168,7 +168,7 @@ pub(crate) fn policy(
     PolicyNetwork::new(config, &weights, precision).unwrap()
 }
 
-/// The values of five actions for each of these frames.
+/// Returns the values of five actions for each of these frames.
 pub(crate) fn q_values(
     policy: &mut PolicyNetwork,
     config: &ModelConfig,
@@ -179,7 +179,7 @@ pub(crate) fn q_values(
     values
 }
 
-/// A variable with the values of `tensor` rounded to `precision`.
+/// Returns a variable with the values of `tensor` rounded to `precision`.
 pub(crate) fn rounded(tensor: &Tensor, precision: Precision) -> Var {
     let rounded = match precision {
         Precision::F32 => tensor.clone(),
@@ -191,7 +191,7 @@ pub(crate) fn rounded(tensor: &Tensor, precision: Precision) -> Var {
     Var::from_tensor(&rounded.detach()).unwrap()
 }
 
-/// Initial biases are 0; tests want them to matter.
+/// Initial parameters with random biases, which would otherwise be 0 and not matter.
 pub(crate) fn with_biases(config: &ModelConfig) -> Parameters {
     let (parameters, rng) = (parameters(config, 7), &mut rng(8));
     for (name, var) in parameters

@@ -1,5 +1,5 @@
-//! Parameters: how each starts, round trips, and an error instead of a panic for every kind of broken file.
-//! The two laws of initial weights are tested in themselves where they are drawn.
+//! Parameters: their initial values, round trips, and an error instead of a panic for every kind of broken file.
+//! The two distributions of initial weights are tested in `init`.
 
 use std::collections::HashMap;
 
@@ -28,7 +28,7 @@ fn the_seed_decides_the_weights() {
     );
 }
 
-/// The layers that start as PyTorch's linear layers do; all others start orthogonal with gain sqrt(2) and without a bias.
+/// The layers that start like PyTorch's linear layers. All others start orthogonal with gain sqrt(2) and zero bias.
 const UNIFORM: [&str; 5] = [
     "head",
     "dim.psi4.hidden",
@@ -97,7 +97,7 @@ fn residual_blocks_start_smaller_where_that_is_asked_for() {
         if found != wanted {
             smaller.push(name);
             for (found, wanted) in found.iter().zip(wanted) {
-                // Four blocks.
+                // The network has four blocks, so the weights are halved.
                 assert!((found - wanted / 2.0).abs() < 1e-7, "{name}");
             }
         }
@@ -173,7 +173,7 @@ fn tensors_that_do_not_fit_are_named() {
     }
 }
 
-/// Loads the file both ways; both must fail and leave the policy as it was.
+/// Loads the file as parameters and as a policy. Both must fail, and the policy must stay as it was.
 fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
     assert!(
         Parameters::load_safetensors(config, file, &Device::Cpu).is_err(),
@@ -224,7 +224,7 @@ fn corrupted_headers_never_panic() {
         for flip in [1u8, 0x10, 0x80] {
             let mut broken = file.clone();
             broken[at] ^= flip;
-            // A flipped bit may turn a space into nothing that matters; it must only never panic.
+            // A flipped bit may have no effect, for example in padding spaces. It must never cause a panic.
             drop(Parameters::load_safetensors(&config, &broken, &Device::Cpu));
         }
     }

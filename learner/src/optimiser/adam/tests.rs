@@ -1,5 +1,5 @@
-//! Adam by itself: steps beyond the finite numbers, and dead moments.
-//! That steps and moments are those of float64, in long runs too, is in the table of properties of `driml experiment stability`.
+//! Adam by itself: steps that overflow, and the moments of gradients that have become 0.
+//! `driml experiment stability` compares steps and moments with float64, in long runs too.
 
 use super::*;
 
@@ -25,7 +25,7 @@ fn moments_of_a_gradient_that_is_gone_end_at_zero() {
             }
             (m.clone(), v.clone())
         };
-        // A square that a float holds.
+        // Whether an f32 holds the square.
         let is_held = size > 1e-15;
         run(&g, 10);
         g[..8].fill(0.0);
@@ -39,7 +39,7 @@ fn moments_of_a_gradient_that_is_gone_end_at_zero() {
     }
 }
 
-/// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.
+/// Whether a step is finite for this parameter and gradient, which are the last of `elements` elements.
 fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
     let rule = Rule::new(settings, 1, 1.0);
     let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);

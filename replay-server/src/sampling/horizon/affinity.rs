@@ -1,5 +1,5 @@
-//! The action affinity that the adaptive rule walks along: the newest matrix that the learner sent.
-//! It does not estimate: how A comes about is the learner's.
+//! The action affinity that the adaptive rule uses: the newest matrix that the learner sent.
+//! Only the learner estimates the matrix.
 
 use driml_protocol::{AffinityUpdate, CodecError};
 use serde::{Deserialize, Serialize};
@@ -8,14 +8,14 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affinity {
     version: u64,
-    /// Whether the next matrix is newer whatever its version: it comes from another learner.
+    /// Whether to take the next matrix whatever its version, as it comes from another learner.
     from_another: bool,
     num_actions: u32,
     matrix: Vec<f32>,
 }
 
 impl Affinity {
-    /// Before the learner's first: the softmax of zeros, 1 / `num_actions` everywhere, version 0.
+    /// Returns the matrix before the learner's first: 1 / `num_actions` everywhere, the softmax of zeros, version 0.
     pub fn uniform(num_actions: u32) -> Self {
         let n = num_actions as usize;
         Self {
@@ -26,7 +26,7 @@ impl Affinity {
         }
     }
 
-    /// The matrices that come from now on are another learner's, which counts its versions from an earlier update.
+    /// Expects the next matrices from another learner, whose versions start from an earlier update.
     pub fn expect_another_source(&mut self) {
         self.from_another = true;
     }
@@ -42,19 +42,19 @@ impl Affinity {
         Ok(())
     }
 
-    /// Whether it is one for so many actions, and of probabilities.
+    /// Whether the matrix is for this number of actions and consists of probabilities.
     pub(crate) fn is_for(&self, num_actions: u32) -> bool {
         let n = num_actions as usize;
         let are_probabilities = self.matrix.iter().all(|p| (0.0..=1.0).contains(p));
         self.num_actions == num_actions && self.matrix.len() == n * n && are_probabilities
     }
 
-    /// Version in use; 0 is the uniform one.
+    /// Returns the version in use; 0 is the uniform matrix.
     pub const fn version(&self) -> u64 {
         self.version
     }
 
-    /// A[from, to].
+    /// Returns A[from, to].
     pub fn get(&self, from: u8, to: u8) -> f32 {
         self.matrix[usize::from(from) * self.num_actions as usize + usize::from(to)]
     }

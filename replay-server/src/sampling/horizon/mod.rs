@@ -1,5 +1,5 @@
-//! How far ahead a positive lies: a line a rule, and a file for the adaptive one.
-//! It does not know the ring: the actions of one window come in, k comes out.
+//! The rules that draw k, the distance from an anchor to its positive: a match arm per rule, and a file for the adaptive one.
+//! They do not know the ring: they get the actions of one window and return k.
 
 pub mod affinity;
 pub mod nhg;
@@ -11,7 +11,7 @@ pub use affinity::Affinity;
 
 /// Draws k for an anchor whose next `actions.len()` states lie in its episode and level.
 ///
-/// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left). Result in 1..=H, of several positives the furthest; 0 where H is 0
+/// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left). Result in 1..=H, the furthest of several positives; 0 if H is 0
 /// or no positive is served.
 /// Source: Mazoure et al. 2020, Deep Reinforcement and InfoMax Learning.
 pub(crate) fn draw_k(

@@ -1,5 +1,5 @@
-//! Which transitions are drawn as anchors: what a rule of `replay.sampling` does, what of it is kept, and a file for each.
-//! What can be an anchor is decided in `episodes`, and so is what is made of one.
+//! Draws anchors: the interface of the rules of `replay.sampling`, the state that is kept of them, and a file per rule.
+//! `episodes` decides which transitions can be anchors, and makes the rows.
 
 pub(crate) mod prioritised;
 mod sum_tree;
@@ -14,34 +14,34 @@ use crate::{
     storage::ring::{Link, Ring},
 };
 
-/// What became of the priorities that the learner has sent, in rows.
+/// Counts, in rows, of what became of the priorities that the learner has sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PriorityCounts {
-    /// Rows whose transition has the priority now.
+    /// Rows whose priority was set.
     pub set: u64,
-    /// Rows whose transition was overwritten meanwhile, or was drawn by an earlier life of the replay server.
+    /// Rows whose transition was overwritten before, or was drawn by an earlier incarnation of the replay server.
     pub gone: u64,
-    /// Rows of updates that had come before.
+    /// Rows of repeated updates.
     pub repeated: u64,
 }
 
-/// A rule by which anchors are drawn. What only rules with priorities do has a default.
+/// A rule that draws anchors. Methods that only prioritised rules need have a default.
 pub(crate) trait RowSampler: Send {
-    /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
+    /// Notes that consecutive transitions of one stream were stored, from index `first` on. `link` is the link of the first one.
     fn stored(&mut self, _ring: &Ring, _first: u64, _link: Link) {}
 
     fn forget(&mut self, _ring: &Ring) {}
 
-    /// Leaves the window of an anchor in `window`; false if there is none.
+    /// Draws an anchor and writes its window to `window`. Returns false if no anchor exists.
     fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool;
 
-    /// The probability with which each draw gives the anchor `index`; none where all anchors are equally likely.
+    /// Returns the probability that a draw gives the anchor `index`; `None` if all anchors are equally likely.
     fn probability(&self, _index: u64) -> Option<f64> {
         None
     }
 
-    /// Takes the priorities that the learner found; those drawn by another `origin` change nothing. On an error, which says why for a
-    /// person, nothing has changed.
+    /// Sets the priorities that the learner found; rows that another `origin` drew change nothing. An error is the reason, for a person;
+    /// nothing has changed then.
     fn update(
         &mut self,
         _ring: &Ring,
@@ -51,34 +51,34 @@ pub(crate) trait RowSampler: Send {
         Err("priorities, in a run that draws uniformly".into())
     }
 
-    /// What became of the priorities that came; none where there are no priorities.
+    /// Returns what became of the priorities received; `None` if the rule has no priorities.
     fn priority_counts(&self) -> Option<PriorityCounts> {
         None
     }
 
-    /// What decides the next draws, beside what is held.
+    /// Returns the state that determines the next draws, besides the transitions held.
     fn state(&self, ring: &Ring) -> RowsState;
 
-    /// Restores a state, except for transitions that are no longer held, or were not. `oldest` is the oldest that was held.
+    /// Restores a state, for transitions that were held then and are held now. `oldest` is the oldest that was held then.
     fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState);
 
-    /// Panics at the first thing that is wrong. Slow: for tests.
+    /// Panics at the first inconsistency. Slow: for tests.
     fn check_valid(&self, _ring: &Ring) {}
 }
 
-/// [`RowSampler::state`].
+/// The state of a [`RowSampler`] in a snapshot.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) enum RowsState {
-    /// Whether the valid anchors are listed: a draw then takes other numbers from the generator.
+    /// Whether the valid anchors are listed, as draws from the list consume random numbers differently.
     Uniform { are_listed: bool },
-    /// What cannot be told from the transitions held.
+    /// The state that cannot be computed from the transitions held.
     Prioritised {
         /// The exponent of the masses.
         alpha: f64,
         highest: f64,
-        /// Of each transition held, the oldest first, its mass.
+        /// The mass of each transition held, oldest first.
         masses: Vec<f64>,
-        /// The learner that the last update came from, and its number.
+        /// The learner that sent the last update, and the update's number.
         last: Option<(u64, u64)>,
         counts: PriorityCounts,
     },

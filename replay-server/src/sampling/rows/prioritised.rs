@@ -1,9 +1,9 @@
-//! Prioritised sampling, the proportional rule: the chance of an anchor is its priority to the power of alpha, over the sum of all.
-//! It does not weigh rows (the learner does, by the chances that travel with a batch) and computes no priority.
+//! Prioritised sampling, proportional rule: the probability of an anchor is its priority to the power of alpha, over the sum of all.
+//! It does not weight rows (the learner does, by the probabilities in a batch) and computes no priority.
 //!
 //! Source: Schaul et al. 2016, Prioritized Experience Replay; Hessel et al. 2018, Rainbow, where a priority is the row's C51 loss.
-//! A transition that nothing was learned from has the highest priority seen, as in both. Rows are drawn with replacement and each from
-//! all, not one from each of B strata: every row follows the law.
+//! A transition that was never learned from has the highest priority seen, as in both. Rows are drawn with replacement, each from all
+//! anchors and not from one of B strata, so every row follows the law.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -16,36 +16,35 @@ use crate::{
     storage::ring::{Link, Ring},
 };
 
-/// What is added to a priority before its power is taken, so that each transition can still be drawn. Castro et al. 2018, Dopamine,
-/// add as much to the loss.
+/// The constant added to a priority before it is raised to alpha, so that each transition can still be drawn. Dopamine adds the same to
+/// the loss (Castro et al. 2018).
 pub const PRIORITY_MIN: f64 = 1e-10;
 
-/// Largest error of the chance that a batch says of a row, as a share of it: half of an f32's last place. One below 1.2e-38 is sent
-/// as that.
+/// Maximum relative error of a row's probability in a batch: half of an f32's last place. Probabilities below 1.2e-38 are sent as 1.2e-38.
 pub const CHANCE_ERROR: f64 = 6.1e-8;
 
-/// The highest priority before the first is known, as in Dopamine: any would do, as all are equal then.
+/// The highest priority before the first update, as in Dopamine. Any value would do, as all priorities are equal then.
 const FIRST_PRIORITY: f64 = 1.0;
 
-/// The priorities of the transitions held, those that can be anchors alone.
+/// The priorities of those transitions held that can be anchors.
 pub(crate) struct Priorities {
     alpha: f64,
     capacity: u64,
     episodes: Episodes,
-    /// By slot, the index modulo the capacity, (priority + [`PRIORITY_MIN`])^alpha; 0 where no anchor is.
+    /// (priority + [`PRIORITY_MIN`])^alpha by slot, the index modulo the capacity; 0 for transitions that cannot be anchors.
     masses: SumTree,
     highest: f64,
     /// Transitions before this one have mass 0.
     oldest: u64,
-    /// Transitions that more steps must follow, in the order of their episode, by the newest of each stream.
+    /// Transitions that still need steps after them, in the order of their episode. The key is the newest transition of the stream.
     open: BTreeMap<u64, VecDeque<u64>>,
-    /// The learner that the last update came from, and its number.
+    /// The learner that sent the last update, and the update's number.
     last: Option<(u64, u64)>,
     counts: PriorityCounts,
 }
 
 impl Priorities {
-    /// Those of an empty ring of `capacity` transitions. An error gives the bytes that the system refuses to reserve.
+    /// Creates the priorities of an empty ring of `capacity` transitions. An error holds the bytes that the system does not grant.
     pub(crate) fn new(alpha: f64, capacity: u64, episodes: Episodes) -> Result<Self, u64> {
         Ok(Self {
             alpha,
@@ -68,7 +67,7 @@ impl Priorities {
         (priority + PRIORITY_MIN).powf(self.alpha)
     }
 
-    /// A `mass` that was raised to the power of another `alpha`; where that was 0, all were the same and have the `highest` now.
+    /// Converts a `mass` from another `alpha`. If that was 0, all masses were equal, and the priority becomes `highest`.
     fn raised(&self, mass: f64, alpha: f64, highest: f64) -> f64 {
         if mass == 0.0 || alpha == self.alpha {
             return mass;
@@ -81,12 +80,12 @@ impl Priorities {
         }
     }
 
-    /// Sets the priorities of rows that were drawn from `ring`. Of one transition that was drawn twice the last counts.
+    /// Sets the priorities of rows that were drawn from `ring`. If a transition was drawn twice, its last priority counts.
     fn set(&mut self, ring: &Ring, part: &PriorityPart) {
         for (&index, &priority) in part.transitions.iter().zip(&part.priorities) {
             let slot = self.slot(index);
             let is_held = (ring.oldest()..ring.inserted()).contains(&index);
-            // Only anchors have one.
+            // Only anchors have a priority.
             if !is_held || self.masses.get(slot) == 0.0 {
                 self.counts.gone += 1;
                 continue;
@@ -100,7 +99,7 @@ impl Priorities {
 }
 
 impl RowSampler for Priorities {
-    /// Whichever can be anchors now get the highest priority seen.
+    /// Gives the highest priority seen to each transition that can be an anchor now.
     fn stored(&mut self, ring: &Ring, first: u64, link: Link) {
         self.forget(ring);
         let waiting = link.after().and_then(|after| self.open.remove(&after));
@@ -124,7 +123,7 @@ impl RowSampler for Priorities {
         }
     }
 
-    /// Those before the oldest that is held are drawn no more.
+    /// Zeroes the masses of transitions that are no longer held.
     fn forget(&mut self, ring: &Ring) {
         let oldest = ring.oldest();
         let from = self.oldest.max(oldest.saturating_sub(self.capacity));
@@ -132,7 +131,7 @@ impl RowSampler for Priorities {
             self.masses.set(self.slot(index), 0.0);
         }
         self.oldest = oldest;
-        // Streams that ended in the midst of an episode.
+        // Streams that stopped in the middle of an episode.
         while let Some(stream) = self.open.first_entry()
             && *stream.key() < oldest
         {
@@ -157,8 +156,8 @@ impl RowSampler for Priorities {
         Some(self.masses.get(self.slot(index)) / self.masses.total())
     }
 
-    /// An update that has come before changes nothing, nor does a row whose transition was overwritten meanwhile: both are counted.
-    /// Those of other shards do not count.
+    /// A repeated update changes nothing, nor does a row whose transition has been overwritten: both are counted. Rows of other shards are
+    /// ignored.
     fn update(
         &mut self,
         ring: &Ring,
@@ -213,7 +212,7 @@ impl RowSampler for Priorities {
     }
 
     fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState) {
-        // Of a run that drew by another rule: each transition keeps the highest.
+        // The run drew uniformly before: each transition keeps the highest priority.
         let RowsState::Prioritised {
             alpha,
             highest,
@@ -229,7 +228,7 @@ impl RowSampler for Priorities {
             if !(ring.oldest()..ring.inserted()).contains(&index) {
                 continue;
             }
-            // Where steps that followed it are gone, it cannot be an anchor any more.
+            // A transition whose following steps are gone cannot be an anchor any more.
             let lacks_steps = self.masses.get(slot) == 0.0 && self.episodes.is_whole(ring, index);
             if !lacks_steps {
                 let mass = self.raised(mass, *alpha, *highest);
@@ -239,7 +238,7 @@ impl RowSampler for Priorities {
         (self.highest, self.last, self.counts) = (*highest, *last, *counts);
     }
 
-    /// Exactly the anchors have a mass, but for those whose stack was cut.
+    /// Checks that exactly the anchors have a mass, apart from transitions whose frame stack was overwritten in part.
     fn check_valid(&self, ring: &Ring) {
         self.masses.check_valid();
         let episodes = self.episodes;

@@ -1,26 +1,26 @@
-//! A sum tree: numbers by place, their sum, and a place drawn in proportion to its number, each in O(log n).
+//! A sum tree: stores a number per place, gives their sum, and draws a place in proportion to its number, each in O(log n).
 //! Source: Schaul et al. 2016, Prioritized Experience Replay, appendix B.2.1.
 //!
-//! Every sum is computed anew from its two parts when one of them changes, never by adding a difference: it is what it would be had
-//! all numbers been set at once, however often they have changed.
+//! If a number changes, each sum above it is computed again from its two children, never by adding the difference. So rounding errors do
+//! not accumulate: the sums equal those of a new tree with the same numbers.
 
 use rand::Rng;
 
 use crate::storage::reserve;
 
-/// Numbers that are not negative, at places `0..capacity`; 0 at first.
+/// Non-negative numbers at places `0..capacity`; 0 at first.
 pub(super) struct SumTree {
-    /// Places, rounded up to a power of two.
+    /// The number of places, rounded up to a power of two.
     leaves: usize,
-    /// The root at 1, the parts of node i at 2 i and 2 i + 1, the numbers from `leaves` on.
+    /// The root is at 1, the children of node i are at 2 i and 2 i + 1, and the numbers start at `leaves`.
     nodes: Vec<f64>,
 }
 
 impl SumTree {
-    /// All 0. Its memory is taken as places are used. An error gives the bytes that the system refuses to reserve.
+    /// Creates a tree of zeros; memory is taken as places are used. An error holds the bytes that the system does not grant.
     pub(super) fn new(capacity: u64) -> Result<Self, u64> {
         let leaves = capacity.checked_next_power_of_two().unwrap_or(u64::MAX);
-        // Zeros that come from the system are not touched; whether it grants them is asked first, as that ends no process.
+        // Asks first for the memory, as a failing `vec!` would abort the process. The zeros of `vec!` take memory only when used.
         drop(reserve::<f64>(leaves.saturating_mul(2))?);
         let leaves = leaves as usize;
         let nodes = vec![0.0; 2 * leaves];
@@ -49,18 +49,18 @@ impl SumTree {
         }
     }
 
-    /// A place, each as likely as its share of the sum, those of number 0 never; none if the sum is 0.
+    /// Draws a place with a probability of its share of the sum, never a place with number 0. `None` if the sum is 0.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Option<usize> {
         (self.total() > 0.0).then(|| self.place(rng.random()))
     }
 
-    /// The place at which so large a share of the sum, which is not 0, has been passed.
+    /// Returns the place at which the cumulative sum passes `share` of the total, which is not 0.
     fn place(&self, share: f64) -> usize {
         let mut left_over = share * self.total();
         let mut node = 1;
         while node < self.leaves {
             node *= 2;
-            // Rounding must not lead where there is nothing.
+            // Rounding must not lead into a subtree of zeros.
             if left_over >= self.nodes[node] && self.nodes[node + 1] > 0.0 {
                 left_over -= self.nodes[node];
                 node += 1;
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     proptest! {
-        /// Numbers of any size: what is drawn is never a 0, and sums do not drift from those of a tree that is new.
+        /// For numbers of any size, no draw gives a zero, and the sums do not drift from those of a new tree.
         #[test]
         fn never_draws_a_zero_and_never_drifts(
             numbers in prop::collection::vec(prop_oneof![Just(0.0), 1e-12f64..1e12, Just(1e38)], 1..70),

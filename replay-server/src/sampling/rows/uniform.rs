@@ -1,5 +1,5 @@
 //! Draws anchors, each valid one equally likely.
-//! It does not decide what is valid: that is `episodes`.
+//! `episodes` decides which transitions are valid.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -10,14 +10,14 @@ use crate::{
     storage::ring::Ring,
 };
 
-/// Draws that may hit an invalid transition before all valid ones are listed instead; either way the law is uniform.
+/// Maximum draws that hit an invalid transition before all valid ones are listed instead. Either way the law is uniform.
 const TRIES_MAX: u32 = 64;
 
-/// The list of all valid anchors, kept for as long as the ring does not change.
+/// Draws uniformly. Keeps the list of all valid anchors, once it was needed, as long as the ring does not change.
 pub(crate) struct Uniform {
     episodes: Episodes,
     valid: Vec<u64>,
-    /// Transitions the ring had stored when `valid` was listed; 0 before the first.
+    /// Transitions that the ring had stored when `valid` was listed; 0 before the first listing.
     listed_at: u64,
     listed_from: u64,
 }
@@ -32,7 +32,7 @@ impl Uniform {
         }
     }
 
-    /// Whether the list is that of the ring.
+    /// Whether `valid` lists the anchors of the ring's current content.
     const fn are_listed(&self, ring: &Ring) -> bool {
         self.listed_at == ring.inserted() && self.listed_from == ring.oldest()
     }
@@ -48,7 +48,7 @@ impl Uniform {
 }
 
 impl RowSampler for Uniform {
-    /// By rejection; after [`TRIES_MAX`] misses by listing, which takes time proportional to the transitions held.
+    /// Draws by rejection; after [`TRIES_MAX`] misses from a list, which takes time proportional to the transitions held.
     fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
         let episodes = self.episodes;
         if ring.oldest() == ring.inserted() {

@@ -1,4 +1,4 @@
-//! A world of a user's own, in any language: copies stepped by a process that the actor starts.
+//! A world that a user writes, in any language: the actor starts a process that steps all copies (environments).
 
 mod process;
 mod protocol;

@@ -1,4 +1,4 @@
-//! A world's process: started, spoken to with a deadline on each answer, and ended with everything that it started.
+//! Starts a world's process, exchanges messages with it under a time-out, and ends it with all processes that it started.
 //! It does not know the protocol.
 
 use std::collections::VecDeque;
@@ -20,60 +20,60 @@ use crate::error::EnvError;
 
 const SHELL: &str = "/bin/sh";
 
-/// Waits until this process is gone, however it ended, and kills the group, itself included.
+/// The guard's script: waits until the actor is gone, however it ended, and kills the process group, including itself.
 const GUARD: &str = "read -r line; sleep 1; kill -KILL 0";
 
-/// Lines of stderr that an error repeats.
+/// The most lines of stderr that an error quotes.
 const WORDS_MAX: usize = 12;
 
-/// Lines of stderr that are logged within a second; then the log says how many there were more.
+/// The most lines of stderr that are logged per second; the log then says how many were left out.
 const LINES_A_SECOND_MAX: usize = 50;
 
-/// Characters of such a line; more are cut off.
+/// The most characters of such a line; the rest is cut off.
 const WORD_LENGTH_MAX: usize = 400;
 
-/// Bytes of a line that declares a world; a process that writes more is none.
+/// The most bytes of a line that declares a world; a longer line is cut off, and so invalid. Limits lines of stderr too.
 const LINE_MAX: usize = 64 * 1024;
 
 /// How long a process may take to end once its stdin is closed, or once it closed its stdout.
 const END_MAX: Duration = Duration::from_secs(2);
 
-/// How often it is looked whether a process that does not answer is there at all.
+/// How often to check whether a process that does not reply still exists.
 const WATCH: Duration = Duration::from_millis(500);
 
-/// How often it is looked whether it ended, once it should.
+/// How often to check whether a process has ended, once it should.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// What is being done with a process: for its errors, and for how long it is waited for.
+/// The current exchange with a process: its description in errors, and its time-out.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Exchange {
-    /// When it is, such as "in the middle of a step".
+    /// The description, such as "in the middle of a step".
     pub(super) doing: &'static str,
-    /// How long each answer is waited for.
+    /// The time-out of each reply.
     pub(super) limit: Duration,
-    /// What a person sets to change that.
+    /// The setting that changes `limit`.
     pub(super) setting: &'static str,
 }
 
 /// A world's process, with its guard.
 ///
-/// They are a process group of their own, which the guard leads: what the command starts ends with it, unless it leaves the group.
+/// The guard leads a process group that both belong to. What the command starts ends with the group, unless it leaves the group.
 pub(super) struct WorldProcess {
     command: String,
-    /// What is being done with it.
+    /// The current exchange.
     pub(super) exchange: Exchange,
     guard: Child,
     child: Child,
-    /// None once it was told to end.
+    /// The process's stdin; `None` once the process was told to end.
     to: Option<ChildStdin>,
     from: ChildStdout,
     words: Arc<Mutex<VecDeque<String>>>,
-    /// Closed when stderr has ended.
+    /// Disconnected once stderr has ended.
     spoken: Receiver<()>,
 }
 
 impl WorldProcess {
-    /// Starts the command for a first exchange; what it writes to stderr is logged at `level`.
+    /// Starts the command for a first exchange, and logs its stderr at `level`.
     pub(super) fn start(command: &str, exchange: Exchange, level: Level) -> io::Result<Self> {
         let mut guard = Command::new(SHELL)
             .args(["-c", GUARD])
@@ -108,7 +108,7 @@ impl WorldProcess {
                 Level::INFO => tracing::info!("world: {text}"),
                 _ => tracing::debug!("world: {text}"),
             });
-            // There is nothing more to say.
+            // Disconnects `spoken`.
             drop(speaks);
         })?;
         Ok(Self {
@@ -123,7 +123,7 @@ impl WorldProcess {
         })
     }
 
-    /// Says something to it. Whether it has ended is found out when its answer is read: what it said before that counts.
+    /// Writes to the process. A closed pipe is not reported here but when the reply is read, as a reply may precede the end.
     pub(super) fn say(&mut self, text: &str) -> Result<(), EnvError> {
         let to = self.to.as_mut();
         match to.map_or(Ok(()), |to| to.write_all(text.as_bytes())) {
@@ -132,10 +132,10 @@ impl WorldProcess {
         }
     }
 
-    /// Says something to a process that has given all its answers.
+    /// Writes to a process that has sent all its replies; any more output is an error.
     pub(super) fn ask(&mut self, text: &str) -> Result<(), EnvError> {
         let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
-        // If this fails, so does the read of the answer. A closed stdout has nothing to read, and the answer to it is its error.
+        // If `poll` fails, so does reading the reply. A closed stdout has nothing to read, and reading the reply reports it.
         let _ = poll(&mut polled, PollTimeout::ZERO);
         let found = polled[0].revents();
         if found.is_some_and(|it| it.contains(PollFlags::POLLIN)) {
@@ -149,7 +149,7 @@ impl WorldProcess {
         let deadline = Instant::now() + self.exchange.limit;
         let mut line = Vec::new();
         loop {
-            // A byte at a time: what follows the line does not belong to it.
+            // Reads a byte at a time, as later bytes do not belong to the line.
             match self.byte_until(deadline)? {
                 b'\n' => return Ok(line),
                 _ if line.len() == LINE_MAX => return Ok(line),
@@ -185,7 +185,7 @@ impl WorldProcess {
             let left = PollTimeout::try_from(left.min(WATCH)).unwrap_or(PollTimeout::ZERO);
             let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
             match poll(&mut polled, left) {
-                // What it started may hold its stdout open.
+                // The process has ended; one that it started may still hold its stdout open.
                 Ok(0) if matches!(self.child.try_wait(), Ok(Some(_))) => return Ok(0),
                 Ok(0) if Instant::now() >= deadline => return Err(ErrorKind::TimedOut.into()),
                 Ok(0) | Err(nix::errno::Errno::EINTR) => {}
@@ -195,7 +195,7 @@ impl WorldProcess {
         }
     }
 
-    /// What to say of a process that is not there any more.
+    /// Kills what is left of a process that has ended, and returns the error that says so.
     fn ended(&mut self) -> EnvError {
         self.to = None;
         let doing = self.exchange.doing;
@@ -207,14 +207,14 @@ impl WorldProcess {
         self.dead(&how)
     }
 
-    /// What to say of a dead process, whose last output may still arrive.
+    /// Returns the error of a dead process, after waiting for the rest of its stderr.
     fn dead(&self, how: &str) -> EnvError {
-        // Nothing is sent on this channel.
+        // Nothing is sent on this channel: this waits until it is disconnected.
         let _ = self.spoken.recv_timeout(END_MAX);
         self.fail(how)
     }
 
-    /// What to say of this fault, with the process's last words.
+    /// Returns the error `how`, with the last lines of the process's stderr.
     pub(super) fn fail(&self, how: &str) -> EnvError {
         let words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
         let words: String = words.iter().map(|line| format!("\n  {line}")).collect();
@@ -225,7 +225,7 @@ impl WorldProcess {
         EnvError::Exec(format!("the world `{}` {how}{words}", self.command))
     }
 
-    /// What to say of an error of the operating system.
+    /// Returns the error for an error of the operating system.
     pub(super) fn system(&self, source: &io::Error) -> EnvError {
         let doing = self.exchange.doing;
         self.fail(&format!("cannot be used: {doing}: {source}"))
@@ -242,14 +242,14 @@ impl WorldProcess {
         }
     }
 
-    /// Kills it, what it started, and the guard; waits for their end.
+    /// Kills the process, what it started, and the guard; waits for the process and the guard to end.
     fn kill(&mut self) {
-        // The world itself may lead another group, as `timeout` does.
+        // The process may lead another group, as `timeout` does.
         for process in [&mut self.guard, &mut self.child] {
             if matches!(process.try_wait(), Ok(Some(_))) {
                 continue;
             }
-            // One that leads no group has none to kill.
+            // This fails for a process that leads no group.
             let _ = killpg(Pid::from_raw(process.id() as i32), Signal::SIGKILL);
             if let Err(e) = process.kill() {
                 tracing::debug!("killing the world `{}`: {e}", self.command);
@@ -278,7 +278,7 @@ fn describe(status: ExitStatus) -> String {
     }
 }
 
-/// Logs the lines of a world's stderr, as many as are allowed, and keeps the last ones.
+/// Logs the lines of a world's stderr, up to the limit per second, and keeps the last ones in `words`.
 pub(super) fn keep(
     mut stderr: impl BufRead,
     words: &Mutex<VecDeque<String>>,

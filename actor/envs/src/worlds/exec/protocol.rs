@@ -1,6 +1,5 @@
-//! The settings of a world that is a process, what an actor and the process say to each other, where it lies, and what can be wrong
-//! with it.
-//! Starting and ending the process is for `process`.
+//! The settings of a world in its own process, the protocol between process and actor, and the memory that they share.
+//! It checks what the process sends; `process` starts and ends the process.
 //!
 //! The process is the command of `--env "exec:COMMAND"`, run by `sh`. Requests and answers:
 //!
@@ -13,7 +12,7 @@
 //! | actor | the actions lie in the block | the byte `s`, for each step |
 //! | world | rewards, ends and the next frames lie there | the byte `.`, for each step |
 //!
-//! A world that declares `"saves": true` besides is also asked for its state, between two steps:
+//! If the declaration also has `"saves": true`, the actor asks for the state between two steps:
 //!
 //! | who | says | by |
 //! | --- | --- | --- |
@@ -23,18 +22,18 @@
 //! | actor | `L` and `{"state": PATH, "bytes_max": M}`: the file holds a state that a world of this command and of as many copies wrote | a line to its stdin |
 //! | world | continues from that state; the frames lie in the block already | the byte `.` |
 //!
-//! A state is everything that decides what follows, generators included, in at most M bytes of the world's own choice. A state that
-//! the world does not take back is a reason to end, with a word to stderr.
+//! A state holds everything that determines the future, including generators, in at most M bytes of a format that the
+//! world chooses. A world that cannot load a state ends, with a message on stderr.
 //!
-//! The end of its stdin tells the process to end. A process that only has to declare itself sees that end after its line: so
-//! the shapes are found before the actors start. There are as many `seeds` as copies, each below 2^31; copy i is seeded with
-//! the i-th. `PATH` is memory that both share; the numbers are where in it the columns begin, by bytes: `actions` [N] u8,
-//! `rewards` [N] f32 of the machine's order, `ends` [N] u8 as [`StepEnd`](crate::StepEnd) numbers them (0 runs on, 1 next
+//! The process must end when its stdin closes. Before the actors start, a process is asked for its declaration alone, to find the
+//! shapes: its stdin closes after that line. There are as many `seeds` as copies, each below 2^31; copy i is seeded with
+//! the i-th. `PATH` is the shared memory, and the numbers are the byte offsets of its columns: `actions` [N] u8,
+//! `rewards` [N] f32 in the machine's byte order, `ends` [N] u8 as [`StepEnd`](crate::StepEnd) numbers them (0 runs on, 1 next
 //! level, 2 timed out, 3 terminal) and `frames` [N, H, W, C] u8. The frame after an end is the first of the next episode.
-//! What the process writes to stderr is in the actor's log, up to 50 lines a second.
+//! The actor logs the process's stderr, up to 50 lines per second.
 //!
-//! The memory has no name in the file system, and a shell that waits for the actor's end kills the process: when an actor
-//! is killed, nothing is left. This side reads and writes the memory as a file, which needs no unsafe code.
+//! The memory has no name in the file system, and a guard shell kills the process when the actor ends: a killed actor
+//! leaves nothing behind. The actor reads and writes the memory as a file, which needs no unsafe code.
 
 use std::fs::File;
 use std::io;
@@ -51,28 +50,28 @@ use crate::error::EnvError;
 use crate::saved;
 use crate::settings::WorldSettings;
 
-/// A command, and the world that it declared when the run was made. Each actor checks that its own process declares the same.
+/// A command, and the world that the command declared when the run was made. Each actor checks that its own process declares the same.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExecConfig {
-    /// What is started, by `sh`, in the folder in which the actor runs.
+    /// The command, which `sh` runs in the actor's working directory.
     pub command: String,
     /// Rows of a frame, as declared.
     pub height: usize,
     /// Columns of a frame, as declared.
     pub width: usize,
-    /// Bytes a pixel, as declared: 1 is grey, 3 are colours.
+    /// Bytes per pixel, as declared: 1 is grey, 3 are colours.
     pub channels: usize,
     /// The names of the actions, as declared.
     pub actions: Vec<String>,
-    /// How long the process may take to declare itself, for its first frames and to load a state, milliseconds; then it is killed.
+    /// Time-out of the declaration, of the first frames and of loading a state, in milliseconds; then the process is killed.
     pub start_timeout_ms: u64,
-    /// How long a step of all copies may take, and to save their state, milliseconds; then the process is killed.
+    /// Time-out of a step of all copies and of saving their state, in milliseconds; then the process is killed.
     pub step_timeout_ms: u64,
 }
 
 impl ExecConfig {
-    /// What it declares, in words.
+    /// Describes the declared frames and actions.
     pub(super) fn describe(&self) -> String {
         format!(
             "frames of {} x {} x {} and the {} actions {}",
@@ -85,13 +84,13 @@ impl ExecConfig {
     }
 }
 
-/// The protocol's version. A process that speaks another is refused.
+/// The protocol's version. A process that speaks another version is rejected.
 pub(super) const VERSION: u64 = 1;
 
-/// Most characters of a line that a message repeats.
+/// The most characters of a line that a message quotes.
 const SHOWN_MAX: usize = 200;
 
-/// What a world is, by its own word.
+/// The declaration of a world: its copies, shapes and actions.
 #[derive(Debug, Deserialize)]
 pub(super) struct Declaration {
     pub(super) copies: usize,
@@ -99,7 +98,7 @@ pub(super) struct Declaration {
     pub(super) width: usize,
     pub(super) channels: usize,
     pub(super) actions: Vec<String>,
-    /// Whether it knows how to save and to load its state. Worlds of before say nothing of it.
+    /// Whether the world can save and load its state. Worlds of earlier versions lack this field.
     #[serde(default)]
     pub(super) saves: bool,
 }
@@ -125,7 +124,7 @@ impl Declaration {
         }
     }
 
-    /// These settings, with what was declared.
+    /// Returns `config` with the declared shapes and actions.
     pub(super) fn over(self, config: &ExecConfig) -> ExecConfig {
         ExecConfig {
             height: self.height,
@@ -137,10 +136,10 @@ impl Declaration {
     }
 }
 
-/// Each column begins at a multiple of this, so that no two of them share a line of a processor's cache.
+/// Each column begins at a multiple of this many bytes, so that no two columns share a cache line.
 const ALIGNMENT: usize = 64;
 
-/// Where each column begins, and how long the whole is; bytes.
+/// The offset of each column and the length of the whole memory, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 struct Layout {
     bytes: usize,
@@ -165,16 +164,16 @@ impl Layout {
     }
 }
 
-/// The memory. It has no name, and goes with the last of the two processes.
+/// The shared memory. It has no name in the file system, and is freed once both processes have closed it.
 pub(super) struct Block {
     file: File,
     layout: Layout,
-    /// Rewards, padding, ends: memory to use again.
+    /// Rewards, padding and ends: a reused buffer.
     results: Vec<u8>,
 }
 
 impl Block {
-    /// Makes the memory, whose size is sealed.
+    /// Creates the memory and seals its size.
     pub(super) fn new(copies: usize, shape: FrameShape) -> io::Result<Self> {
         let layout = Layout::new(copies, shape);
         let flags = MFdFlags::MFD_CLOEXEC | MFdFlags::MFD_ALLOW_SEALING;
@@ -189,14 +188,14 @@ impl Block {
         })
     }
 
-    /// The line that says where the memory is, and the columns in it.
+    /// The message that says where the memory is, and its layout.
     pub(super) fn opening(&self) -> Value {
         let mut opening = json!(self.layout);
         opening["block"] = path(&self.file).into();
         opening
     }
 
-    /// Puts down the actions [N].
+    /// Writes the actions [N].
     pub(super) fn write_actions(&self, actions: &[u8]) -> io::Result<()> {
         self.file.write_all_at(actions, self.layout.actions as u64)
     }
@@ -218,20 +217,20 @@ impl Block {
         self.file.read_exact_at(frames, self.layout.frames as u64)
     }
 
-    /// Puts down the frames [N, H, W, C], as after a step.
+    /// Writes the frames [N, H, W, C], as the process does after a step.
     pub(super) fn write_frames(&self, frames: &[u8]) -> io::Result<()> {
         self.file.write_all_at(frames, self.layout.frames as u64)
     }
 }
 
-/// Memory that holds a state of a world and is as long. It goes when this is dropped.
+/// Creates memory that holds exactly `state`. It is freed once the file is closed.
 pub(super) fn state_memory(state: &[u8]) -> io::Result<File> {
     let file = File::from(memfd_create(c"driml-world-state", MFdFlags::MFD_CLOEXEC)?);
     file.write_all_at(state, 0)?;
     Ok(file)
 }
 
-/// Under which name another process of the same user opens a file without one, as long as this process lives.
+/// The path by which another process of the same user opens a file without a name, as long as this process lives.
 pub(super) fn path(file: &File) -> String {
     format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
 }
@@ -239,12 +238,12 @@ pub(super) fn path(file: &File) -> String {
 /// Longest state that a process may give for all its copies together, bytes.
 pub(super) const WORLD_STATE_BYTES_MAX: u64 = 64 << 20;
 
-/// How a world stands, and which world it is.
+/// A saved state of a world, with the settings that identify the world.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct SavedExec {
     pub(super) config: ExecConfig,
     pub(super) copies: usize,
-    /// Those in which the next actions are taken [N, H, W, C].
+    /// The frames in which the next actions are taken [N, H, W, C].
     pub(super) frames: Vec<u8>,
     pub(super) state: Vec<u8>,
 }

@@ -1,5 +1,5 @@
-//! A world in its own process against one whose every frame says which one it is (`tests/worlds/numbered.py`), and each way in
-//! which a process can fail. Needs `python3`, without any package; what needs Gymnasium is in `tests/system/own_worlds.rs`.
+//! Tests a world in its own process with one that numbers its frames (`tests/worlds/numbered.py`), and each way in which a process
+//! can fail. Needs `python3`, without any package; what needs Gymnasium is in `tests/system/own_worlds.rs`.
 
 use std::fs;
 use std::sync::Mutex;
@@ -35,7 +35,7 @@ pub(crate) fn config(command: String) -> ExecConfig {
     }
 }
 
-/// What a world of these settings declares, with one copy.
+/// The declaration of a world of these settings, with one copy.
 const ONE: &str = r#"{"driml_env": 1, "copies": 1, "height": 12, "width": 12, "channels": 1, "actions": ["no-op", "left", "right"]}"#;
 
 /// The command of a process that declares itself with this line, and nothing else.
@@ -108,7 +108,7 @@ fn an_environment_s_seed_does_not_depend_on_how_many_environments_there_are() {
     assert_eq!(different.len(), 64);
 }
 
-/// A world that fails as its arguments say: when its state is saved or loaded, or in its third step.
+/// Runs a world that fails as its arguments say: when its state is saved or loaded, or in its third step.
 fn faulty(arguments: &str) -> Result<(), EnvError> {
     let hangs = arguments.contains("hang");
     let config = ExecConfig {
@@ -126,7 +126,7 @@ fn faulty(arguments: &str) -> Result<(), EnvError> {
     world.step(&[0, 1], &mut [0.0; 2], &mut [StepEnd::Running; 2])
 }
 
-/// Lines of `what => sentence | sentence ..`.
+/// Splits lines of the form `what => sentence | sentence ..`.
 fn rows(table: &'static str) -> impl Iterator<Item = (&'static str, Vec<&'static str>)> {
     table.trim().lines().map(|line| {
         let (what, sentences) = line.split_once("=>").unwrap();
@@ -177,7 +177,7 @@ echo hello; read -r line            => does not declare itself as a world: its f
 #[test]
 fn each_way_a_start_can_fail_has_its_sentence() {
     let says = |command: &str, sentences: &[&str]| {
-        // Long enough for everything that answers at all.
+        // Long enough for every command that replies at all.
         let limit = if command == "sleep 60" { 500 } else { 60_000 };
         fails(declaration(command, limit, 1000), sentences);
     };
@@ -220,7 +220,7 @@ fn what_is_printed_into_the_protocol_is_named() {
     let config = config(declares(ONE) + "; echo ready");
     let sentence = "the byte 0x72 and not with `.`";
     fails(ExecWorld::new(&config, 1, 1), &[sentence]);
-    // A second answer, which the next step would read as its own.
+    // A second reply, which the next step would read as the reply to its own request.
     let twice = self::config(declares(ONE) + "; printf ..; read -r line");
     let mut world = ExecWorld::new(&twice, 1, 1).unwrap();
     let stepped = world.step(&[0], &mut [0.0], &mut [StepEnd::Running]);
@@ -242,13 +242,13 @@ fn a_flood_on_stderr_is_logged_in_part_and_its_last_lines_are_kept() {
 fn a_world_that_offers_it_continues_where_it_was_saved() {
     let config = config(numbered("saves"));
     let mut worlds = Vec::new();
-    // Another seed each: what a world is, is in its state alone.
+    // Each world has another seed: its state alone must determine how it continues.
     let ended = continues("a process", 60, || {
         worlds.push(());
         Box::new(ExecWorld::new(&config, 3, worlds.len() as u64).unwrap())
     });
     assert!(ended > 20, "{ended}");
-    // The frames that its next actions are taken in are those that there were.
+    // The frames in which the next actions are taken are restored.
     let mut world = ExecWorld::new(&config, 2, 1).unwrap();
     step(&mut world, &[0, 1]);
     let mut other = ExecWorld::new(&config, 2, 2).unwrap();
@@ -260,7 +260,7 @@ fn a_world_that_offers_it_continues_where_it_was_saved() {
 fn a_world_that_does_not_offer_it_is_not_asked() {
     let mut world = ExecWorld::new(&config(numbered("")), 2, 1).unwrap();
     assert!(matches!(world.save(), Err(EnvError::NotSaved(_))));
-    // It is not told, and continues.
+    // The process gets no request, and continues.
     step(&mut world, &[0, 1]);
 }
 
@@ -287,7 +287,7 @@ fn a_state_of_another_world_is_refused_by_name() {
     ] {
         refused("saves", 2, wrong, &["no state of this world"]);
     }
-    // The same command, which is another world now.
+    // The same command, but the settings of another world.
     let config = ExecConfig {
         height: 13,
         ..config(numbered("saves"))
@@ -296,7 +296,7 @@ fn a_state_of_another_world_is_refused_by_name() {
     fails(SavedExec::from_bytes(&state, &config, 2), &[sentence]);
 }
 
-/// Processes with this word in their command line.
+/// Returns the processes with `mark` in their command line.
 fn alive(mark: &str) -> Vec<String> {
     let Ok(processes) = fs::read_dir("/proc") else {
         return Vec::new();
@@ -320,7 +320,7 @@ fn nothing_is_left_of_a_world_and_of_what_it_started() {
     drop(world);
     assert_eq!(alive(&mark), [""; 0]);
 
-    // One that leads another group ends as well.
+    // A process that leads another group ends as well.
     let command = "exec timeout 600 sleep 590.5";
     fails(declaration(command, 200, 1000), &["start_timeout_ms=N"]);
     assert_eq!(alive("590.5"), [""; 0]);

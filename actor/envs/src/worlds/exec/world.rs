@@ -1,5 +1,5 @@
-//! Copies of a game in a process of their own, as the trait has them: a byte to the process and one back for each step.
-//! What passes between them is for `protocol`. A command is asked here what world it is.
+//! Implements the world traits with a process that steps copies of a game: each step sends it one byte and reads one byte back.
+//! `protocol` defines the messages. The function `declaration` asks a command what world it is.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -22,7 +22,7 @@ use crate::settings::{Built, Variants, WorldSettings};
 /// Longest side of a frame, in pixels.
 const SIDE_MAX: usize = 4096;
 
-/// Most bytes a pixel.
+/// The most bytes per pixel.
 const CHANNELS_MAX: usize = 16;
 
 /// Most actions of a world: the wire numbers them with a byte.
@@ -31,22 +31,22 @@ const ACTIONS_MAX: usize = 255;
 /// Longest time limit, in milliseconds: a day.
 const LIMIT_MS_MAX: u64 = 86_400_000;
 
-/// Says that the actions lie in the block.
+/// Request for a step: the actions lie in the block.
 const STEP: &str = "s";
 
-/// Says that the frames lie there, and after a step rewards and ends; that a state is written, or taken.
+/// Reply of success: the block has the frames, and after a step rewards and ends; or a state is saved, or loaded.
 const DONE: u8 = b'.';
 
-/// Asks for the state.
+/// Request to save the state.
 const SAVE: &str = "S";
 
-/// Gives a state back.
+/// Request to load a state.
 const LOAD: &str = "L";
 
-/// The error where no state can be saved, and why.
+/// Reply that the state cannot be saved; a line with the reason follows.
 const NOT_SAVED: u8 = b'-';
 
-/// Copies of one game, stepped by a process of their own.
+/// Copies of one game, stepped by one separate process.
 pub struct ExecWorld {
     process: WorldProcess,
     block: Block,
@@ -109,13 +109,13 @@ impl ExecWorld {
         ))
     }
 
-    /// Says that a state is to be saved or loaded, and where it lies.
+    /// Sends the request `what`, to save or load a state, with the path of its memory.
     fn say_state(&mut self, what: &str, memory: &File) -> Result<(), EnvError> {
         let place = json!({"state": path(memory), "bytes_max": WORLD_STATE_BYTES_MAX});
         self.process.ask(&format!("{what}{place}\n"))
     }
 
-    /// The process's own bytes for how its copies stand.
+    /// Returns the state of the process's copies, in the process's format.
     fn save_process(&mut self) -> Result<Vec<u8>, EnvError> {
         self.process.exchange = self.config.stepping("in the middle of saving its state");
         let memory = state_memory(&[]).map_err(|e| self.process.system(&e))?;
@@ -125,7 +125,7 @@ impl ExecWorld {
             NOT_SAVED => {
                 let line = self.process.line()?;
                 let why = String::from_utf8_lossy(&line);
-                // It lives on, and has said all there is to say.
+                // The process continues: its reply is complete.
                 let (command, why) = (&self.config.command, why.trim());
                 let text = format!("the world `{command}` cannot save its state: {why}");
                 return Err(EnvError::NotSaved(text));
@@ -173,7 +173,7 @@ fn introduce(
 }
 
 impl ExecConfig {
-    /// An exchange that belongs to a start: the process declares itself, makes its first frames or loads a state.
+    /// An exchange with the start's time-out: the process declares itself, makes its first frames or loads a state.
     const fn starting(&self, doing: &'static str) -> Exchange {
         Exchange {
             doing,
@@ -182,7 +182,7 @@ impl ExecConfig {
         }
     }
 
-    /// One that a run waits for: a step of all copies, or their state.
+    /// An exchange with a step's time-out: a step of all copies, or saving their state.
     const fn stepping(&self, doing: &'static str) -> Exchange {
         Exchange {
             doing,
@@ -195,7 +195,7 @@ impl ExecConfig {
 /// Asks a command what world it is: starts it with one copy, reads its declaration, ends it.
 ///
 /// # Errors
-/// A command that cannot be started, does not declare a world in time, or one that no run can be made of.
+/// The command cannot be started, does not declare a world in time, or declares one that no run can use.
 pub fn declaration(
     command: &str,
     start_timeout_ms: u64,
@@ -356,7 +356,7 @@ impl Environment for ExecWorld {
         if !self.saves {
             return Err(EnvError::not_saved());
         }
-        // It belongs to a start, and may take as long: a world may have to play an episode again.
+        // Loading has the start's time-out, as a world may have to replay an episode.
         self.process.exchange = self.config.starting("in the middle of loading its state");
         let memory = state_memory(&state)
             .and_then(|memory| self.block.write_frames(&frames).map(|()| memory))

@@ -1,5 +1,5 @@
 //! A two-dimensional Ising model and its Metropolis dynamics.
-//! It has no field, no couplings but J = 1 and no cluster moves, and it draws nothing.
+//! It has no field, no couplings but J = 1 and no cluster moves, and it paints no frames.
 
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -13,7 +13,7 @@ const NEIGHBOURS: usize = 4;
 /// Longest side of a lattice, in sites; a longer one is rejected.
 const SIDE_MAX: usize = 4096;
 
-/// What a site on the rim has beyond it.
+/// The neighbours beyond the rim of a lattice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Boundary {
@@ -31,10 +31,10 @@ pub enum Boundary {
 pub struct IsingLattice {
     height: usize,
     width: usize,
-    /// [H * W], then one site that is never there, which stands for "beyond the rim".
+    /// Spins [H * W], then one absent site, which stands for all sites beyond the rim.
     spins: Vec<i8>,
     neighbours: Vec<[u32; NEIGHBOURS]>,
-    /// The sites there are: those with even row + column first, then the odd ones, each in row order.
+    /// The present sites: those with even row + column first, then the odd ones, each in row order.
     sites: Vec<u32>,
     /// A proposal with s * h = i - 4 > 0 is taken when a uniform u64 is below entry i: exp(-2 s h / T) * 2^64.
     accept_below: [u64; 2 * NEIGHBOURS + 1],
@@ -109,7 +109,7 @@ impl IsingLattice {
         }
     }
 
-    /// Takes spins [H * W] that another lattice of these sites had.
+    /// Sets the spins [H * W] to those of another lattice with the same sites.
     ///
     /// # Errors
     /// Spins that are not -1 or +1 exactly where there is a site, and 0 elsewhere.
@@ -123,8 +123,7 @@ impl IsingLattice {
         Ok(())
     }
 
-    /// One Metropolis proposal at each site, first those with even row + column, then the odd ones; then one more at a
-    /// site drawn uniformly.
+    /// One Metropolis proposal at each site, those with even row + column first; then one more at a site drawn uniformly.
     ///
     /// A proposal that does not raise the energy is always taken, so at low temperature a sweep is nearly a function of
     /// the spins: at T = 0.4 an inner site's smallest rise, 4, is taken with probability exp(-10). The last proposal is
@@ -176,8 +175,8 @@ impl IsingLattice {
     }
 }
 
-/// Hottest lattice, in units of J / k_B; a hotter one is rejected. Nearly every proposal is taken there, and as sweeps propose in a
-/// fixed order, they turn the whole lattice over and back: the mean of s s' over a sweep is -0.4 at T = 5, -0.97 at T = 100.
+/// The highest temperature, in units of J / k_B; a higher one is rejected. Above it nearly every proposal is taken. As sweeps propose in a
+/// fixed order, they then turn the whole lattice over and back: the mean of s s' over a sweep is -0.4 at T = 5, -0.97 at T = 100.
 const TEMPERATURE_MAX: f64 = 5.0;
 
 /// Rejects a temperature that is not above 0 and at most 5.

@@ -241,7 +241,7 @@ fn energy_of_a_torus(side: usize, temperature: f64) -> f64 {
     -(log_z(k + step) - log_z(k - step)) / (2.0 * step) / (side * side) as f64
 }
 
-/// Where the infinite lattice orders: 2 / ln(1 + sqrt 2). Source: Onsager 1944.
+/// The temperature at which the infinite lattice orders: 2 / ln(1 + sqrt 2). Source: Onsager 1944.
 fn critical_temperature() -> f64 {
     2.0 / (1.0 + 2f64.sqrt()).ln()
 }

@@ -1,5 +1,5 @@
 //! A square of Ising spins hidden in a field of noise: predictable inside the patch, unpredictable outside it.
-//! There is nothing to decide and nothing to earn in it; it exists to show what DIM learns to predict.
+//! It has one action and no reward; it exists to show what DIM learns to predict.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -34,7 +34,7 @@ pub struct IsingConfig {
 /// model. One action, no reward; an episode ends `TimedOut`.
 ///
 /// The patch's place is uniform in each episode: for 42 in 84 its centre, row and column, is uniform on 21..=63.
-/// Source: the paper's appendix on the Ising model, with the place held for an episode as its main text has it.
+/// Source: the paper's appendix on the Ising model, with the place fixed for an episode, as the main text says.
 pub type IsingWorld = Envs<Field>;
 
 /// One field, and the lattice that is its patch.
@@ -43,7 +43,7 @@ pub struct Field {
     patch: IsingLattice,
 }
 
-/// All of a [`Field`] that does not follow from the settings, but for the patch's spins.
+/// The state of a [`Field`] that does not follow from the settings, except the patch's spins.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct Now {
     rng: ChaCha8Rng,
@@ -95,7 +95,7 @@ impl WorldSettings for IsingConfig {
 impl Env for Field {
     type Config = IsingConfig;
 
-    /// With the patch's spins.
+    /// The state and the patch's spins.
     type Saved = (Now, Vec<i8>);
 
     fn new(config: &IsingConfig, seed: u64, env: usize) -> Result<Self, EnvError> {

@@ -50,7 +50,7 @@ pub struct LethalSchedule {
     /// Episodes of one environment until the next ghost, at least 1. N environments pass N times as many episodes in a task: for the
     /// paper's 5000 in all, set 5000 / N.
     pub episodes_per_task: u64,
-    /// The lethal ghost (0 to 3) of each task; after the last the first again.
+    /// The lethal ghost (0 to 3) of each task; after the last task, the first again.
     pub order: Vec<u8>,
 }
 

@@ -1,5 +1,5 @@
 //! One game of Ms. PacMan: how it starts, and what one step does.
-//! It neither starts anew what has ended, nor draws what moves.
+//! It neither resets a game that has ended, nor paints the agent and the ghosts.
 
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -12,26 +12,26 @@ use super::{
 };
 use crate::{environment::StepEnd, error::EnvError, saved::check};
 
-/// It is its own saved form: what never changes, the maze and the settings, is not in it.
+/// One game. The saved state is this struct: it leaves out the maze and the settings, which never change.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct Game {
     pub(super) rng: ChaCha8Rng,
     pub(super) agent: Place,
     pub(super) ghosts: [Ghost; GHOSTS],
     pub(super) lethal: [bool; GHOSTS],
-    /// Steps that the agent is still invincible.
+    /// Steps for which the agent is still invincible.
     pub(super) boost_left: u32,
     pub(super) items: Vec<Item>,
     pub(super) pellets_left: u32,
     pub(super) episode_step: u32,
     /// Episodes that this environment has ended.
     pub(super) episodes: u64,
-    /// The frame without what moves.
+    /// The frame without the agent and the ghosts.
     pub(super) background: Vec<u8>,
 }
 
 impl Game {
-    /// The start of an episode, after so many others.
+    /// Starts an episode, after `episodes` others.
     pub(super) fn start(config: &PacmanConfig, rng: ChaCha8Rng, episodes: u64) -> Self {
         Self {
             rng,
@@ -47,7 +47,7 @@ impl Game {
         }
     }
 
-    /// An error where no game is so.
+    /// Returns an error if no game can be in this state.
     pub(super) fn check(&self) -> Result<(), EnvError> {
         let places = MAZE.items.len();
         let is_place = |place: Place| usize::from(place) < places;
@@ -62,7 +62,7 @@ impl Game {
         check(self.background.len() == render::FRAME_BYTES, "a frame")
     }
 
-    /// One step of one game; it does not reset. Returns what was earned and what ended.
+    /// Plays one step, without a reset. Returns its reward and its end.
     pub(super) fn step(&mut self, config: &PacmanConfig, action: u8) -> (f32, StepEnd) {
         let (agent_before, boosted_before) = (self.agent, self.boost_left > 0);
         self.episode_step += 1;

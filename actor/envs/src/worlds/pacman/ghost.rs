@@ -1,4 +1,4 @@
-//! How a ghost moves: wander, follow or avoid, changed over by chance, with the odd random move.
+//! The moves of a ghost: it wanders, follows or avoids, changes between these at random, and sometimes moves at random.
 //! It decides nothing about contacts; every ghost sees the agent where it was before the step.
 
 use rand::Rng;
@@ -9,7 +9,7 @@ use super::{
     maze::{DIRECTIONS, Direction, MAZE, Place},
 };
 
-/// What a ghost is at. Which one the situation asks for: `wanted`.
+/// A ghost's behaviour. `wanted` says which one the situation asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Mode {
     /// Continue at random, turning back only where there is no other way.
@@ -73,7 +73,7 @@ impl Ghost {
         draw(if onward == 0 { open } else { onward }, rng)
     }
 
-    /// The open direction of the highest score, the first of equals in the order up, down, left, right.
+    /// Returns the open direction with the highest score; of equals, the first in the order up, down, left, right.
     fn best(&self, score: impl Fn(Place) -> i32) -> Option<Direction> {
         (0..DIRECTIONS as Direction)
             .rev()

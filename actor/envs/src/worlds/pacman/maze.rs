@@ -1,5 +1,5 @@
-//! The maze of Ms. PacMan: where walls, food and starts are, what sees what, and how far it is.
-//! It knows nothing of what moves in it. The layout was drawn for this project; it is not the arcade's.
+//! The maze of Ms. PacMan: its walls, food and starts, which cells see each other, and the distances between them.
+//! It knows nothing of the agent and the ghosts. The layout was drawn for this project; it is not the arcade's.
 
 use std::sync::LazyLock;
 
@@ -39,7 +39,7 @@ const LAYOUT: [&[u8; WIDTH]; HEIGHT] = [
     b"###################",
 ];
 
-/// The one maze that there is.
+/// The only maze.
 pub(crate) static MAZE: LazyLock<Maze> = LazyLock::new(Maze::new);
 
 /// A way out of a cell; `direction ^ 1` is its opposite.
@@ -63,9 +63,9 @@ pub(crate) struct Maze {
     next: Vec<[Place; DIRECTIONS]>,
     /// Open cell -> bit d is set where direction d is open.
     open: Vec<u8>,
-    /// Open cell -> number of its unbroken run of open cells in its row, and in its column.
+    /// Open cell -> first pixel of its unbroken run of open cells in its row, and in its column.
     runs: Vec<(u16, u16)>,
-    /// [places, places]: moves on the shortest way.
+    /// [places, places]: moves on the shortest way between two open cells.
     distances: Vec<u8>,
     /// What lies in each open cell at the start of an episode.
     pub(crate) items: Vec<Item>,
@@ -130,7 +130,7 @@ impl Maze {
         self.pixels[usize::from(place)].into()
     }
 
-    /// Where one move leads; a wall leaves the mover where it is.
+    /// Returns the cell to which one move leads. A move into a wall stays in its cell.
     pub(crate) fn next(&self, place: Place, direction: Direction) -> Place {
         self.next[usize::from(place)][usize::from(direction)]
     }
@@ -140,7 +140,7 @@ impl Maze {
         self.open[usize::from(place)]
     }
 
-    /// Whether the two are in one row or column with no wall between. The tunnel cannot be looked through.
+    /// Whether two open cells are in one row or column with no wall between. The tunnel cannot be looked through.
     pub(crate) fn in_sight(&self, a: Place, b: Place) -> bool {
         let (a, b) = (self.runs[usize::from(a)], self.runs[usize::from(b)]);
         a.0 == b.0 || a.1 == b.1
@@ -158,7 +158,7 @@ impl Maze {
     }
 }
 
-/// The pixels up, down, left and right of one, around the rim.
+/// The pixels up, down, left and right of `pixel`, wrapping around the rim.
 fn beside(pixel: usize) -> [usize; DIRECTIONS] {
     let (row, column) = (pixel / WIDTH, pixel % WIDTH);
     let at = |row: usize, column: usize| row % HEIGHT * WIDTH + column % WIDTH;
@@ -179,7 +179,7 @@ fn runs(pixel: usize) -> (u16, u16) {
     ((row * WIDTH + left) as u16, (top * WIDTH + column) as u16)
 }
 
-/// Breadth-first moves from one open cell to each; `u8::MAX` where none leads.
+/// The number of moves from one open cell to each, by breadth-first search; `u8::MAX` for cells out of reach.
 fn distances_from(from: usize, next: &[[Place; DIRECTIONS]]) -> Vec<u8> {
     let mut distances = vec![u8::MAX; next.len()];
     distances[from] = 0;

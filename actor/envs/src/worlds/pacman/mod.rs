@@ -1,11 +1,10 @@
 //! The simplified Ms. PacMan of the paper: a yellow square eats pellets in a maze and is hunted by four ghosts.
-//! It has no levels, no lives and no fruit, and it knows nothing of stacks or enlargement.
+//! It has no levels, no lives and no fruit, and it does not stack or enlarge frames.
 //!
-//! One step, everyone at once: the agent moves and eats what lies there; each ghost moves by what it saw before the
-//! step; then contacts count, and crossing (agent and ghost changing places) is one. A lethal ghost in contact ends the
-//! episode, or, while the agent is boosted, goes back to its start and earns `reward_ghost`. A harmless ghost in contact
-//! with a boosted agent goes back too, for the same behaviour, but has no link to the reward. The episode also ends when
-//! the last pellet is eaten, before any contact of that step. Boosts need not be eaten.
+//! In one step all move at once. The agent moves and eats what lies in its new cell; each ghost moves by what it saw before the step. Then
+//! contacts count, and crossing (agent and ghost changing places) is one. A lethal ghost in contact ends the episode. If the agent is
+//! boosted, the ghost goes back to its start instead and earns `reward_ghost`. A harmless ghost in contact with a boosted agent goes back
+//! too, without a reward. The episode also ends when the last pellet is eaten, before any contact of that step. Boosts need not be eaten.
 //!
 //! Source: the paper's appendix on Ms. PacMan; what it leaves open (maze, colours, rewards, order within a step, how a
 //! ghost finds its way) is decided here and in `config`.
@@ -35,10 +34,10 @@ use crate::worlds::ising::{Boundary, IsingLattice};
 /// A move into a wall is a no-op. The no-op is a separate action so that an agent can wait for a ghost to pass.
 pub type PacmanWorld = Envs<Board>;
 
-/// One game, and what its walls show.
+/// One game, and the Ising model in its walls.
 pub struct Board {
     game: Game,
-    /// The spins in the walls, where walls flicker. Their generator is their own, so that the ghosts do the same with and without them.
+    /// The spins in the walls, if walls flicker. Their separate generator keeps the ghosts' moves the same with and without spins.
     walls: Option<(IsingLattice, ChaCha8Rng)>,
 }
 
@@ -69,7 +68,7 @@ impl WorldSettings for PacmanConfig {
 impl Env for Board {
     type Config = PacmanConfig;
 
-    /// A game; and the spins in its walls with their generator, where walls flicker.
+    /// A game; and, if walls flicker, the spins in its walls with their generator.
     type Saved = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
 
     fn new(config: &PacmanConfig, seed: u64, env: usize) -> Result<Self, EnvError> {

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use super::maze::{GHOSTS, HEIGHT, Item, MAZE, Place, WIDTH};
 
-/// Bytes a pixel.
+/// Bytes per pixel.
 pub(crate) const CHANNELS: usize = 3;
 pub(crate) const FRAME_BYTES: usize = HEIGHT * WIDTH * CHANNELS;
 
@@ -50,7 +50,7 @@ pub(crate) fn overlay(spins: &[i8], frame: &mut [u8]) {
     }
 }
 
-/// Paints what moves: the ghosts, the first on top, and the agent over them.
+/// Paints the ghosts, the first on top, and the agent over them.
 pub(crate) fn actors(ghosts: [Place; GHOSTS], agent: Place, boosted: bool, frame: &mut [u8]) {
     for (place, colour) in ghosts.into_iter().zip(GHOST).rev() {
         paint(frame, MAZE.pixel(place), colour);

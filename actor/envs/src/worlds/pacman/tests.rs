@@ -98,7 +98,7 @@ fn food_is_eaten_once() {
     let mut world = duel(&harmless(), 3);
     assert_eq!(step(&mut world, 3).0, 1.0);
     assert_eq!(world.envs[0].game.pellets_left, 186);
-    // The pellet on which the agent was put.
+    // The agent eats the pellet on which it was put.
     assert_eq!(step(&mut world, 4).0, 1.0);
     assert_eq!(step(&mut world, 3).0, 0.0);
     let pixel = MAZE.pixel(at(19, 9));
@@ -111,7 +111,7 @@ fn contact_with_a_lethal_ghost_ends_the_episode() {
     for (apart, action) in [
         // The agent waits: the ghost steps onto it.
         (1, 0),
-        // It walks at it: they change places, which counts.
+        // The agent walks at the ghost: they change places, which counts.
         (1, 4),
         // Both go to the middle.
         (2, 4),
@@ -140,7 +140,7 @@ fn contact_with_a_harmless_ghost_is_nothing() {
     let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
     assert_eq!(step(&mut world, 0), (1.0, StepEnd::Running));
     assert_eq!(world.envs[0].game.ghosts[0].place, world.envs[0].game.agent);
-    // It stays, and still does nothing.
+    // The harmless ghost stays in contact, and still does nothing.
     assert_eq!(step(&mut world, 0), (0.0, StepEnd::Running));
 }
 
@@ -165,7 +165,7 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
     game.agent = beside;
     game.ghosts = [boost, away, away, away].map(Ghost::at);
     game.ghosts[0].mode = Mode::Follow;
-    // In the step in which it is taken.
+    // The boost counts in the step in which it is taken.
     assert_eq!(step(&mut world, 3), (5.0 + 20.0, StepEnd::Running));
     let pixel = MAZE.pixel(boost) * 3;
     for after in 1..=11 {
@@ -287,7 +287,7 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
         }
         is_start = ends[0] != StepEnd::Running;
     }
-    // Each start is another draw.
+    // Each episode starts with other spins.
     assert!(starts.windows(2).all(|pair| pair[0] != pair[1]));
 }
 

@@ -1,5 +1,5 @@
 //! The settings of the Procgen world, as a preset or a command line gives them.
-//! No field has a default: each affects what is learned, so a preset states it with its source.
+//! Only fields that earlier versions lack have defaults: each affects what is learned, so a preset states it with its source.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options};
 use crate::error::EnvError;
 use crate::settings::Levels;
 
-/// Levels to draw unseen ones from, right after those trained on.
+/// The number of unseen levels to draw from; they follow the levels of training.
 const UNSEEN_LEVELS: u32 = 100_000;
 
 /// Which levels of which game, and how they look.
@@ -39,15 +39,15 @@ pub struct ProcgenConfig {
     pub center_agent: bool,
     /// Whether each kind of thing always looks the same, rather than differently from level to level.
     pub restrict_themes: bool,
-    /// Side of a frame in pixels, 8 to 64, as it is sent, kept and learned from. The engine draws 64; fewer are means over areas of its
-    /// picture. Settings of earlier versions do not have it: 64.
+    /// Side of a frame in pixels, 8 to 64, as it is sent, stored and learned from. The engine draws 64; smaller frames
+    /// are means over areas of its picture. Settings of earlier versions lack this field and mean 64.
     #[serde(default = "whole_side")]
     pub frame_side: u32,
-    /// Whether frames are grey, one byte a pixel, rather than of three colours. Settings of earlier versions do not have it: not.
+    /// Whether frames are grey, one byte per pixel, rather than in colour. Settings of earlier versions lack this field and mean false.
     #[serde(default)]
     pub grey: bool,
-    /// Another build of the engine's library, by the path of `libenv.so`, with its pictures in `assets` beside it or beside its
-    /// folder; none: the published one.
+    /// The path of another build of the engine's library, `libenv.so`, with its pictures in `assets` beside it or
+    /// beside its folder. If absent, the published build plays.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub library: Option<String>,
 }
@@ -57,7 +57,7 @@ pub(super) const fn whole_side() -> u32 {
 }
 
 impl ProcgenConfig {
-    /// The engine that plays: the build that is named, or the published one, which is fetched if it is not there.
+    /// Returns the engine: the build that `library` names, or the published one, which is fetched if it is not installed.
     pub(super) fn engine(&self, progress: &mut dyn FnMut(&str)) -> Result<Engine, EnvError> {
         let engine = match &self.library {
             Some(library) => Engine::other(Path::new(library)),
@@ -66,7 +66,7 @@ impl ProcgenConfig {
         Ok(engine?)
     }
 
-    /// The same game with other levels.
+    /// Returns the same game with other levels.
     pub(crate) fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
         let mut changed = self.clone();
         match levels {

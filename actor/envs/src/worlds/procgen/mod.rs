@@ -12,20 +12,20 @@
 //! | 1 | otherwise | | `Terminal` |
 //!
 //! The engine does not say which episodes its limit cut off, so steps are counted here. The limits are exact (they are
-//! read out of the engine's saved states in the tests of `procgen-sys`). What remains unknowable is an episode that was
-//! lost in the very step at which the limit strikes: it is reported as `TimedOut`.
+//! read out of the engine's saved states in the tests of `procgen-sys`). An episode that was lost in the very step of
+//! the limit cannot be told apart: it is reported as `TimedOut`.
 //!
 //! # Sequential levels
-//! With `use_sequential_levels` the engine follows a completed level s by level s + 997, without `first`, the return
-//! continuing. With 500 levels this leaves the training set at the first completed level, and the agent trains on ever
-//! new levels until it dies; only a lost or timed-out episode draws from the set again.
+//! With `use_sequential_levels` the engine continues a completed level s with level s + 997: `first` stays 0, and the
+//! return continues. With 500 levels this leaves the training set at the first completed level, and the agent trains on
+//! ever new levels until it dies. Only a lost or timed-out episode draws from the set again.
 //!
-//! Here a completed level is followed by one **of the set**: when the engine has left it, the environment's complete state is
-//! moved to a spare environment, reset there, and moved back. The spare's reset draws the level with the environment's
-//! own generator, as every lost episode does, so the law of levels is uniform over the set, the result depends on the
-//! seed and the environment's own actions only, no other environment is stepped, and no transition is made up: the step that completed
-//! the level keeps its reward and is a `LevelChange`, and the next frame is the first of the drawn level. Where s + 997
-//! lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
+//! Here a level **of the set** follows a completed level. When the engine has left the set, the environment's complete
+//! state is moved to a spare environment, reset there, and moved back. The reset draws the level with the environment's
+//! own generator, as after every lost episode. So levels are uniform over the set, and the result depends on the seed
+//! and the environment's own actions only. No other environment is stepped and no transition is made up: the step that
+//! completed the level keeps its reward and is a `LevelChange`, and the next frame is the first of the drawn level.
+//! Where s + 997 lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
 
 mod config;
 mod shrink;
@@ -60,11 +60,11 @@ pub struct ProcgenWorld {
     steps_taken: Vec<u32>,
     /// Steps after which the engine ends an episode.
     time_limit_steps: u32,
-    /// What keeps sequential levels in their set; `None` where the engine does so itself.
+    /// Keeps sequential levels in their set; `None` without sequential levels, where the engine does so itself.
     levels: Option<LevelSet>,
-    /// The shape of a frame as it leaves this world.
+    /// The shape of this world's frames.
     shape: FrameShape,
-    /// What makes frames smaller or grey; `None` where they leave as the engine drew them.
+    /// Makes frames smaller or grey; `None` if this world's frames are the engine's.
     shrink: Option<Shrink>,
 }
 
@@ -75,8 +75,7 @@ struct LevelSet {
 }
 
 impl ProcgenWorld {
-    /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`procgen_sys::Engine::install`] for how to do that
-    /// beforehand and watch it.
+    /// Makes `num_envs` environments. Fetches the engine unless it is installed; [`procgen_sys::Engine::install`] does so beforehand.
     ///
     /// `seed` decides which levels are drawn; `threads` is the number of threads that step, 0 for the calling one.
     pub fn new(
@@ -116,7 +115,7 @@ impl ProcgenWorld {
         })
     }
 
-    /// What the last step ended in environment `env`, whose steps were counted including it.
+    /// What the last step ended in environment `env`; `steps_taken` must already count that step.
     fn end_of(&self, env: usize) -> StepEnd {
         let completed = self.game.prev_level_complete()[env] != 0;
         match (self.game.first()[env] != 0, completed) {

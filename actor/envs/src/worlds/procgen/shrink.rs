@@ -1,5 +1,5 @@
-//! The engine's frames made smaller, or grey: fewer bytes to keep, to send and to learn from.
-//! A frame that is wanted as the engine gave it does not come here.
+//! Makes the engine's frames smaller, or grey: fewer bytes to store, to send and to learn from.
+//! Frames that keep the engine's size and colours do not pass through here.
 
 use procgen_sys::{FRAME_BYTES, FRAME_SIDE};
 
@@ -11,18 +11,18 @@ pub(super) const RGB: usize = 3;
 const LUMA: [u32; RGB] = [299, 587, 114];
 const LUMA_SUM: u32 = 1000;
 
-/// Makes a frame [64, 64, 3] one of `side` x `side` pixels, in colour or grey.
+/// Shrinks a frame [64, 64, 3] to `side` x `side` pixels, in colour or grey.
 ///
 /// A pixel is the mean over the area that it covers, pixels at its edges counted in proportion, rounded to the nearest number, halves
-/// up; its grey is the luma of that mean before rounding. All of it is exact in 32 bits.
+/// up; its grey is the luma of that mean before rounding. The arithmetic is exact in 32 bits.
 pub(super) struct Shrink {
     shape: FrameShape,
-    /// For each pixel along a side the first of the engine's that it covers, and how much of each, in `1 / side` of one.
+    /// For each pixel along a side, the first engine pixel that it covers, and how much of each it covers, in units of `1 / side`.
     covers: Vec<(usize, Vec<u32>)>,
 }
 
 impl Shrink {
-    /// To frames of this shape: a side of 1 to 64 pixels, and 3 bytes a pixel, or 1 where they are grey.
+    /// Shrinks to frames of this shape: a side of 1 to 64 pixels, and 3 bytes per pixel, or 1 if they are grey.
     pub(super) fn new(shape: FrameShape) -> Self {
         let side = shape.height;
         assert!((1..=FRAME_SIDE).contains(&side), "a side of {side} pixels");

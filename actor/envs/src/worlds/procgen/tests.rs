@@ -1,4 +1,4 @@
-//! Tests of the Procgen world. Those that step it fetch the engine once and are skipped with `DRIML_OFFLINE=1`.
+//! Tests of the Procgen world. Tests that step it fetch the engine once and are skipped with `DRIML_OFFLINE=1`.
 //! What the engine itself does is tested in `procgen-sys`.
 
 use std::hash::{Hash, Hasher};
@@ -17,7 +17,7 @@ pub(crate) fn engine() -> Option<&'static Engine> {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
     if std::env::var_os("DRIML_OFFLINE").is_some_and(|it| !it.is_empty() && it != "0") {
         let test = std::thread::current();
-        // Past the test runner, which keeps the output of a test that passes.
+        // Bypasses the test runner, which hides the output of a test that passes.
         let line = format!(
             "skipped: {} (DRIML_OFFLINE=1)\n",
             test.name().unwrap_or("?")
@@ -50,13 +50,13 @@ fn draw(rng: &mut ChaCha8Rng, num_envs: usize) -> Vec<u8> {
     (0..num_envs).map(draw).collect()
 }
 
-/// What a step gave: frames after it, rewards, ends.
+/// Steps the world and returns the frames after the step, the rewards and the ends.
 fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f32>, Vec<StepEnd>) {
     let (rewards, ends) = playing::step(world, actions);
     (playing::frames(world), rewards, ends)
 }
 
-/// One environment at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
+/// Makes one environment at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
 /// was taken before: the engine aims shots with it, and does not forget it when a level starts.
 fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> VecGame {
     let options = config.options(1, 0, 0).unwrap();
@@ -237,7 +237,7 @@ fn ends_are_told_apart() {
     assert!(ends.contains(&StepEnd::Terminal) && !ends.contains(&StepEnd::TimedOut));
 }
 
-/// How many actions each game tells apart; that those it does not are the same is the engine's word, below.
+/// How many actions each game tells apart. The next test checks with the engine that the other actions do the same.
 #[test]
 fn games_have_so_many_visible_actions() {
     let count = |game: &Game| {
@@ -252,7 +252,7 @@ fn games_have_so_many_visible_actions() {
     assert_eq!(counts.join(", "), expected);
 }
 
-/// Does every action in the same saved states and compares all that follows for six steps; see `visible_actions`.
+/// Takes every action in the same saved states and compares all that follows for six steps; see `visible_actions`.
 #[test]
 fn visible_actions_are_what_the_engine_does() {
     let Some(engine) = engine() else { return };
@@ -279,7 +279,7 @@ fn visible_actions_are_what_the_engine_does() {
             let tapes: Vec<_> = (0..NUM_ACTIONS).map(&mut consequences).collect();
             for (a, tape) in tapes.iter().enumerate() {
                 let visible = usize::from(table[a]);
-                // What is seen next is the same.
+                // The next frame is the same.
                 assert!(tape[0] == tapes[visible][0], "{game}: {a} and {visible}");
                 for (b, other) in tapes.iter().enumerate() {
                     differs[a][b] |= tape != other;

@@ -1,13 +1,13 @@
-//! What each of the fifteen actions amounts to in each game.
-//! It does not change what the engine is given; it is an alphabet for statistics over actions.
+//! Which of the fifteen actions do the same in each game: the alphabet for statistics over actions, and for `ActionSet::Visible`.
+//! It does not change which actions the engine takes.
 
 use procgen_sys::{Game, NUM_ACTIONS};
 
-/// For each raw action, the one that it amounts to; an action that stands for itself maps to itself, 4 is no-op.
+/// Maps each raw action to one that does the same in `game`. An action that does something else maps to itself; 4 is the no-op.
 ///
 /// The table is that of the authors of Deep Reinforcement and InfoMax Learning (2020). The engine confirms it, by doing
-/// each pair of actions in the same saved state and comparing all that follows, **except in ninja**: there 13 and 14 are
-/// no no-ops but throw a star as 9 does, which the next frame does not show yet. The table keeps the authors' entry.
+/// each pair of actions in the same saved state and comparing all that follows, **except in ninja**: there 13 and 14 throw a star
+/// as 9 does, instead of being no-ops, but the next frame does not show it yet. The table keeps the authors' entry.
 /// It could also be coarser: in leaper 0 and 2 do what 1 does, and 6 and 8 what 7 does; in starpilot 11 to 14 do what 9
 /// does. In caveflyer, dodgeball, fruitbot and ninja the effect of action 9 shows only after the next frame.
 pub fn visible_actions(game: Game) -> [u8; NUM_ACTIONS] {

@@ -1,4 +1,4 @@
-//! Adam: steps of any gradients, ten million of them, and the bias correction of any step number.
+//! Adam: steps with any gradients, runs of many steps, and the bias correction at any step number.
 
 use driml_learner::{
     AdamSettings,
@@ -7,7 +7,7 @@ use driml_learner::{
 
 use crate::stability::property::*;
 
-/// As `driml-ada` on Procgen has them, but for the eps, which here is the one that rounds worst.
+/// The settings of `driml-ada` on Procgen, but with the eps that has the worst rounding errors.
 const PRESET: AdamSettings = AdamSettings {
     lr: 2.5e-4,
     beta1: 0.9,
@@ -16,9 +16,9 @@ const PRESET: AdamSettings = AdamSettings {
 };
 /// The largest `max_grad_norm`.
 const LARGEST: f32 = 1e15;
-/// What the errors of the moments allow; the root halves the share that the second is off by.
+/// The error of a step that follows from the errors of the moments. The square root halves the relative error of the second moment.
 const MOMENTS_ERROR: f64 = moment_error(PRESET.beta1) + moment_error(PRESET.beta2) / 2.0;
-/// Beside half of a parameter's last place a step, its way is the sum of its steps' sizes.
+/// The inputs. Errors are shares of a parameter's way, the sum of its step sizes, beyond half of its last place for each step.
 const RANGE: &str = "gradients within 1e15; lr 1e-30 to 1e38, beta 0 to 0.99999, eps 1e-15 to 1e30";
 const OF_WAY: &str = "a parameter, as a share of its way";
 
@@ -31,16 +31,16 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
     let long = format!("{steps} steps of eight patterns of gradients, 1e-40 to 1e15");
     vec![
         Property::new("Adam", RANGE)
-            // Where f32 holds second moments, and where they are near the least that it holds.
+            // The first promise is for second moments well within f32, the second for those near its smallest numbers.
             .promise(OF_WAY, STEP_ERROR / 10.0)
             .promise("the same at the least second moments", STEP_ERROR)
             .on(EQUAL, Listed, |cases| few_steps(cases, 0))
             .on(DRAWN, Drawn(0.5), |cases| few_steps(cases, 1)),
         Property::new("Adam", RANGE)
             .promise(OF_WAY, MOMENTS_ERROR)
-            // Where half of its last place is below 0.4% of a step.
+            // This counts only if `step_floor`, summed over the steps, is at most `STEP_ERROR` of the way.
             .promise("a parameter, all in", 2.0 * STEP_ERROR)
-            // Of the decayed mean of sizes, while gradients last.
+            // The error is relative to the decayed mean of |gradient|, for patterns that never end.
             .promise("the first moment", moment_error(PRESET.beta1))
             .promise("the second moment", moment_error(PRESET.beta2))
             .on(&long, Listed, long_run),
@@ -50,7 +50,7 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
     ]
 }
 
-/// A parameter that starts at 0 and its moments, as the rule steps them in f32, and in float64.
+/// A parameter that starts at 0, and its moments: in f32 as the rule steps them, and in f64.
 #[derive(Clone, Copy, Default)]
 struct Stepped {
     /// The parameter and its moments in f32.
@@ -58,16 +58,16 @@ struct Stepped {
     p: f64,
     m: f64,
     v: f64,
-    /// How far the parameter went, back and forth.
+    /// The sum of the sizes of all steps.
     way: f64,
-    /// What f32 may add: [`step_floor`] of each step; NaN after one that is not finite.
+    /// The error allowed for f32: the sum of [`step_floor`] over the steps; NaN after a step that is not finite.
     floor: f64,
-    /// Decayed mean of the gradients' sizes.
+    /// The decayed mean of |gradient|.
     size: f64,
 }
 
 impl Stepped {
-    /// The error of the parameter as a share of its way, [`step_floor`] apart.
+    /// Returns the error of the parameter beyond `floor`, as a share of its way.
     fn error(&self) -> f64 {
         match (f64::from(self.found[0]) - self.p).abs() - self.floor {
             error if error <= 0.0 => 0.0,
@@ -76,14 +76,14 @@ impl Stepped {
     }
 }
 
-/// Takes step number `t` of each with its gradient.
+/// Makes step number `t` for each parameter with its gradient.
 fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) {
     let rule = Rule::new(settings, t, 1.0);
     let (lr, eps) = (settings.lr, settings.eps);
     let (beta1, beta2) = (settings.beta1, settings.beta2);
-    // 1 - beta^t, which keeps its digits near beta = 1 and near t = 0.
+    // 1 - beta^t, computed without cancellation near beta = 1 and near t = 0.
     let [first, second] = [beta1, beta2].map(|beta| -(t as f64 * beta.ln()).exp_m1());
-    // Together, as the parameters of a tensor.
+    // The rule steps all of them together, like the parameters of a tensor.
     let [mut p, mut m, mut v] =
         [0, 1, 2].map(|i| all.iter().map(|it| it.found[i]).collect::<Vec<_>>());
     let is_finite = rule.apply(&mut p, gradients, &mut m, &mut v);
@@ -101,7 +101,7 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
     }
 }
 
-/// Those with which drawn gradients are tried.
+/// The (beta1, beta2) with which drawn gradients are tried.
 const DRAWN_BETAS: [(f64, f64); 5] = [
     (0.0, 0.0),
     (0.0, 0.9),
@@ -110,7 +110,7 @@ const DRAWN_BETAS: [(f64, f64); 5] = [
     (0.5, 0.99999),
 ];
 
-/// Up to 120 steps from 0, whose error counts for this promise.
+/// Makes up to 120 steps from 0. The error counts for `promise`.
 fn few_steps(cases: &mut Cases<'_>, promise: usize) -> anyhow::Result<()> {
     let betas = [(0.0, 0.0), (0.9, 0.999), (0.99999, 0.99999), (0.0, 0.99999)];
     let (beta1, beta2) = cases.of(&betas, |rng| one_of(&DRAWN_BETAS, rng));
@@ -140,10 +140,10 @@ fn few_steps(cases: &mut Cases<'_>, promise: usize) -> anyhow::Result<()> {
     cases.see(input, errors)
 }
 
-/// A name, and the gradient of a step beside noise from -1 to 1.
+/// A name, and a function of the step number and noise in -1..1 that gives the gradient.
 type Pattern = (&'static str, fn(u64, f32) -> f32);
 
-/// Patterns of gradients; of the first three, which never end, the moments promise something.
+/// Patterns of gradients. The promises about moments hold for the first three, which never end.
 const PATTERNS: [Pattern; 8] = [
     ("0.02 for ever", |_, _| 0.02),
     ("+-1e-5 in turn", |t, _| 1e-5 * turn(t)),
@@ -194,7 +194,7 @@ fn long_run(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A step whose number is as large as numbers get.
+/// Checks a single step at numbers up to the largest u64.
 fn step_number(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let powers = [24, 31, 32, 33, 53].map(|power| 1 << power);
     let number = cases.each(&[&[1, 2, 1000, u64::MAX][..], &powers].concat());

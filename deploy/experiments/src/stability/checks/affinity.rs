@@ -1,4 +1,4 @@
-//! Both estimates of the action affinity.
+//! Both estimators of the action affinity.
 
 use driml_learner::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
@@ -7,10 +7,9 @@ use driml_learner::{
 
 use crate::stability::property::*;
 
-/// Half of the last place of an f32 near 1, of which the sum of a row of an affinity may be off by four.
+/// The allowed error of a row's sum: four times half of the last place of an f32 near 1.
 const ROW_SUM_ERROR: f64 = 2.5e-7;
-/// How far an entry of an affinity may be from 1 / actions where no pair says anything: a quarter of an f32's last place at 1, as 1 /
-/// 15 has.
+/// The allowed distance of an entry from 1 / actions if the pairs carry no information: a quarter of the last place of an f32 at 1.
 const UNIFORM_ERROR: f64 = 3e-8;
 
 const ALWAYS: &str = "always the same action: an entry, beside 1 / actions";
@@ -29,13 +28,13 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
             .on(COUNTS, Listed, exact),
         Property::new("affinity, learned", "any pairs of 1 to 255 actions")
             .promise("a row's sum, beside 1, at any update", ROW_SUM_ERROR)
-            // One pair says nothing of how actions follow each other.
+            // If there is only one pair, it does not tell how actions follow each other.
             .promise(ALWAYS, UNIFORM_ERROR)
             .on(&updates, Listed, learned),
     ]
 }
 
-/// As the preset has them.
+/// The settings of the preset.
 const LEARNED: LearnedSettings = LearnedSettings {
     hidden: 32,
     lr: 2e-3,
@@ -45,7 +44,7 @@ const LEARNED: LearnedSettings = LearnedSettings {
     keep: 0.9,
 };
 
-/// Ways in which actions are used, each as so many pairs a batch and what draws one of them.
+/// A way in which actions are used: its name, the number of pairs in a batch, and a function that draws a pair.
 type Use = (&'static str, usize, fn(u8, &mut ChaCha8Rng) -> (u8, u8));
 
 const USES: [Use; 5] = [
@@ -65,7 +64,7 @@ fn any_pair(actions: u8, rng: &mut ChaCha8Rng) -> (u8, u8) {
     (rng.random_range(0..actions), rng.random_range(0..actions))
 }
 
-/// The largest distance of a row's sum from 1; NaN where an entry is not a probability.
+/// Returns the largest distance of a row's sum from 1; NaN if an entry is not a probability.
 fn row_sum_error(matrix: &[f32], actions: usize) -> f64 {
     worst(matrix.chunks_exact(actions).map(|row| {
         let are_chances = row.iter().all(|a| (0.0..=1.0 + 1e-6).contains(a));
@@ -73,12 +72,12 @@ fn row_sum_error(matrix: &[f32], actions: usize) -> f64 {
     }))
 }
 
-/// A of these counts: each row of (c + s) / (e + s), e = what independent actions would have, over its sum.
+/// Computes A from counts c: (c + s) / (e + s), divided by its row's sum. e is the expected count of independent actions.
 fn closed_form(counts: &[f64], actions: usize, smoothing: f64) -> Vec<f64> {
     let rows = || counts.chunks_exact(actions);
     let column = |j: usize| exact_sum(rows().map(|row| row[j]));
     let columns: Vec<f64> = (0..actions).map(column).collect();
-    // Where nothing was counted, 0 of any total is 0.
+    // Without counts, 0 divided by any positive total is 0.
     let total = exact_sum(columns.iter().copied()).max(f64::MIN_POSITIVE);
     let chances = rows().flat_map(|row| {
         let of_row = exact_sum(row.iter().copied());
@@ -98,7 +97,7 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         decay: cases.each(&[1.0, 0.999, 0.5, 1e-300]),
         smoothing: cases.each(&[1e-100, 1.0, 1e100]),
     };
-    // So many of each pair were counted already.
+    // The initial count of each pair.
     let start = cases.each(&[0.0, 2f64.powi(24), 2f64.powi(53), 1e299]);
     let (used, count, pair) = cases.each(&USES);
     let exact = ExactAffinity::new(Alphabet::raw(actions)?, settings)?;

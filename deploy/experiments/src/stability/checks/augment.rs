@@ -1,4 +1,4 @@
-//! States cropped and recoloured, as an auxiliary loss sees them, against bytes that are rounded once.
+//! Cropping and recolouring of states for an auxiliary loss, compared with values in f64.
 
 use driml_learner::augment::{Augment, AugmentSettings, COLOUR_ERROR, CROP_ERROR, View};
 
@@ -18,7 +18,7 @@ pub(super) fn properties() -> Vec<Property> {
     ]
 }
 
-/// States [height, width, stack * frame channels].
+/// A state [height, width, stack * frame channels].
 struct Picture {
     size: (usize, usize, usize),
     frame_channels: usize,
@@ -26,7 +26,7 @@ struct Picture {
 }
 
 impl Picture {
-    /// The strongest, with crops of this side.
+    /// Creates the strongest augmentation, with crops of this side.
     fn augment(&self, crop_side: f64) -> Augment {
         let strongest = AugmentSettings {
             crop_side,
@@ -38,7 +38,7 @@ impl Picture {
         Augment::new(strongest, self.size, self.frame_channels)
     }
 
-    /// The largest error of a view in bytes, beside what each byte should be.
+    /// Returns the largest difference between the bytes of a view and their expected values.
     fn error(&self, augment: &Augment, view: &View, expected: impl Fn(usize) -> f64) -> f64 {
         let mut seen = vec![0u8; self.state.len()];
         augment.apply_view(&self.state, view, &mut seen);
@@ -49,7 +49,7 @@ impl Picture {
     fn crop_error(&self, augment: &Augment, view: &View) -> f64 {
         let (height, width, channels) = self.size;
         let (rows, columns) = augment.crop();
-        // Where an output pixel lies in the crop: two pixels and the second one's share.
+        // The position of an output pixel in the crop: its two neighbours, and the weight of the second.
         let place = |at: usize, crop: usize, whole: usize| {
             let place = (at as f64 + 0.5) * crop as f64 / whole as f64 - 0.5;
             let place = place.clamp(0.0, (crop - 1) as f64);
@@ -80,7 +80,7 @@ impl Picture {
             let pixel = &self.state[first..first + self.frame_channels];
             let grey = mean(pixel);
             let coloured = match pixel {
-                // A turn about the axis of greys, by Rodrigues' formula.
+                // A rotation about the grey axis, by Rodrigues' formula.
                 [_, _, _] => {
                     let d = |i: usize| f64::from(pixel[i % 3]) - grey;
                     let cross = (d(i + 2) - d(i + 1)) / 3f64.sqrt();
@@ -109,7 +109,7 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         (height, width, channels, stack, rng.random_range(0.01..=1.0))
     });
     let (rng, channels) = (&mut cases.rng, frame_channels * stack);
-    // Of all bytes, or of the two ends alone.
+    // The state has any bytes, or only 0 and 255.
     let bytes: &[u8] = if rng.random() { &[] } else { &[0, 255] };
     let state = (0..height * width * channels).map(|_| match bytes {
         [] => rng.random(),
@@ -122,7 +122,7 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     };
     let augment = picture.augment(crop_side);
     let any = augment.draw(rng);
-    // At the ends of its ranges, or anywhere in them.
+    // Each value is a listed one (the ends and the neutral value) or anywhere in its range.
     let mut end = |value: f64, ends: [f64; 3]| match rng.random_bool(0.5) {
         true => value,
         false => one_of(&ends, rng),

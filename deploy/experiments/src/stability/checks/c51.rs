@@ -1,4 +1,4 @@
-//! C51's losses: projection, softmax, and the divergence with its slopes.
+//! The C51 loss: projection, softmax, and the KL divergence with its slopes (gradients).
 
 use driml_learner::losses::{
     c51::{self, ENTRY_ERROR, KL_ERROR, SLOPE_ERROR},
@@ -17,7 +17,7 @@ pub(super) fn properties() -> Vec<Property> {
     let steps = "rewards any, infinite ones included; discounts 0 to 1; a support within 1e30";
     vec![
         Property::new("C51 projection", steps)
-            // Of 1e-7 + 1e-15 N max|v| / width; none is negative.
+            // `entry_error` is 1e-7 + 1e-15 N max|v| / width. No probability is negative.
             .promise("a probability, as a share of `entry_error`", 1.0)
             .promise("what a row sums to, before and after", MASS_ERROR)
             .promise("rows that hide it, or change others' bits", 0.0)
@@ -29,7 +29,7 @@ pub(super) fn properties() -> Vec<Property> {
             .on(LOGITS, Listed, softmax)
             .on("drawn", Drawn(1.0), softmax),
         Property::new("C51 loss (KL)", "logits finite; targets sum to 1")
-            // Of 10 + sum of target (max logit - logit).
+            // The error is a share of 10 + sum of target (max logit - logit).
             .promise("the loss, as a share of its terms", KL_ERROR)
             .promise("a slope, as a share of 6.1e-8 of it + 1e-15", 1.0)
             .promise("cases in which the loss is finite all the same", 0.0)
@@ -44,7 +44,7 @@ pub(super) fn properties() -> Vec<Property> {
     ]
 }
 
-/// Rows `probs` [B, N] with these rewards and discounts [B] on one support.
+/// Projects rows `probs` [B, N] with these rewards and discounts [B] on one support.
 fn projected(probs: &[f32], reward: &[f32], discount: &[f32], support: (f32, f32)) -> Vec<f32> {
     let mut out = vec![f32::NAN; probs.len()];
     project(probs, reward, discount, support.0, support.1, &mut out);
@@ -70,7 +70,7 @@ fn projection(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         _ => law(atoms, &mut cases.rng),
     };
 
-    // Each atom lands as the height of the hats of the atoms beside it: 1 at an atom, 0 at its neighbours.
+    // Each moved atom spreads its mass by hat functions: the hat of an atom is 1 there and 0 at its neighbours.
     let [low, high] = [support.0, support.1].map(f64::from);
     let (last, width) = ((atoms - 1) as f64, high - low);
     let mut hats = vec![0.0; atoms];
@@ -96,7 +96,7 @@ fn projection(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, errors)
 }
 
-/// Between two good rows, one that the batch's check would refuse: what comes here all the same must show.
+/// Puts a NaN row, which the batch's check would reject, between two good rows. The result must show the NaN in this row alone.
 fn projection_of_nan(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let (atoms, support) = (rng.random_range(2..60), support(rng));
@@ -138,7 +138,7 @@ struct Batch {
     atoms: usize,
     logits: Vec<f32>,
     target: Vec<f32>,
-    /// One a row, or 1 for all.
+    /// The weights, one for each row; `None` means 1.
     weights: Option<Vec<f32>>,
 }
 
@@ -161,7 +161,7 @@ impl Batch {
         (loss, slopes)
     }
 
-    /// Sees the errors of the loss and of its slopes.
+    /// Counts the errors of the loss and of its slopes.
     fn see(&self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let rows = self.logits.len() / self.atoms;
         let (loss, gradient) = self.kl();
@@ -173,7 +173,7 @@ impl Batch {
             let (probs, max, sum) = shares(&x);
             let mass = exact_sum(t.iter().copied());
             let there = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
-            // t ln t, t (max - x) and t ln sum apart, as their sizes are.
+            // t ln t, t (max - x) and t ln sum are separate terms because their sizes differ.
             terms.extend(there().map(|(_, t)| weight * t * t.ln()));
             terms.extend(there().map(|(x, t)| weight * t * (max - x)));
             terms.push(weight * mass * sum.ln());
@@ -184,7 +184,7 @@ impl Batch {
                 (f64::from(*g) - expected).abs() / allowed
             }));
         }
-        // A scale of 0 is that of weights of 0.
+        // The scale is 0 if all weights are 0.
         let of_loss = (loss * rows as f64 - exact_sum(terms)) / scale.max(LEAST);
         let input = format_args!("{rows} rows, logits {}", Shown(&self.logits));
         cases.see(input, [of_loss, worst(slopes)])
@@ -207,7 +207,7 @@ fn kl(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     batch.see(cases)
 }
 
-/// In the first row some atoms have no probability on either side, and the first always has one.
+/// Draws a batch in which some atoms of the first row have probability 0 in logits and target. The first atom never has 0.
 fn with_gaps(rng: &mut ChaCha8Rng) -> Batch {
     let mut batch = Batch::drawn(rng);
     batch.target[0] = 0.5;
@@ -220,12 +220,12 @@ fn with_gaps(rng: &mut ChaCha8Rng) -> Batch {
     batch
 }
 
-/// What is not a number at one atom, be its target 0 or not, shows in the loss.
+/// Checks that the loss shows a value that is not finite at one atom, whether its target is 0 or not.
 fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let mut batch = with_gaps(rng);
     let kind = rng.random_range(0..6);
-    // The first atom's probability stays: without it nothing might be left.
+    // Kinds 3 and above spare the first atom, which may be the only one left with a probability.
     let at = rng.random_range(usize::from(kind >= 3)..batch.atoms);
     (batch.logits[at], batch.target[at]) = match kind {
         0..3 => (not_finite(rng), 1.0 / batch.atoms as f32),

@@ -15,7 +15,7 @@ pub(super) fn properties() -> Vec<Property> {
     ]
 }
 
-/// Of any size.
+/// Draws a number of any size.
 fn count(rng: &mut ChaCha8Rng) -> u64 {
     rng.random::<u64>() >> rng.random_range(0..64)
 }
@@ -44,7 +44,7 @@ fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let mut before: f64 = start;
     for frames in frames {
         let found = schedule.epsilon(frames);
-        // The share of two counts, right to the last place: 64 bits of the quotient, as an integer.
+        // The quotient of the two counts, exact to the last place: computed as an integer with 64 fractional bits.
         let share = match frames >= decay_frames {
             true => 1.0,
             false => ((u128::from(frames) << 64) / u128::from(decay_frames)) as f64 / 2f64.powi(64),

@@ -22,7 +22,7 @@ pub(super) fn properties() -> Vec<Property> {
             .on("drawn", Drawn(5.0), clip),
         Property::new("InfoNCE", any_rows)
             .promise("the loss, as a share of 10 + the largest score", LOSS_ERROR)
-            // Of 1e-7 of it + 1e-15 + what the rounding of the largest score leaves open.
+            // `slope_error` is 1e-7 of the slope + 1e-15 + the effect of rounding the largest score.
             .promise("a slope, as a share of `slope_error`", 1.0)
             .promise("cases with other bits, or that hide it", 0.0)
             .on(BATCHES, Listed, loss)
@@ -45,7 +45,7 @@ fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         0.0 => score.abs() * f64::MAX,
         _ => (score - expected) / expected,
     };
-    // Divided twice, as the square of the cosh may be too large for a float where the slope is not yet too small for one.
+    // Divide twice by cosh: its square may overflow although the slope is still representable.
     let expected = 1.0 / (embedding_dim as f64).sqrt() / ratio.cosh() / ratio.cosh();
     let allowed = scores::slope_error(x, bound) * expected.max(scores::LEAST_SLOPE);
     let of_slope = (slope - expected).abs() / allowed;
@@ -53,7 +53,7 @@ fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, [of_score, of_slope])
 }
 
-/// `dots` [L, B, B] of vectors of 64 numbers.
+/// A batch of dot products `dots` [L, B, B] of vectors with 64 entries.
 struct Batch {
     dots: Vec<f32>,
     valid: Vec<u8>,
@@ -73,13 +73,13 @@ impl Batch {
         (loss.to_bits(), bits(&slopes))
     }
 
-    /// The rows that count.
+    /// Returns the valid rows.
     fn there(&self) -> Vec<usize> {
         let rows = 0..self.valid.len();
         rows.filter(|&row| self.valid[row] != 0).collect()
     }
 
-    /// Errors of the loss and of its slopes.
+    /// Returns the errors of the loss and of its slopes.
     fn errors(&self) -> [f64; 2] {
         let (rows, bound, there) = (self.valid.len(), self.bound, self.there());
         let (loss, slopes) = self.loss();
@@ -134,7 +134,7 @@ fn loss(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, batch.errors())
 }
 
-/// Dot products that are not finite: in rows that do not count, and in those that do.
+/// Checks dot products that are not finite, in rows that are not valid and in valid rows.
 fn loss_of_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let count = rng.random_range(2..12);
@@ -163,7 +163,7 @@ fn loss_of_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     keeps(cases, &batch, !batch.loss().0.is_finite())
 }
 
-/// Notes whether what is promised of dot products that are not finite holds for this batch.
+/// Counts whether the promise about dot products that are not finite holds for this batch.
 fn keeps(cases: &mut Cases<'_>, batch: &Batch, is_kept: bool) -> anyhow::Result<()> {
     let input = format_args!("valid {:?}, dots {}", batch.valid, Shown(&batch.dots));
     cases.keeps(2, input, is_kept)

@@ -1,5 +1,5 @@
-//! The table of properties, a file a family: which inputs a routine gets, and the reference it is held to.
-//! References are written without a look at the routine. A bound is a constant of the routine wherever it has one.
+//! The table of properties, with a file for each family of routines: the inputs of each routine, and the reference it is compared with.
+//! References are written independently of the routine. A bound is a constant of the routine where the routine has one.
 
 mod adam;
 mod affinity;
@@ -17,7 +17,7 @@ mod values;
 
 use super::property::{Property, Settings};
 
-/// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
+/// Returns all properties in the order of the page. Relative errors of values below 1.2e-38 are relative to 1.2e-38.
 pub(super) fn table(settings: &Settings) -> Vec<Property> {
     let families = [
         c51::properties(),

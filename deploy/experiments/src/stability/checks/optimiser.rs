@@ -1,4 +1,4 @@
-//! Around the optimiser: the norm of all gradients together, the factor that clips it, and the target network's moves.
+//! Routines around the optimiser: the global gradient norm, the clipping factor, and the updates of the target network.
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
@@ -32,7 +32,7 @@ pub(super) fn properties() -> Vec<Property> {
             .on("norms 0 to 3.4e38, limits 1e-6 to 1e15", Listed, clipping)
             .on("drawn, half of them near the limit", Drawn(10.0), clipping),
         Property::new("target network", "tau 1e-5 to 1; parameters within 1.7e38")
-            // Of the largest that either ever was.
+            // The error is relative to the largest value that the parameter had in either network.
             .promise("a parameter, as a share of `follow_error`", 1.0)
             .promise("copies of other bits", 0.0)
             .on(MOVES, Listed, followed)
@@ -41,7 +41,7 @@ pub(super) fn properties() -> Vec<Property> {
     ]
 }
 
-/// Gradients with these values, one parameter after the other: those of the sum of each parameter times its value.
+/// Returns gradients with these values, one parameter after the other. They come from the loss: sum of parameter times value.
 fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> {
     let parameters = small::parameters(config, &[])?;
     let slopes = small::tensors(config, values)?;
@@ -60,7 +60,7 @@ fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let len = small::len(&config);
     let values = cases.of(&listed(len), |rng| finites(len, rng));
     let norm = gradients(&config, &values)?.norm(Kernels::FUSED)?;
-    // The largest value's size times the norm of the shares of it.
+    // The reference is the largest |value| times the norm of all values divided by it.
     let largest = f64::from(values.iter().fold(0.0f32, |most, x| most.max(x.abs())));
     let squares = values.iter().map(|x| (f64::from(*x) / largest).powi(2));
     let error = match largest {
@@ -92,7 +92,7 @@ fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         false => limit * (1.0 + rng.random_range(-1e-6..1e-6)),
     });
     if norm <= 8e37 * limit {
-        // As the step uses it.
+        // The optimiser step uses the factor as f32.
         let factor = f64::from(clip_factor(norm, limit) as f32);
         let is_right = factor == 1.0 || (norm + 1e-6 > limit && (0.0..1.0).contains(&factor));
         let error = only_if(is_right, (factor * norm / limit - 1.0).max(0.0));
@@ -101,13 +101,13 @@ fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A target network of the smallest kind, led towards one network after the other.
+/// Checks a target network of the smallest kind that follows one online network after the other.
 fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let start = vec![-0.4, -1.1, 0.6, 2.6, 0.0, 1e-45, -1e30, 1.0];
     let start = cases.of(&[start], |rng| clamped(10, FOLLOWED_MAX, rng));
     let taus = [0.95, 0.5, 0.005, 1e-3, 1e-4, 1e-5];
     let tau: f64 = cases.of(&taus, |rng| 10f64.powf(rng.random_range(-5.0..0.0)));
-    // How often it moves towards each.
+    // Each entry has the number of moves, and the online network that the target moves towards.
     let end = vec![0.7, -1.3, 0.011, 2.5, 1e-38, 1e-40, 1e30, -1.0];
     let ways: Vec<(u64, Vec<f32>)> = cases.of(&[vec![((3.0 / tau) as u64, end)]], |rng| {
         let count = rng.random_range(1..8);
@@ -115,14 +115,14 @@ fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         (0..count).map(way).collect()
     });
     let target = small::parameters(&small::least(), &start)?;
-    // In f64 its parameters, and how large they or the online network's ever were.
+    // Each parameter in f64, and the largest absolute value that it had in either network.
     let mut exact: Vec<_> = widened(&start).iter().map(|&x| (x, x.abs())).collect();
     for (moves, online) in &ways {
         let source = small::parameters(&small::least(), online)?;
         for _ in 0..*moves {
             follow(&target, &source, tau, Kernels::FUSED)?;
         }
-        // All moves at once: what is left of the distance is (1 - tau)^moves.
+        // All moves at once: the remaining share of the distance is (1 - tau)^moves.
         let left = (*moves as f64 * (-tau).ln_1p()).exp();
         for ((exact, largest), online) in exact.iter_mut().zip(widened(online)) {
             *exact = online + left * (*exact - online);

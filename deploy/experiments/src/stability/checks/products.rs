@@ -1,5 +1,5 @@
-//! Products of the network in f32 and bf16, results and gradients, held to candle's in float64.
-//! The kernels themselves are the model's; what they are made of is tested there, against the stock ones.
+//! Products of the network in f32 and bf16, results and gradients, compared with candle's in f64.
+//! The kernels are in the model crate, which tests their parts against candle's kernels.
 
 use candle_core::{DType, Device, Tensor, Var};
 use driml_model::{Precision, conv2d_relu, linear, relu};
@@ -43,19 +43,19 @@ pub(super) fn properties() -> Vec<Property> {
     properties.collect()
 }
 
-/// Of Procgen's network and DIM's heads.
+/// The layers of Procgen's network and of DIM's heads.
 const LAYERS: [Layer; 6] = [
-    // From the maps to the hidden layer, from there to the atoms of 15 actions, and each place of a map to a score of DIM.
+    // From the feature maps to the hidden layer, from there to the atoms of 15 actions, and from each map location to a DIM embedding.
     Layer::of([256, 1024, 512], [0; 3]),
     Layer::of([256, 512, 765], [0; 3]),
     Layer::of([4096, 64, 512], [0; 3]),
-    // Convolutions, the border that the first would not read left out.
+    // Convolutions, without the border that the first does not read.
     Layer::of([32, 3, 32], [60, 8, 4]),
     Layer::of([32, 32, 64], [14, 4, 2]),
     Layer::of([32, 64, 64], [6, 3, 1]),
 ];
 
-/// A fully connected layer, of one kernel without a side; or a convolution with ReLU of images [B, side, side, inputs].
+/// A fully connected layer if `kernel` is 0, else a convolution with ReLU of images [B, side, side, inputs].
 #[derive(Clone, Copy, Debug)]
 struct Layer {
     rows: usize,
@@ -66,10 +66,10 @@ struct Layer {
     stride: usize,
 }
 
-/// Inputs, weights, biases, and the gradient of the results.
+/// Inputs, weights, biases, and the gradient with respect to the results.
 type Operands = [Tensor; 4];
 
-/// What draws so many values.
+/// Draws a number of values.
 type Draw<'a> = &'a mut dyn FnMut(usize, &mut ChaCha8Rng) -> Vec<f32>;
 
 impl Layer {
@@ -109,7 +109,7 @@ impl Layer {
         ])
     }
 
-    /// In float64 by candle's own operations, and before ReLU.
+    /// Computes the layer in f64 with candle's operations, before ReLU.
     fn exact(&self, [x, w, b]: &[Var; 3]) -> candle_core::Result<Tensor> {
         let y = match self.is_convolution() {
             false => x.matmul(&w.t()?)?,
@@ -122,7 +122,7 @@ impl Layer {
         y.broadcast_add(b)
     }
 
-    /// The worst error of results and gradients, as a share of what is promised.
+    /// Returns the worst error of results and gradients, as a share of the promised bound.
     fn error(&self, operands: &Operands, precision: Precision) -> anyhow::Result<f64> {
         let found = traced(operands, |[x, w, b]| match self.is_convolution() {
             false => linear(x, w, b, precision),
@@ -137,7 +137,7 @@ impl Layer {
             exact[0] = (&exact[0] * (1.0 / 255.0))?;
         }
         if self.is_convolution() {
-            // Where a result is 0 its gradient is.
+            // ReLU passes no gradient where the result is 0.
             let y = Tensor::from_slice(&found[0], exact[3].shape(), &Device::Cpu)?;
             exact[3] = (&exact[3] * y.gt(0.0)?.to_dtype(DType::F64)?)?;
         }
@@ -148,15 +148,15 @@ impl Layer {
             ones[at] = tensor.ones_like()?;
             sums[at] = (&sizes[at] + &ones[at])?;
         }
-        // Biases are in no product.
+        // Biases are not part of a product.
         (ones[2], sums[2]) = (exact[2].zeros_like()?, sizes[2].clone());
         let [exact, sizes] = [traced(&exact)?, traced(&sizes)?];
         let [terms, sums] = [traced(&ones)?, traced(&sums)?];
         let mut errors = Vec::new();
         for of in 0..4 {
-            // Sums of gradients are not products, and f32 in either precision.
+            // The gradient of a bias is a sum without products, computed in f32 in either precision.
             let precision = if of == 3 { Precision::F32 } else { precision };
-            // A byte / 255 has two roundings.
+            // A byte / 255 is rounded twice.
             let roundings = if with_bytes && of != 3 { 2.0 } else { 0.0 };
             for (at, &found) in found[of].iter().enumerate() {
                 let (mut exact, size, terms) = (exact[of][at], sizes[of][at], terms[of][at]);
@@ -164,11 +164,11 @@ impl Layer {
                     exact = exact.max(0.0);
                 }
                 let error = (found - exact).abs();
-                // Rounding to bf16 may add a 128th to a sum that is promised to be finite.
+                // Near the largest f32 nothing is promised, because rounding to bf16 may enlarge a sum by a 128th.
                 if error == 0.0 || size * 1.01 >= f64::from(f32::MAX) {
                     continue;
                 }
-                // The promise is of the largest operand; their mean allows less: (1 + a) (1 + b) = 1 + a + b + a b.
+                // The promise holds for the largest operand. The mean is stricter, and follows from (1 + a) (1 + b) = 1 + a + b + a b.
                 let mean = (sums[of][at] - size - terms) / (2.0 * terms);
                 let terms = (terms + roundings) as usize;
                 let allowed = precision.product_error(terms) * size;
@@ -178,7 +178,7 @@ impl Layer {
         Ok(worst(errors))
     }
 
-    /// Sees the errors on operands that are drawn; those of a convolution on bytes too.
+    /// Counts the errors on drawn operands, and for a convolution also on inputs of bytes.
     fn see(
         &self,
         cases: &mut Cases<'_>,
@@ -201,7 +201,7 @@ impl Layer {
     }
 }
 
-/// Results, and the gradients of inputs, weights and biases, flat; bytes have none.
+/// Returns results and the gradients of inputs, weights and biases, flattened. Inputs of bytes have no gradient.
 fn traced(
     [x, w, b, g]: &Operands,
     layer: impl Fn(&[Var; 3]) -> candle_core::Result<Tensor>,
@@ -226,7 +226,7 @@ fn usual(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
 }
 
-/// So large that no product of two leaves the finite numbers.
+/// Operands of at most this size have finite sums of products.
 const MODERATE: f32 = 1e17;
 
 fn moderate(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
@@ -247,7 +247,7 @@ fn dense_of_sizes(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result
 fn dense(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let most = match precision {
         Precision::F32 => f32::MAX,
-        // A larger one would be infinite.
+        // A larger operand would round to infinity.
         Precision::Bf16 => 3.38e38,
     };
     let layer = Layer::drawn_dense(&mut cases.rng);
@@ -283,7 +283,7 @@ fn infinite(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     cases.keeps(1, input, !y.is_finite())
 }
 
-/// A row with a number that is none spoils itself, visibly, and nothing else.
+/// Checks that an infinity or NaN in a row shows in the results of this row, and changes no other row and no later call.
 fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let mut layer = Layer::drawn_dense(rng);
@@ -305,7 +305,7 @@ fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
             Ok(y.to_vec1()?)
         };
         let (before, mut spoilt, after) = (results(&clean)?, results(&spoilt)?, results(&clean)?);
-        // The largest of 0 and -inf is 0.
+        // ReLU may hide -inf, because max(0, -inf) is 0.
         let may_hide = with_relu && bad == f32::NEG_INFINITY;
         let shows = may_hide || !spoilt[own.clone()].iter().any(|y| y.is_finite());
         spoilt[own.clone()].copy_from_slice(&before[own.clone()]);

@@ -1,4 +1,4 @@
-//! N-step returns and discounts, as a replay's batches have them.
+//! The n-step returns and discounts in the batches of a replay.
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, InsertReply, RunSpec, Sampling, TimeoutRule,
@@ -13,14 +13,14 @@ pub(super) fn properties() -> Vec<Property> {
     let terms = "rewards within 3.4e38 / n; n 1 to 1,000; gamma 0 to 1";
     vec![
         Property::new("n-step return", terms)
-            // Of 6.1e-8 of it + 2.2e-16 n of the terms' sizes; never infinite.
+            // The bound of a return is 6.1e-8 of it + 2.2e-16 n of the sum of its terms' sizes. A return is never infinite.
             .promise("return or discount, as a share of its bound", 1.0)
             .on(REWARDS, Listed, returns)
             .on("drawn", Drawn(0.1), returns),
     ]
 }
 
-/// Of a world whose frames are the number of their step.
+/// Returns the spec of a world in which each frame holds the number of its step.
 pub(super) fn spec() -> RunSpec {
     RunSpec {
         frame_width: 4,
@@ -28,7 +28,7 @@ pub(super) fn spec() -> RunSpec {
     }
 }
 
-/// A replay, in which neither side waits, of these steps of actor 0.
+/// Creates a replay with these steps of actor 0, in which neither the actors nor the learner wait.
 pub(super) fn replay(
     spec: &RunSpec,
     sampling: Sampling,
@@ -63,12 +63,12 @@ pub(super) fn replay(
     Ok(replay)
 }
 
-/// The number of the step that a state [1, 4, 1] is of.
+/// Returns the step number that a state [1, 4, 1] holds.
 pub(super) fn number(state: &[u8]) -> usize {
     u32::from_le_bytes([state[0], state[1], state[2], state[3]]) as usize
 }
 
-/// Return of the row at the first of these steps, the sum of its terms' sizes, and its discount.
+/// Returns the n-step return at the first of these steps, the sum of the sizes of its terms, and its discount.
 fn expected(spec: &RunSpec, steps: &[(f32, End)]) -> (f64, f64, f64) {
     let n = spec.n_step as usize;
     let (mut terms, mut follows) = (Vec::new(), Some(n));
@@ -125,7 +125,7 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         ..spec()
     };
     let mut replay = replay(&spec, Sampling::default(), rows, &steps)?;
-    // An episode may have ended nowhere in reach.
+    // If no row is complete, the replay has nothing to sample.
     let Ok(batch) = replay.sample(rows) else {
         return Ok(());
     };

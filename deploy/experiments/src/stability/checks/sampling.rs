@@ -1,4 +1,4 @@
-//! What batches are drawn by: k along the stored actions, rows by priority, and the weights that undo their bias.
+//! How batches are sampled: k along the stored actions, rows by priority, and the importance weights that correct the bias.
 
 use anyhow::Context;
 use driml_learner::importance::{WEIGHT_ERROR, importance_weights};
@@ -15,7 +15,7 @@ use rand::RngCore;
 use super::replay::{number, replay, spec};
 use crate::stability::property::*;
 
-/// Deviations of a chi-square that one right law in two million passes.
+/// The limit of the chi-square test in standard deviations. A correct sampler exceeds it once in two million tests.
 const DEVIATIONS: f64 = 5.0;
 
 const EVERY: &str =
@@ -40,13 +40,13 @@ pub(super) fn properties() -> Vec<Property> {
             .on(PRIORITIES, Listed, prioritised)
             .on("drawn", Drawn(0.01), prioritised),
         Property::new("importance weight", "chances 1.2e-38 to 1; beta 0 to 1")
-            // The least likely row's is 1.
+            // The weight of the least likely row is exactly 1.
             .promise("a weight, as a share of it", WEIGHT_ERROR)
             .on(CHANCES, Drawn(1.0), weights),
     ]
 }
 
-/// Gives every value that a float can be drawn as, one after the other.
+/// A generator from which a drawn float takes each of its 2^24 values in turn.
 struct EveryFloat(u32);
 
 impl RngCore for EveryFloat {
@@ -86,7 +86,7 @@ fn probability_of_a_step(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let draws = 1u32 << 24;
     let further = (0..draws).filter(|_| draw_k(&affinity, &[0, 0], &mut every) == 2);
     let found = further.count() as f64 / f64::from(draws);
-    // Certain is certain, and impossible impossible.
+    // The probabilities 0 and 1 must be exact.
     let is_certain = a == 0.0 || a == 1.0;
     let error = found - f64::from(a);
     let error = only_if(!is_certain || error == 0.0, error);
@@ -104,7 +104,7 @@ fn law_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     };
     let matrix: Vec<f32> = (0..16).map(|_| draw()).collect();
     let actions: Vec<u8> = (0..steps).map(|_| rng.random_range(0..4)).collect();
-    // P(k = i) for i = 1, .., H along this walk.
+    // P(k = i) for i = 1, .., H along these actions.
     let (mut reached, mut law) = (1.0, Vec::new());
     for pair in actions.windows(2) {
         let a = f64::from(matrix[usize::from(pair[0]) * 4 + usize::from(pair[1])]);
@@ -122,9 +122,9 @@ fn law_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, [None, Some(deviations)])
 }
 
-/// How far counts are beyond a law, in standard deviations of a normal of the same tail; cells that expect less than 5 are one.
+/// Returns how far counts deviate from a distribution: their chi-square as standard deviations of a normal with the same tail, 0 or more.
 ///
-/// Pearson's chi-square by the cube root of Wilson and Hilferty 1931. Infinite where something was seen that cannot be.
+/// Pearson's chi-square by Wilson and Hilferty 1931 (cube root). Cells that expect fewer than 5 are merged. Infinite for impossible values.
 fn deviations(counts: &[u64], law: &[f64]) -> f64 {
     let total = counts.iter().sum::<u64>() as f64;
     let (mut cells, mut few) = (Vec::new(), (0.0, 0.0));
@@ -148,7 +148,7 @@ fn deviations(counts: &[u64], law: &[f64]) -> f64 {
     (((square / degrees).cbrt() - (1.0 - spread)) / spread.sqrt()).max(0.0)
 }
 
-/// Transitions that can be drawn by priority.
+/// The number of transitions that can be drawn by priority.
 const HELD: usize = 300;
 const ROWS: u32 = 64;
 
@@ -166,7 +166,7 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         sizes.map(f32::abs).collect::<Vec<_>>()
     });
     let alpha = cases.of(&[0.0, 0.5, 1.0], |rng| rng.random());
-    // Of one batch the law is not seen.
+    // Listed inputs draw many batches for the chi-square; a drawn input has only one batch, too few for it.
     let batches = cases.of(&[cases.settings.law_draws / u64::from(ROWS)], |_| 1);
 
     let sampling = Sampling::Prioritised {
@@ -179,7 +179,7 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         seed: cases.rng.random(),
         ..spec()
     };
-    // The last one lacks a step that follows.
+    // One step more than transitions, because the last step has no successor.
     let steps = [(1.0, End::Running); HELD + 1];
     let mut replay = replay(&spec, sampling, ROWS, &steps)?;
     let batch_of = |replay: &mut Replay| {
@@ -207,7 +207,7 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         for (frame, chance) in batch.states_t().chunks_exact(4).zip(chances) {
             let transition = number(frame);
             counts[transition] += 1;
-            // A chance below the least normal number counts as that.
+            // A chance below the smallest normal number is reported as that number.
             let expected = law[transition];
             let error = f64::from(chance) / expected.max(LEAST) - 1.0;
             let input = format_args!("{chance:e}, which should be {expected:e}");

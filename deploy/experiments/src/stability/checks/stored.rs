@@ -1,4 +1,4 @@
-//! Weights as they travel: rounded to f16 or bf16, and read back.
+//! Weights as the learner publishes them: rounded to f32, f16 or bf16, and read back.
 
 use candle_core::Device;
 use driml_model::{Parameters, StoredAs};
@@ -37,12 +37,12 @@ pub(super) fn properties() -> Vec<Property> {
     ]
 }
 
-/// Scalars a row of the head's weight that carries the values.
+/// The length of a row of the head's weight, which carries the values.
 const HIDDEN: usize = 256;
 
-/// The step of the type at `x`.
+/// Returns the distance between neighbouring numbers of the type at `x`.
 fn step_at(stored: StoredAs, x: f32) -> f64 {
-    // Bits of significand, and the exponent of the least normal number.
+    // The bits of the significand, and the exponent of the smallest normal number.
     let (bits, least) = match stored {
         StoredAs::F32 => (24, -126),
         StoredAs::F16 => (11, -14),
@@ -52,7 +52,7 @@ fn step_at(stored: StoredAs, x: f32) -> f64 {
     2f64.powi(exponent.max(least) - bits + 1)
 }
 
-/// All places where rounding turns.
+/// Returns every number of the type, every midpoint between two of them, and the floats beside the midpoints, with both signs.
 fn turning_points(stored: StoredAs) -> Vec<f32> {
     let mut values = Vec::new();
     let mut x = 0.0f32;
@@ -67,7 +67,7 @@ fn turning_points(stored: StoredAs) -> Vec<f32> {
     values.iter().flat_map(|&x| [x, -x]).collect()
 }
 
-/// Sees what the values become as weights that are saved and loaded.
+/// Saves and loads the values as weights, and counts their errors.
 fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Result<()> {
     let atoms = values.len().div_ceil(HIDDEN).max(2);
     let config = small::config(atoms, HIDDEN, (-1.0, 1.0));

@@ -1,4 +1,4 @@
-//! Losses and gradients of a whole update, C51 with DIM: this project's kernels beside candle's own operations.
+//! Loss and gradients of a whole update, C51 with DIM: this project's kernels compared with candle's operations.
 
 use candle_core::Device;
 use driml_learner::{
@@ -12,7 +12,7 @@ use driml_settings::flags::of_names;
 
 use crate::{small, stability::property::*};
 
-/// How far two ways of computing may be apart, each of which is right to half of it.
+/// The largest allowed difference of two ways to compute an update. Each of them may be wrong by half of it.
 const UPDATES_APART: f64 = 2e-4;
 
 const UPDATES: &str = "our kernels beside candle's operations: initial weights times 1e-6 to 100; returns 0 to 3e38; supports 1e-3 to 2e30 wide; tanh_clip 1e-30 to 1e30; one state, four or all that differ, equal ones computed each and once";
@@ -29,7 +29,7 @@ pub(super) fn properties() -> Vec<Property> {
 
 const ACTIONS: usize = 4;
 
-/// How a small network and its loss differ from those of a run: all four pairs of DIM have a weight.
+/// Settings of a small network in which all four pairs of DIM have a weight.
 const SETS: [&str; 7] = [
     "learner.update.lambda.3t3=0.5",
     "learner.update.lambda.3t4=0.5",
@@ -40,16 +40,16 @@ const SETS: [&str; 7] = [
     "model.action_embed=4",
 ];
 
-/// What an update computes with, beside its weights and rows.
+/// The settings of an update besides its weights and rows.
 #[derive(Debug)]
 struct Setting {
-    /// What initial weights are multiplied by.
+    /// The factor for the initial weights.
     scale: f32,
     support: (f32, f32),
     tanh_clip: f64,
     /// The size of returns.
     returns: f32,
-    /// Different states at most.
+    /// The largest number of different states.
     distinct: usize,
 }
 
@@ -71,7 +71,7 @@ impl Setting {
         }
     }
 
-    /// Two agents of one network, which has initial weights times the scale: with our kernels, and with candle's.
+    /// Creates two agents with the same scaled initial weights: one with our kernels, one with candle's.
     fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
         let run = of_names("paper", "chain", "driml-fix", &SETS, &Machine::this())?;
         let model = ModelConfig {
@@ -138,12 +138,12 @@ impl Setting {
     }
 }
 
-/// The error of a loss, which may be 0, as a share of 1 + loss.
+/// Returns the error of a loss as a share of 1 + |loss|, because the loss may be 0.
 const fn loss_error(own: f64, reference: f64) -> f64 {
     (own - reference).abs() / (1.0 + reference.abs())
 }
 
-/// The larger of the two in the middle, if there is any; NaN where one is NaN, which would stand last.
+/// Returns the median (the larger of two middle values), or NaN if any value is NaN; `None` without values.
 fn median(mut errors: Vec<f64>) -> Option<f64> {
     errors.sort_by(f64::total_cmp);
     let nan = errors.iter().find(|it| it.is_nan());
@@ -157,21 +157,21 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let setting = Setting::drawn(scale, &mut cases.rng);
         let [mut agent, reference] = setting.agents(&mut cases.rng)?;
         let batch = setting.batch(agent.model().frame_len(), &mut cases.rng);
-        // The larger of those with equal states each and once.
+        // The errors with and without deduplication of equal states; the larger counts.
         let (mut loss, mut gradient) = (Vec::new(), Vec::new());
         for deduplicate in [false, true] {
             agent = agent.with_deduplication(deduplicate);
             let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
             loss.push(loss_error(found.own_loss, found.reference_loss));
-            // None where of two values that are nearly the same another is the larger, after which the target is another too.
+            // `None` if two nearly equal values swap their order: then the next action and the target differ, so gradients do too.
             gradient.push((found.same_next_action == 1.0).then_some(found.gradient));
         }
         cases.see(format_args!("{setting:?}"), [worst(loss)])?;
         let gradient: Option<Vec<f64>> = gradient.into_iter().collect();
         gradients.extend(gradient.map(worst));
     }
-    // Not of each case: where states are equal, or losses saturate, a gradient's terms cancel, and its norm is that of rounding.
-    // Of a few cases none may have a gradient that can be compared.
+    // Only the median counts: if states are equal or losses saturate, the terms of a gradient cancel and only rounding remains.
+    // With few cases there may be none with comparable gradients.
     let input = format_args!("weights x {scale:e}");
     cases.see(input, [None, median(gradients)])
 }

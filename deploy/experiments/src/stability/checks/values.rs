@@ -1,5 +1,5 @@
-//! Expected returns of logits over the atoms, and the action of largest value, as an actor chooses it.
-//! Exploration is not here: it never looks at a value.
+//! The expected return of logits over the atoms, and the greedy action as an actor chooses it.
+//! Exploration is not checked because it does not depend on values.
 
 use candle_core::{Device, Tensor};
 use driml_model::{
@@ -17,12 +17,12 @@ pub(super) fn properties() -> Vec<Property> {
     let values = "the expected return; logits finite, or some of them -inf; a support within 1e30";
     vec![
         Property::new("Q-value", values)
-            // Beside the value's own last place; never beyond the support.
+            // An error in the last place of the value is not counted. A value outside the support breaks the promise.
             .promise("a value, as a share of the width", EXPECTED_RETURN_ERROR)
             .on(LOGITS, Listed, expected)
             .on("drawn, some logits -inf", Drawn(1.0), expected),
         Property::new("greedy action", "weights finite; 1 to 255 actions")
-            // Whose f32 may be the same.
+            // The values of both actions may round to the same f32.
             .promise("how far its value is below the largest", F32_STEP)
             .promise("actions of which a lower one has the same logits", 0.0)
             .promise("rows beyond the finite numbers not refused by number", 0.0)
@@ -61,7 +61,7 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, [error])
 }
 
-/// A policy of two atoms on [-1, 1] an action; the parameters are four of the torso, then weights and biases of the head.
+/// Creates a policy with two atoms on [-1, 1] for each action. `set` fills the parameters: four of the torso, then head weights, biases.
 fn policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<PolicyNetwork> {
     let config = ModelConfig {
         num_actions,
@@ -76,7 +76,7 @@ fn policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<Po
 fn greedy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let num_actions = cases.rng.random_range(1..=255usize);
     let logits = cases.of(&listed(num_actions), |rng| finites(num_actions, rng));
-    // The logits of an action are biases alone: 0 and this one.
+    // The weights are 0, so the two logits of an action are its biases: 0 and the listed logit.
     let mut policy = policy(num_actions, |values| {
         let first = values.len() - 2 * num_actions;
         let biases = values[first..].chunks_exact_mut(2).zip(&logits);
@@ -85,7 +85,7 @@ fn greedy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rows = cases.rng.random_range(1..70usize);
     let mut actions = vec![0u8; rows];
     policy.greedy_actions(&vec![255; rows], &mut actions)?;
-    // -1 + 2 / (1 + exp(-logit)).
+    // The value is -1 + 2 / (1 + exp(-logit)).
     let value = |logit: f32| (f64::from(logit) / 2.0).tanh();
     let values = logits.iter().map(|&logit| value(logit));
     let most = values.fold(f64::NEG_INFINITY, f64::max);
@@ -101,7 +101,7 @@ fn greedy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 fn too_large(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let num_actions = rng.random_range(1..=255usize);
-    // Twice the pixel's share of 255 times a weight of 3.4e38, where the pixel is not black.
+    // If the pixel is not black, a logit is 2 (pixel / 255) 3.4e38, which overflows.
     let mut policy = policy(num_actions, |values| {
         (values[0], values[2]) = (1.0, 2.0);
         values[4 + rng.random_range(0..2 * num_actions)] = f32::MAX;

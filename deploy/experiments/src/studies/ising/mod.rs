@@ -1,5 +1,5 @@
-//! Fig. 2: local DIM on a patch of an Ising model in noise scores high where the future can be predicted.
-//! Learning and measuring are in `training`; here the seeds, the figures and the page.
+//! Fig. 2: on a patch of an Ising model in noise, local DIM gives high scores where the future can be predicted.
+//! `training` learns and measures; this module has the seeds, the figures and the page.
 
 mod training;
 
@@ -20,15 +20,15 @@ use crate::{
 
 const NAME: &str = "ising";
 const SETTINGS: &str = include_str!("config.toml");
-/// Updates over which the drawn loss is averaged.
+/// The number of updates over which the drawn loss is averaged.
 const LOSS_WINDOW: usize = 10;
 
-/// World, network and optimiser as a run has them.
+/// Returns the world, the network and the optimiser as a run would have them.
 fn task(settings: &Settings) -> anyhow::Result<Task> {
     let sets: Vec<_> = settings.sets.iter().map(String::as_str).collect();
-    // DIM with k = 1; what else distinguishes the agents is not used here.
+    // `driml-fix` gives DIM with k = 1. Nothing else of the agent is used here.
     let config = of_names("paper", "ising", "driml-fix", &sets, &Machine::this())?;
-    // The experiment plays in the world itself, whose frames are whole.
+    // The experiment steps the world directly, and the world has full-size frames.
     let config = config.with_whole_frames()?;
     let WorldConfig::Ising(world) = config.world else {
         return Err(usage!("the Ising world's settings are those of another world").into());
@@ -81,7 +81,7 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
     session.csv("maps", "episode,location,score_nats", maps)
 }
 
-/// Means of `LOSS_WINDOW` updates each, at their end.
+/// Returns (update, mean loss) for each window of `LOSS_WINDOW` updates; the update is the last of its window.
 fn smoothed(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
     loss.chunks(LOSS_WINDOW).enumerate().map(|(index, chunk)| {
         let mean = chunk.iter().copied().map(f64::from).sum::<f64>() / chunk.len() as f64;
@@ -89,7 +89,7 @@ fn smoothed(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
     })
 }
 
-/// Lattices and scores of the first measured episodes.
+/// Draws lattices and scores of the first measured episodes.
 fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
     let settings = &task.settings;
     let early_t = settings.from_t + 1;
@@ -151,7 +151,7 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
     })
 }
 
-/// Loss and what the scores tell, over updates.
+/// Draws the loss, and how well the scores tell patch from noise, over updates.
 fn learning(task: &Task, trained: &[Trained]) -> Figure {
     let over = |name: &str, index: usize, value: fn(&Measured) -> f64| {
         let checks = trained[0].checks.iter().enumerate();
@@ -221,7 +221,7 @@ mod tests {
     fn both_lengths_read_and_ask_for_local_dim_alone() {
         for settings in [smoke(), flags::settings(NAME, SETTINGS, false)] {
             let task = task(&settings).unwrap();
-            // The paper's table of parameters.
+            // From the paper's table of parameters.
             let local = [true, false, false, false];
             assert_eq!(task.learner.lambda.wanted(), local);
             assert_eq!((task.world.lattice_size, task.world.patch_size), (84, 42));

@@ -1,5 +1,5 @@
-//! Local DIM on the Ising world: training on pairs of successive frames, and measuring what the scores tell.
-//! Network, loss and optimiser are the learner's own; there is no C51 part, as nothing is earned in this world.
+//! Local DIM on the Ising world: training on pairs of successive frames, and measuring how well the scores tell patch from noise.
+//! Network, loss and optimiser are those of the learner. The C51 loss is left out because this world gives no rewards.
 
 use candle_core::{Device, Tensor};
 use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
@@ -15,27 +15,27 @@ use crate::{progress::Progress, stats::auc, studies::dim::DimLearner};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
-    /// What differs from the settings of a run in this world, in the form of `--set`.
+    /// Differences from the settings of a run in this world, in the form of `--set`.
     pub(super) sets: Vec<String>,
-    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
+    /// The number of seeds, 1 to this. No piece depends on it, so that more seeds can be added later.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
     pub(super) updates: u64,
-    /// Pairs in a batch, each with all others as negatives.
+    /// The number of pairs in a batch. For each pair all others are negatives.
     pub(super) batch_size: usize,
-    /// Measurements before the end.
+    /// The number of measurements before the end.
     pub(super) checks: u64,
-    /// Episodes of each.
+    /// The number of episodes of each measurement before the end.
     pub(super) check_episodes: usize,
-    /// Episodes of the measurement at the end.
+    /// The number of episodes of the measurement at the end.
     pub(super) episodes: usize,
-    /// Scores are those from this environment step to the next.
+    /// Scores are measured from this environment step to the next.
     pub(super) from_t: u32,
-    /// The environment step of the late lattices.
+    /// The environment step at which the late lattices are drawn.
     pub(super) late_t: u32,
 }
 
-/// What one training depends on.
+/// Everything that a training depends on except its seed.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Task {
     pub(super) world: IsingConfig,
@@ -44,31 +44,31 @@ pub(super) struct Task {
     pub(super) settings: Settings,
 }
 
-/// Seed of the worlds that are measured on: the same for every training, and of none that is trained on.
+/// The first seed of the measured worlds: the same for every training, and never used to train.
 const MEASURED_SEED: u64 = 1 << 40;
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Trained {
-    /// InfoNCE's loss at each update, in nats.
+    /// The InfoNCE loss at each update, in nats.
     pub(super) loss: Vec<f32>,
-    /// Measurements on the way: after how many updates, and what; the last one is at the end, on more episodes.
+    /// Measurements, each with its number of updates. The last one is at the end, on more episodes.
     pub(super) checks: Vec<(u64, Measured)>,
-    /// Scores at each location of the first episodes of the last measurement, in nats: log-softmax of the true pair plus ln B.
+    /// Scores at each location, for the first episodes of the last measurement, in nats: log-softmax of the true pair plus ln B.
     pub(super) maps: Vec<Vec<f64>>,
 }
 
-/// What the scores from `from_t` to the step after tell. Areas under ROC curves: 0.5 is nothing, 1 everything.
+/// How well the scores from `from_t` to the next step classify. Areas under ROC curves: 0.5 is chance, 1 is perfect.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Measured {
-    /// Whether a location looks at the patch: the centre of its receptive field lies in it or not.
+    /// Locations in the patch against the others. A location is in the patch if the centre of its receptive field is.
     pub(super) auc: f64,
-    /// The same by the raw score, without the softmax over other episodes.
+    /// As `auc`, by the raw score without the softmax over other episodes.
     pub(super) auc_raw: f64,
-    /// The same among the locations whose receptive field lies wholly inside or wholly outside the patch.
+    /// As `auc`, for the locations whose receptive field lies wholly inside or wholly outside the patch.
     pub(super) auc_clear: f64,
     /// Inside the patch: true pairs against pairs of two episodes whose patches both cover the location.
     pub(super) auc_pairs: f64,
-    /// InfoNCE's loss, in nats.
+    /// The InfoNCE loss, in nats.
     pub(super) loss: f64,
 }
 
@@ -90,9 +90,9 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
             checks.push((update, measure(task, &learner, settings.check_episodes)?.0));
         }
         if batches_left == 0 {
-            // As many batches as there are pairs in an episode: each is used once, on average.
+            // As many batches as an episode has pairs, so that each pair is used once on average.
             batches_left = (task.world.episode_steps - 1).max(1);
-            // Below the measured worlds' seeds.
+            // The seed is below those of the measured worlds.
             let seed = rng.random_range(0..MEASURED_SEED);
             episodes = Episodes::play(&task.world, settings.batch_size, batches_left, seed)?;
         }
@@ -107,7 +107,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     Ok(Trained { loss, checks, maps })
 }
 
-/// Frames [T, N, H * W] of whole episodes of N environments, and the patches' first rows and columns.
+/// Frames [T, N, H * W] of whole episodes of N environments, and the first row and column of each patch.
 #[derive(Default)]
 pub(super) struct Episodes {
     pub(super) frames: Vec<Vec<u8>>,
@@ -115,7 +115,7 @@ pub(super) struct Episodes {
 }
 
 impl Episodes {
-    /// `steps` + 1 frames of each of `envs` episodes.
+    /// Plays `envs` episodes and keeps `steps` + 1 frames of each.
     pub(super) fn play(
         config: &IsingConfig,
         envs: usize,
@@ -145,13 +145,13 @@ impl Episodes {
         })
     }
 
-    /// The episodes that [`measure`] looks at first.
+    /// Plays the first batch of episodes that [`measure`] uses.
     pub(super) fn measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
         let seed = MEASURED_SEED;
         Self::play(&task.world, task.settings.batch_size, steps, seed)
     }
 
-    /// A batch of pairs (s_t, s_{t+1}): each row another episode, at its own t.
+    /// Draws a batch of pairs (s_t, s_{t+1}). Each row is another episode at a random t.
     fn pairs(&self, rows: usize, rng: &mut ChaCha8Rng) -> (Vec<u8>, Vec<u8>) {
         let (mut now, mut next) = (Vec::new(), Vec::new());
         for row in 0..rows {
@@ -165,7 +165,7 @@ impl Episodes {
     }
 }
 
-/// What the learner's network sees in these frames, a row each.
+/// Computes the features of these frames with the learner's network, a row for each frame.
 fn features(task: &Task, learner: &DimLearner, frames: &[u8]) -> anyhow::Result<Features> {
     let model = &task.model;
     let rows = frames.len() / model.frame_len();
@@ -174,7 +174,7 @@ fn features(task: &Task, learner: &DimLearner, frames: &[u8]) -> anyhow::Result<
     Ok(learner.network.features(&frames)?)
 }
 
-/// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
+/// Measures on whole batches of episodes, at least one. Returns also the maps of the first three episodes.
 fn measure(
     task: &Task,
     learner: &DimLearner,
@@ -211,10 +211,10 @@ fn measure(
     Ok((tally.measured(), maps))
 }
 
-/// Scores normalised over the candidates of each anchor, [L, B, B].
+/// Normalises scores [L, B, B] over the candidates of each anchor.
 ///
-/// A positive's log-softmax plus ln B estimates the pointwise mutual information of its two views, in nats; it is at
-/// most ln B. Source: the paper's listing "DIM objective scores".
+/// The log-softmax of a positive plus ln B estimates the pointwise mutual information of its two views, in nats. It is at most ln B.
+/// Source: the paper's listing "DIM objective scores".
 fn log_softmax(scores: &[f64], rows: usize) -> Vec<f64> {
     let normalise = |row: &[f64]| -> Vec<f64> {
         let largest = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -225,27 +225,27 @@ fn log_softmax(scores: &[f64], rows: usize) -> Vec<f64> {
     scores.chunks(rows).flat_map(normalise).collect()
 }
 
-/// How a location's receptive field lies to the patch.
+/// How the receptive field of a location overlaps the patch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Cover {
-    /// Its centre is in the patch.
+    /// Whether the centre of the field is in the patch.
     centre: bool,
-    /// All of it is, or none of it; otherwise this is none.
+    /// `Some(true)` if the whole field is in the patch, `Some(false)` if no part is, else `None`.
     whole: Option<bool>,
 }
 
-/// What the locations of the last convolution look at.
+/// The receptive fields of the locations of the last convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct View {
-    /// Side of a receptive field, in pixels.
+    /// The side of a receptive field, in pixels.
     pub(super) side: usize,
-    /// Pixels from one location's field to the next one's.
+    /// The distance between the fields of neighbouring locations, in pixels.
     pub(super) step: usize,
     pub(super) columns: usize,
 }
 
 impl View {
-    /// Of a network's f3.
+    /// Returns the receptive fields of a network's feature map f3.
     pub(super) fn of(model: &ModelConfig) -> Self {
         let (mut side, mut step) = (1, 1);
         for layer in &model.conv {
@@ -279,7 +279,7 @@ impl View {
     }
 }
 
-/// Scores of those that are not and of those that are: in the patch, by log-softmax and raw, wholly in it, and a true pair.
+/// Scores by class, [negatives, positives]: in the patch (log-softmax and raw), wholly in the patch, and true pairs.
 #[derive(Default)]
 struct Tally {
     inside: [Vec<f64>; 2],
@@ -289,7 +289,7 @@ struct Tally {
 }
 
 impl Tally {
-    /// Adds a location's true pairs, and inside the patch each anchor with the next episode as well.
+    /// Adds the true pairs of a location. Inside the patch it also adds each anchor with the next episode as a false pair.
     fn add(&mut self, location: usize, cover: &[Cover], scores: &[f64], logs: &[f64], rows: usize) {
         for (row, here) in cover.iter().enumerate() {
             let at = (location * rows + row) * rows;
@@ -307,7 +307,7 @@ impl Tally {
         }
     }
 
-    /// 0.5 where a kind has no example, as only a very short measurement leaves it.
+    /// Computes the areas and the loss. An area is 0.5 if a class has no example, which only a very short measurement leaves.
     fn measured(&self) -> Measured {
         let area = |[no, yes]: &[Vec<f64>; 2]| auc(yes, no).unwrap_or(0.5);
         let [outside, inside] = &self.inside;

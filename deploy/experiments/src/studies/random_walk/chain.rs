@@ -1,17 +1,17 @@
 //! The biased random walk on 0..K, in closed form and by numerical linear algebra.
-//! It samples and learns nothing.
+//! This module learns nothing.
 //!
-//! From i to i + 1 with probability alpha, else to i - 1; at an end the step that would leave it stays.
+//! The walk steps from i to i + 1 with probability alpha, else to i - 1. At an end, a step that would leave the line stays in place.
 
 use rand::Rng;
 use serde::Serialize;
 
-/// A biased random walk on a line of states, whose transition ratio is known in closed form.
+/// A biased random walk on a line of states. Its transition ratio is known in closed form.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Chain {
-    /// States K, at least 2.
+    /// The number of states K, at least 2.
     pub(super) states: usize,
-    /// Probability of a step up, in [0, 1].
+    /// The probability of a step up, in [0, 1].
     pub(super) alpha: f64,
 }
 
@@ -20,7 +20,7 @@ impl Chain {
         Self { states, alpha }
     }
 
-    /// T [K, K], row-major: T[i, j] is the probability of going from i to j.
+    /// Returns T [K, K], row-major: T[i, j] is the probability of a step from i to j.
     pub(super) fn transitions(&self) -> Vec<f64> {
         let k = self.states;
         let mut matrix = vec![0.0; k * k];
@@ -31,12 +31,12 @@ impl Chain {
         matrix
     }
 
-    /// ln of the stationary law at each state.
+    /// Returns ln of the stationary distribution at each state.
     ///
-    /// rho(i) = r^i (1 - r) / (1 - r^K), r = alpha / (1 - alpha); 1 / K at r = 1. It is taken from the likelier end, where all powers
-    /// are of a number of at most 1. Source: the paper's appendix; it holds for this chain exactly, as its steps balance in detail.
+    /// rho(i) = r^i (1 - r) / (1 - r^K), r = alpha / (1 - alpha); 1 / K at r = 1. Powers are taken from the likelier end, so that none
+    /// exceeds 1. Source: the paper's appendix. The formula is exact for this chain, which satisfies detailed balance.
     fn log_stationary(&self) -> Vec<f64> {
-        // Infinite for a walk that only goes one way.
+        // The rate is infinite for a walk that only moves in one direction.
         let rate = (self.alpha / (1.0 - self.alpha)).ln().abs();
         let fall = |away: usize| match away {
             0 => 0.0,
@@ -50,24 +50,24 @@ impl Chain {
         }
     }
 
-    /// The stationary law rho: see [`Chain::log_stationary`].
+    /// Returns the stationary distribution rho: see [`Chain::log_stationary`].
     pub(super) fn stationary(&self) -> Vec<f64> {
         self.log_stationary().into_iter().map(f64::exp).collect()
     }
 
-    /// I(S_t; S_{t+1}) at stationarity, in nats: H(rho) - h(alpha), as every row of T is (alpha, 1 - alpha).
+    /// Returns I(S_t; S_{t+1}) at stationarity, in nats: H(rho) - h(alpha), because every row of T is (alpha, 1 - alpha).
     pub(super) fn mutual_information(&self) -> f64 {
         entropy(&self.stationary()) - entropy(&[self.alpha, 1.0 - self.alpha])
     }
 
-    /// The same on a ring, which has no ends: ln K - h(alpha), in nats.
+    /// Returns the mutual information on a ring, which has no ends: ln K - h(alpha), in nats.
     pub(super) fn mutual_information_of_a_ring(&self) -> f64 {
         (self.states as f64).ln() - entropy(&[self.alpha, 1.0 - self.alpha])
     }
 
-    /// The appendix's double sum for the mutual information, as printed, in nats.
+    /// Returns the double sum of the paper's appendix for the mutual information, as printed, in nats.
     ///
-    /// Its factor alpha^[j > i] (1 - alpha)^[j < i] is a law of steps only next to i; the printed sum has all i and j.
+    /// The factor alpha^[j > i] (1 - alpha)^[j < i] is a step probability only for neighbours j of i, but the printed sum has all i and j.
     pub(super) fn mutual_information_as_printed(&self) -> f64 {
         let log_rho = self.log_stationary();
         let factor = |i: usize, j: usize| match j.cmp(&i) {
@@ -83,11 +83,11 @@ impl Chain {
         all.map(term).sum()
     }
 
-    /// 1 - lambda_2 = 1 - 2 sqrt(alpha (1 - alpha)) cos(pi / K).
+    /// Returns the spectral gap 1 - lambda_2 = 1 - 2 sqrt(alpha (1 - alpha)) cos(pi / K).
     ///
-    /// Taken as (sqrt(1 - alpha) - sqrt(alpha))^2 + 4 sqrt(alpha (1 - alpha)) sin^2(pi / 2K), which cancels nothing.
-    /// Source: Feller, An Introduction to Probability Theory, vol. 1, XVI.3. The smallest eigenvalue is -lambda_2, so
-    /// this is the absolute gap as well.
+    /// Computed without cancellation as (sqrt(1 - alpha) - sqrt(alpha))^2 + 4 sqrt(alpha (1 - alpha)) sin^2(pi / 2K).
+    /// The smallest eigenvalue is -lambda_2, so this is also the absolute gap.
+    /// Source: Feller, An Introduction to Probability Theory, vol. 1, XVI.3.
     pub(super) fn spectral_gap(&self) -> f64 {
         let (up, down) = (self.alpha.sqrt(), (1.0 - self.alpha).sqrt());
         let apart = (1.0 - 2.0 * self.alpha) / (up + down);
@@ -95,14 +95,14 @@ impl Chain {
         apart * apart + 4.0 * up * down * sine * sine
     }
 
-    /// The stationary law as the rows of T^(2^40), whose trace is 1.
+    /// Returns the stationary distribution as the first row of T^(2^40), scaled to trace 1. All rows are equal.
     fn stationary_numerically(&self) -> Vec<f64> {
         let mut rows = high_power(self.transitions(), self.states);
         rows.truncate(self.states);
         rows
     }
 
-    /// Sum of rho_i T_ij ln(T_ij / rho_j), in nats.
+    /// Returns the mutual information as the sum of rho_i T_ij ln(T_ij / rho_j), in nats.
     pub(super) fn mutual_information_numerically(&self) -> f64 {
         let (t, k) = (self.transitions(), self.states);
         let rho = self.stationary_numerically();
@@ -113,10 +113,10 @@ impl Chain {
         (0..k * k).map(term).sum()
     }
 
-    /// 1 - lambda_2 from the symmetric matrix sqrt(T_ij T_ji), which has T's eigenvalues as T balances in detail.
+    /// Returns 1 - lambda_2 from the symmetric matrix sqrt(T_ij T_ji). By detailed balance it has the eigenvalues of T.
     ///
-    /// Its first eigenvalue, 1 of the vector sqrt(rho), is taken out. Of what is left, lambda_2 is the largest, and a high power of
-    /// 1 + matrix is v v^T of its vector v.
+    /// The first eigenvalue, 1 with eigenvector sqrt(rho), is removed. Then lambda_2 is the largest, and a high power of 1 + matrix is
+    /// v v^T of its eigenvector v.
     pub(super) fn spectral_gap_numerically(&self) -> f64 {
         let (t, k) = (self.transitions(), self.states);
         let rho = self.stationary_numerically();
@@ -128,7 +128,7 @@ impl Chain {
         let mut shifted = matrix.clone();
         shifted.iter_mut().step_by(k + 1).for_each(|it| *it += 1.0);
         let projection = high_power(shifted, k);
-        // v^T matrix v.
+        // lambda_2 = v^T matrix v.
         let terms = matrix.iter().zip(projection).map(|(a, b)| a * b);
         1.0 - terms.sum::<f64>()
     }
@@ -142,19 +142,19 @@ impl Chain {
     }
 }
 
-/// -sum p ln p, in nats.
+/// Returns the entropy -sum p ln p, in nats.
 fn entropy(law: &[f64]) -> f64 {
     let terms = law.iter().filter(|p| **p > 0.0).map(|p| p * p.ln());
     -terms.sum::<f64>()
 }
 
-/// The power 2^40 of a matrix [k, k], by squaring, over its trace.
+/// Returns the power 2^40 of a matrix [k, k] by repeated squaring, divided by its trace.
 fn high_power(mut matrix: Vec<f64>, k: usize) -> Vec<f64> {
     for _ in 0..40 {
         let term = |at: usize, l: usize| matrix[at / k * k + l] * matrix[l * k + at % k];
         let entry = |at| (0..k).map(|l| term(at, l)).sum();
         let square: Vec<f64> = (0..k * k).map(entry).collect();
-        // Each time, as squaring would double how far rounding lets it drift.
+        // The scale is normalised each time, because squaring would double the drift from rounding.
         let trace: f64 = square.iter().step_by(k + 1).sum();
         matrix = square.into_iter().map(|it| it / trace).collect();
     }
@@ -200,7 +200,7 @@ mod tests {
         }
     }
 
-    /// What the paper reads off its Fig. 1c is the other way round for the chain it describes.
+    /// The paper reads the opposite from its Fig. 1c, for the chain that it describes.
     #[test]
     fn even_odds_are_where_the_walk_tells_most_about_its_next_state() {
         let at = |alpha| Chain { states: 10, alpha };
@@ -209,7 +209,7 @@ mod tests {
             let chain = at(alpha);
             assert!(chain.mutual_information() < even);
             assert!(chain.mutual_information_of_a_ring() > at(0.5).mutual_information_of_a_ring());
-            // More than ten states can hold.
+            // This is more information than ten states can hold.
             assert!(chain.mutual_information_as_printed() > 10f64.ln());
         }
     }

@@ -1,5 +1,5 @@
 //! The figures of the random walk.
-//! They show numbers that `mod` has, and compute means over seeds alone.
+//! They show the numbers of `Results`, and compute nothing but means over seeds.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Heat, Mark, Panel, Series};
 
@@ -10,7 +10,7 @@ use super::{
 };
 use crate::plot::{Band, Curve};
 
-/// The paper's four panels.
+/// Draws the four panels of the paper's figure.
 pub(super) fn fig1(results: &Results) -> Figure {
     let settings = &results.settings;
     let k = settings.states;
@@ -50,14 +50,14 @@ fn by_alpha() -> Axis {
     Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0])
 }
 
-/// A closed form over biases so fine that its curve is smooth.
+/// Draws a closed form over many biases, so that its curve is smooth.
 fn closed_form(results: &Results, name: &str, value: impl Fn(&Chain) -> f64) -> Series {
     let fine = (1..=97).map(|i| 0.02 + f64::from(i - 1) * 0.01);
     let points = fine.map(|alpha| (alpha, value(&results.chain(alpha))));
     Series::line(name, 0, points.collect())
 }
 
-/// The same by linear algebra, at each alpha.
+/// Draws a numerical result as a ring at each alpha of the settings.
 fn numerical(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
     let alphas = results.settings.alphas.iter();
     let points = alphas.map(|&alpha| (alpha, value(&results.chain(alpha))));
@@ -91,7 +91,7 @@ fn inverse_gap(results: &Results) -> Panel {
     Panel::Chart(Chart::new(title, by_alpha(), y, series))
 }
 
-/// How fast it is learnt, against the gap.
+/// Draws the speed of learning against the spectral gap.
 pub(super) fn convergence(results: &Results) -> Figure {
     let settings = &results.settings;
     let times = |title: String, measure: Measure| {
@@ -124,7 +124,7 @@ pub(super) fn convergence(results: &Results) -> Figure {
     }
 }
 
-/// Of each sampling the mean and range over seeds at each alpha, moved aside by up to -1 or 1, so that no point hides another.
+/// Returns for each sampling the mean and range over seeds at each alpha. `x` receives an offset in -1..=1, so that no point hides another.
 fn by_sampling(
     results: &Results,
     x: impl Fn(&Chain, f64) -> f64,

@@ -1,5 +1,5 @@
-//! Fig. 1: InfoNCE on a biased random walk learns T / rho; does it converge as the spectral gap says?
-//! Closed forms are in `chain`, learning in `training`, pictures in `figures`; here the grid and the page.
+//! Fig. 1: InfoNCE on a biased random walk learns T / rho. Does it converge as fast as the spectral gap predicts?
+//! `chain` has the closed forms, `training` learns, `figures` draws; this module has the grid of trainings and the page.
 
 mod chain;
 mod figures;
@@ -130,7 +130,7 @@ fn values(results: &Results) -> Value {
             correlations => context! { tv, share },
         }
     });
-    // What follows from the closed forms alone, at any length of the experiment.
+    // These values follow from the closed forms alone, whatever the length of the experiment.
     let closed_forms = [0.5, 0.9, 0.3].map(|alpha| {
         let chain = results.chain(alpha);
         context! {

@@ -1,4 +1,4 @@
-//! All trainings of the grid, and what follows from them together.
+//! All trainings of the grid, and the results over several of them.
 
 use serde::Serialize;
 
@@ -20,9 +20,9 @@ pub(super) struct Trained {
     pub(super) seed: u32,
     #[serde(skip)]
     pub(super) learnt: Learnt,
-    /// Updates until the law of the next state is near the true one, however near a blind guess is; none if it never was.
+    /// The updates until the next-state distribution is within `tv_reached`, even if an untrained one is; `None` if it never is.
     pub(super) updates_to_tv: Option<u64>,
-    /// Updates until most of what there is to learn is learnt, however little that is; none if it never was.
+    /// The updates until only `share_reached` of the mutual information is missing, however small that is; `None` if that never happens.
     pub(super) updates_to_share: Option<u64>,
 }
 
@@ -36,7 +36,7 @@ impl Trained {
     }
 }
 
-/// When a training counts as converged.
+/// Returns the updates until a training counts as converged, by one criterion.
 pub(super) type Measure = fn(&Trained) -> Option<u64>;
 pub(super) const TV: Measure = |it| it.updates_to_tv;
 pub(super) const SHARE: Measure = |it| it.updates_to_share;
@@ -47,7 +47,7 @@ pub(super) struct Results {
 }
 
 impl Results {
-    /// Those of one sampling and bias, over seeds.
+    /// Returns the trainings of one sampling and one bias, over all seeds.
     pub(super) fn of(&self, sampling: Sampling, alpha: f64) -> impl Iterator<Item = &Trained> {
         let all = self.trained.iter();
         all.filter(move |one| one.sampling == sampling && one.chain.alpha == alpha)
@@ -57,7 +57,7 @@ impl Results {
         Chain::new(self.settings.states, alpha)
     }
 
-    /// T / rho at the figure's bias, [K, K].
+    /// Returns T / rho at the figure's bias, [K, K].
     pub(super) fn true_ratio(&self) -> Vec<f64> {
         let chain = self.chain(self.settings.figure_alpha);
         let (t, rho) = (chain.transitions(), chain.stationary());
@@ -65,7 +65,7 @@ impl Results {
         (0..k * k).map(|at| t[at] / rho[at % k]).collect()
     }
 
-    /// Its entries as they were learnt, over the seeds of stationary sampling.
+    /// Returns the learnt ratio at the figure's bias, [K, K], over the seeds of stationary sampling.
     pub(super) fn learnt_ratio(&self) -> Vec<Spread> {
         let of = || self.of(Sampling::Stationary, self.settings.figure_alpha);
         let k = self.settings.states;
@@ -73,14 +73,14 @@ impl Results {
         (0..k * k).filter_map(entry).collect()
     }
 
-    /// Mutual information as the scores of stationary sampling have it, in nats, of each seed.
+    /// Returns for each seed the mutual information, in nats, that the scores of stationary sampling have learnt.
     pub(super) fn learnt_information(&self, alpha: f64) -> Vec<f64> {
         let all = self.chain(alpha).mutual_information();
         let each = self.of(Sampling::Stationary, alpha);
         each.map(|one| all - one.final_excess()).collect()
     }
 
-    /// The biases of the curves: the strongest below 0.5, one between, and the figure's.
+    /// Returns the biases of the drawn curves: the first of `alphas`, the figure's, and one halfway between.
     pub(super) fn shown(&self) -> Vec<f64> {
         let alphas = &self.settings.alphas;
         let is_figure = |alpha: &f64| *alpha == self.settings.figure_alpha;
@@ -90,7 +90,7 @@ impl Results {
         shown.into_iter().map(|at| alphas[at]).collect()
     }
 
-    /// Total variation over updates, over the seeds of stationary sampling.
+    /// Returns the total variation over updates, averaged over the seeds of stationary sampling.
     pub(super) fn tv_curve(&self, alpha: f64) -> Curve {
         let each: Vec<_> = self.of(Sampling::Stationary, alpha).collect();
         let updates = each.iter().take(1).flat_map(|one| &one.learnt.updates);
@@ -101,9 +101,9 @@ impl Results {
         Curve::of_means(means, Band::Range)
     }
 
-    /// Of each seed, the rank correlation over alpha between 1 / gap and the updates until the error is small.
+    /// Returns for each seed the rank correlation over alpha between 1 / gap and the updates until convergence.
     ///
-    /// A training that never got there counts as one update more than the longest.
+    /// A training that never converges counts as one update more than a full training.
     pub(super) fn gap_correlations(&self, sampling: Sampling, measure: Measure) -> Vec<f64> {
         let of_seed = |seed: u32| {
             let all = self.trained.iter();

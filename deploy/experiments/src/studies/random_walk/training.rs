@@ -1,5 +1,5 @@
-//! The global DIM heads on one-hot states, trained by InfoNCE on pairs of successive states.
-//! Heads, loss and optimiser are the learner's own; there is no torso, action or return.
+//! The global DIM heads on one-hot states, trained with InfoNCE on pairs of successive states.
+//! Heads, loss and optimiser are those of the learner. Torso, actions and returns are not used.
 
 use candle_core::{Device, Tensor};
 use driml_learner::{AdamSettings, Lambda, auxiliary::dim::Dim};
@@ -11,9 +11,9 @@ use serde::{Deserialize, Serialize};
 use super::chain::Chain;
 use crate::{progress::Progress, small, studies::dim::DimLearner};
 
-/// Ratio between the updates of two measurements.
+/// The ratio of the update counts of two successive measurements.
 const MEASURE_GROWTH: f64 = 1.04;
-/// Rows in the replay before the first update, where one walker fills it.
+/// The number of transitions in the replay before the first update, for [`Sampling::OneWalker`].
 const WARMUP_TRANSITIONS: usize = 16;
 
 /// A table of `config.toml`.
@@ -21,47 +21,47 @@ const WARMUP_TRANSITIONS: usize = 16;
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
     pub(super) states: usize,
-    /// Probabilities of a step up.
+    /// The probabilities of a step up, one for each chain.
     pub(super) alphas: Vec<f64>,
-    /// The one of the matrices; among `alphas`.
+    /// The alpha of the drawn ratio matrices; it is among `alphas`.
     pub(super) figure_alpha: f64,
-    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
+    /// The number of seeds, 1 to this. No piece depends on it, so that more seeds can be added later.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
     pub(super) updates: u64,
-    /// Pairs in a batch, each with all others as negatives.
+    /// The number of pairs in a batch. For each pair all others are negatives.
     pub(super) batch_size: usize,
     pub(super) embedding_dim: usize,
-    /// Rows sampled per transition of a single walker.
+    /// Rows sampled per stored transition, for [`Sampling::OneWalker`].
     pub(super) replay_ratio: f64,
-    /// Bound of the scores' soft clip.
+    /// The bound of the soft clip of scores.
     pub(super) tanh_clip: f64,
-    /// Global 2-norm to which gradients are clipped.
+    /// The global 2-norm to which gradients are clipped.
     pub(super) max_grad_norm: f64,
-    /// Error of the next state's law at which a training counts as converged, a probability.
+    /// The total variation (a probability) of the next-state distribution at which a training counts as converged.
     #[serde(skip_serializing)]
     pub(super) tv_reached: f64,
-    /// Share of the mutual information that is still missed when a training counts as converged.
+    /// The share of the mutual information that may still be missing when a training counts as converged.
     #[serde(skip_serializing)]
     pub(super) share_reached: f64,
     pub(super) adam: AdamSettings,
 }
 
-/// Where the pairs come from.
+/// How the training pairs are sampled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sampling {
-    /// Independent, the first state from the stationary law: no mixing to wait for.
+    /// Independent pairs, with the first state from the stationary distribution, so that nothing has to mix.
     Stationary,
-    /// Many walkers that all start in the lowest state; update t learns from their t-th step. The paper's proposition.
+    /// Many walkers that all start in the lowest state. Update t learns from their t-th step, as in the paper's proposition.
     FromOneEnd,
-    /// One walker fills a replay, a few steps an update, and batches are drawn from all of it: as in a run.
+    /// One walker adds a few transitions to a replay before each update, and batches are drawn from all of the replay, as in a run.
     OneWalker,
 }
 
 impl Sampling {
     pub(super) const ALL: [Self; 3] = [Self::Stationary, Self::FromOneEnd, Self::OneWalker];
 
-    /// As figures and files name it.
+    /// Returns the name in figures and files.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Stationary => "stationary",
@@ -71,14 +71,14 @@ impl Sampling {
     }
 }
 
-/// What a training left, measured without noise: from the scores of all K * K pairs.
+/// The results of a training, measured without sampling noise from the scores of all K * K pairs.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct Learnt {
-    /// When it was measured.
+    /// The updates after which the training was measured.
     pub(super) updates: Vec<u64>,
-    /// How far InfoNCE's loss with infinitely many negatives is above its minimum, in nats: E_rho KL(T_i || learnt T_i).
+    /// The InfoNCE loss with infinitely many negatives, above its minimum, in nats: E_rho KL(T_i || learnt T_i).
     pub(super) excess: Vec<f64>,
-    /// Error of the law of the next state, a probability: E_rho of the total variation between T_i and learnt T_i.
+    /// The error of the next-state distribution, a probability: E_rho of the total variation between T_i and learnt T_i.
     pub(super) tv: Vec<f64>,
     /// The learnt ratio [K, K] at the end.
     pub(super) ratio: Vec<f64>,
@@ -113,10 +113,10 @@ pub(super) fn train(
 }
 
 impl Learnt {
-    /// Adds a measurement of the scores [K, K].
+    /// Adds a measurement from the scores [K, K].
     ///
-    /// At its optimum InfoNCE's score is ln(T_ij / rho_j) up to a number for each i, which the softmax cannot see; it is
-    /// fixed by sum_j rho_j ratio_ij = 1, which T / rho fulfils.
+    /// At the optimum the score is ln(T_ij / rho_j) plus a constant for each i, which does not change the softmax. The constant comes from
+    /// sum_j rho_j ratio_ij = 1, which T / rho fulfils.
     fn measure(&mut self, update: u64, chain: &Chain, scores: Vec<f64>) {
         let k = chain.states;
         let (t, rho) = (chain.transitions(), chain.stationary());
@@ -138,22 +138,22 @@ impl Learnt {
             tv += 0.5 * rho[i] * (t[at] - learnt).abs();
         }
         self.updates.push(update);
-        // Rounding can take a perfect fit a hair below 0.
+        // Rounding can make a perfect fit slightly negative.
         self.excess.push(excess.max(0.0));
         self.tv.push(tv);
         self.ratio = ratio;
     }
 
-    /// The first measured update at which `measure` is at `reached` or below; none if it never was.
+    /// Returns the first measured update at which `measure` is at most `reached`; `None` if it never is.
     pub(super) fn updates_to(&self, measure: &[f64], reached: f64) -> Option<u64> {
         let at = measure.iter().position(|value| *value <= reached)?;
         Some(self.updates[at])
     }
 }
 
-/// The heads Psi_4 and Phi_4, and how they learn.
+/// Creates the heads Psi_4 and Phi_4 with their loss and optimiser.
 ///
-/// They read f4, which is here the one-hot state itself; torso and C51 head are as small as can be, and no loss reaches them.
+/// The heads read f4, which is the one-hot state here. Torso and C51 head have the smallest possible size, and no loss reaches them.
 fn heads(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<DimLearner> {
     let lambda = Lambda {
         l4t4: 1.0,
@@ -169,7 +169,7 @@ fn heads(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Re
     DimLearner::new(&model, dim, settings.adam, settings.max_grad_norm, rng)
 }
 
-/// Features of these states of a chain of `count`, a row each.
+/// Returns the features of these states of a chain with `count` states, a row for each.
 fn one_hot(
     count: usize,
     states: impl ExactSizeIterator<Item = usize>,
@@ -219,7 +219,7 @@ fn source<'a>(
     }
 }
 
-/// A step from a state: the pair of both, of which the second takes its place.
+/// Steps from `state`, replaces it by the next state, and returns the pair of both.
 fn walk(chain: &Chain, state: &mut usize, rng: &mut ChaCha8Rng) -> (usize, usize) {
     let before = *state;
     *state = chain.step(before, rng);
@@ -254,7 +254,7 @@ mod tests {
     fn true_ratios_measure_as_no_error_and_constant_scores_as_the_mutual_information() {
         let chain = Chain::new(6, 0.3);
         let (t, rho) = (chain.transitions(), chain.stationary());
-        // Any number may be added to a row; a pair that never comes has a score far below the others.
+        // Each row may have an arbitrary constant. A pair that never occurs has a score far below the others.
         let score = |at: usize| (t[at] / rho[at % 6]).max(1e-300).ln() + (at / 6) as f64;
         let mut learnt = Learnt::default();
         learnt.measure(3, &chain, (0..36).map(score).collect());

@@ -1,4 +1,4 @@
-//! The picture of Fig. 3. It draws nothing beyond the episodes and frames that the settings ask for.
+//! Draws Fig. 3, up to the episodes and frames of the settings.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_protocol::RETURNS_OF;
@@ -9,10 +9,10 @@ use crate::{
     stats::Spread,
 };
 
-/// Share of a run over which the drawn loss is averaged.
+/// The share of a run over which the drawn loss is averaged.
 const SMOOTH: f64 = 0.1;
 
-/// The DIM losses by epsilon, and the returns under one lethal ghost after another.
+/// Draws the DIM losses by epsilon, and the returns under one lethal ghost after another.
 pub(super) fn figure(results: &Results) -> Figure {
     let settings = &results.settings;
     let mut panels = Vec::new();

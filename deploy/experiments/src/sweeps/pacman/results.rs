@@ -1,4 +1,4 @@
-//! What the runs of Fig. 3 left: their losses over frames, and their returns over episodes.
+//! The results of the runs of Fig. 3: losses over frames, and returns over episodes.
 
 use serde::Serialize;
 
@@ -9,23 +9,23 @@ use crate::{
     sweep::plan::Made,
 };
 
-/// The DIM losses of the preset: column of the metrics, and what it compares.
+/// The DIM losses of the preset: the column of the metrics, and the kind of features that the loss compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];
-/// Share of a run, at its end, whose mean is the final loss.
+/// The final loss is the mean over this share of a run, at its end.
 const FINAL: f64 = 0.2;
 
-/// (x, y) in the order of x.
+/// Points (x, y), sorted by x.
 pub(super) type Points = Vec<(f64, f64)>;
 
 pub(super) struct Results {
     pub(super) settings: Settings,
-    /// Of (a).
+    /// The losses of part (a).
     pub(super) losses: Vec<Loss>,
-    /// Of (b) and of (c).
+    /// The returns of parts (b) and (c).
     pub(super) traces: [Vec<Trace>; PARTS],
 }
 
-/// A loss over frames, of a run of (a).
+/// A loss over frames in a run of part (a).
 #[derive(Serialize)]
 pub(super) struct Loss {
     pub(super) epsilon: f64,
@@ -33,7 +33,7 @@ pub(super) struct Loss {
     pub(super) column: &'static str,
     #[serde(skip)]
     pub(super) points: Points,
-    /// Means of the last fifth and of the whole run; none if it has no value there.
+    /// The means of the last fifth and of the whole run; `None` without values.
     pub(super) last: Option<f64>,
     pub(super) whole: Option<f64>,
     pub(super) episodes: f64,
@@ -46,7 +46,7 @@ pub(super) struct Trace {
     pub(super) seed: u32,
     #[serde(skip)]
     pub(super) points: Points,
-    /// Of each task the mean return at its end, and its mean over the task; none if the run has no row there.
+    /// For each task the return at its end, and the mean over the task; `None` if the metrics have no row within the task.
     pub(super) tasks: Vec<Option<(f64, f64)>>,
 }
 
@@ -100,7 +100,7 @@ impl Results {
         self.traces[part].iter().filter(move |it| it.agent == agent)
     }
 
-    /// Rank correlation of epsilon and a final loss, and of how many runs it is.
+    /// Returns the rank correlation of epsilon and a final loss, and the number of runs in it.
     pub(super) fn order_of_epsilon(&self, column: &str) -> Option<(f64, usize)> {
         let pairs = self.losses.iter().filter(|it| it.column == column);
         let pairs = pairs.filter_map(|it| Some((it.epsilon, it.last?)));
@@ -114,7 +114,7 @@ fn mean_from(points: &Points, frames: f64) -> Option<f64> {
     mean(&late.map(|point| point.1).collect::<Vec<_>>())
 }
 
-/// See [`Trace::tasks`].
+/// Computes [`Trace::tasks`].
 fn tasks(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
     let length = continual.episodes_per_task as f64;
     let of_task = |task: u64| {
@@ -127,7 +127,7 @@ fn tasks(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
 }
 
 impl Trace {
-    /// The mean over all tasks; none if the run lacks one.
+    /// Returns the mean over all tasks; `None` if the run lacks a task.
     pub(super) fn over_tasks(&self) -> Option<f64> {
         let tasks = self.tasks.iter().map(|task| Some((*task)?.1));
         mean(&tasks.collect::<Option<Vec<_>>>()?)

@@ -1,4 +1,4 @@
-//! What Fig. 3 can be told, what the command line replaces of it, and the runs that follow.
+//! The settings of Fig. 3, the flags that override them, and the runs that follow.
 
 use driml_machine::error::{Usage, usage};
 use driml_settings::presets;
@@ -11,32 +11,32 @@ use crate::{
 
 pub(super) const NAME: &str = "pacman";
 
-/// Frames of an episode, about; only the estimate of the time left depends on it.
+/// The approximate number of frames of an episode, used only to estimate the time left.
 const EPISODE_FRAMES: u64 = 190;
-/// Most frames of an episode: the world's step limit. A run of that many frames has all its episodes.
+/// The most frames of an episode: the step limit of the world. With this many frames per episode a run has all its episodes.
 pub(super) const EPISODE_FRAMES_MAX: u64 = 500;
 
-/// A table of `pacman.toml`. A folder holds the runs of one such choice; agents and seeds can be added.
+/// A table of `pacman.toml`. All runs of a folder share these settings; agents and seeds can be added later.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
-    /// Agents of (b) and (c), the first for comparison.
+    /// The agents of (b) and (c). The others are compared with the first.
     #[serde(skip_serializing)]
     pub(super) agents: Vec<String>,
-    /// Seeds 1 to this.
+    /// The number of seeds, 1 to this.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
     #[serde(skip_serializing)]
     pub(super) jobs: u32,
     pub(super) preset: String,
-    /// What differs from the preset in every run, in the form of `--set`.
+    /// Differences from the preset in every run, in the form of `--set`.
     pub(super) sets: Vec<String>,
     pub(super) predictability: Predictability,
     pub(super) continual: Continual,
     pub(super) noise: Continual,
 }
 
-/// (a) The share of random moves of the ghosts.
+/// Part (a): the ghosts make a share of random moves.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Predictability {
@@ -45,18 +45,18 @@ pub(super) struct Predictability {
     pub(super) frames: u64,
 }
 
-/// (b, c) One lethal ghost after another.
+/// Parts (b) and (c): one lethal ghost after another.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Continual {
     pub(super) tasks: u64,
-    /// The lethal ghost of each task; after the last the first again.
+    /// The lethal ghost of each task. After the last entry it starts again with the first.
     pub(super) order: Vec<u8>,
-    /// Episodes of a task, of all environments together.
+    /// The number of episodes of a task, over all environments together.
     pub(super) episodes_per_task: u64,
-    /// Environments, in one actor.
+    /// The number of environments, all in one actor.
     pub(super) envs: u64,
-    /// What differs from the other runs, in the form of `--set`.
+    /// Differences from the other runs, in the form of `--set`.
     pub(super) sets: Vec<String>,
 }
 
@@ -66,16 +66,16 @@ impl Continual {
     }
 }
 
-/// (b) and (c).
+/// The number of parts with tasks: (b) and (c).
 pub(super) const PARTS: usize = 2;
-/// As files name them.
+/// The names of parts (b) and (c) in files.
 pub(super) const PART_NAMES: [&str; PARTS] = ["ghosts", "noise"];
 
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Point {
-    /// (a): ghosts that move at random with this probability.
+    /// Part (a): ghosts move at random with this probability.
     Epsilon(f64),
-    /// (b) or (c), of this agent.
+    /// Part (b) or (c) (0 or 1) with this agent.
     Tasks(usize, String),
 }
 
@@ -135,7 +135,7 @@ impl Settings {
     }
 }
 
-/// The settings of the length asked for, with what the flags replace.
+/// Returns the settings of the full or smoke length, overridden by the flags.
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
     let mut settings: Settings = flags::settings(NAME, text, args.flags.smoke);

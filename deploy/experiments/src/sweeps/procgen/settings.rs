@@ -1,4 +1,4 @@
-//! What table 1 can be told, what the command line replaces of it, and the runs that follow.
+//! The settings of table 1, the flags that override them, and the runs that follow.
 
 use driml_envs::WorldName;
 use driml_launch::evaluate::Levels;
@@ -15,20 +15,20 @@ use crate::{
 };
 
 pub(super) const NAME: &str = "procgen";
-/// Checkpoints that play.
+/// The number of newest checkpoints of a run that play.
 pub(super) const CHECKPOINTS: u32 = 3;
-/// Playing a run as a part of making it; only the estimate of the time left depends on it.
+/// Playing counts as 1 / this of the work of a run, used only to estimate the time left.
 const PLAY_SHARE: u64 = 10;
 /// The paper's agents, in the order of its table 1.
 const AGENTS: &str = "c51 cpc curl driml-noact driml-randk driml-fix driml-ada";
-/// Agents that look a fixed k ahead, so that another k can be asked for.
+/// The agents with a fixed k, for which a name such as `driml-fix-k5` chooses another k.
 const OF_FIXED_K: [&str; 2] = ["driml-fix", "driml-noact"];
 
-/// A table of `procgen.toml`, with what the flags replace.
+/// A table of `procgen.toml`, overridden by the flags.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
-    /// As `--env` takes them, or `all` for Procgen's sixteen. These four can be added to in a folder; what follows cannot.
+    /// Games as `--env` accepts them, or `all` for the sixteen. A folder allows changes of the first four fields, but not of the others.
     #[serde(skip_serializing)]
     pub(super) games: Vec<String>,
     #[serde(skip_serializing)]
@@ -40,13 +40,13 @@ pub(super) struct Settings {
     pub(super) preset: String,
     pub(super) frames: u64,
     pub(super) sets: Vec<String>,
-    /// Played with each of the last checkpoints.
+    /// The number of episodes played with each of the last checkpoints.
     pub(super) episodes: u32,
 }
 
 #[derive(Debug, Serialize)]
 pub(super) struct Point {
-    /// The world's name as files have it.
+    /// The name of the world in files.
     pub(super) game: String,
     pub(super) agent: String,
 }
@@ -98,7 +98,7 @@ impl Settings {
         plans
     }
 
-    /// How a run is played on these levels.
+    /// Returns how a run is played on these levels.
     pub(super) fn play(&self, levels: Levels) -> Played {
         Played {
             levels,
@@ -109,7 +109,7 @@ impl Settings {
     }
 }
 
-/// Worlds by their names or their games', each once; `all` is every game.
+/// Resolves names of worlds or games and drops duplicates. `all` means every Procgen game.
 fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
     once(names, |name| match name {
         "all" => {
@@ -123,7 +123,7 @@ fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
     })
 }
 
-/// The agent and the k of a name such as `driml-noact-k5`; other names are the agent's alone.
+/// Splits a name such as `driml-noact-k5` into the agent and its k. Other names have no k.
 fn with_k(name: &str) -> (&str, Option<u32>) {
     let split = name.rsplit_once("-k");
     match split.and_then(|(agent, k)| Some((agent, k.parse().ok()?))) {
@@ -132,7 +132,7 @@ fn with_k(name: &str) -> (&str, Option<u32>) {
     }
 }
 
-/// Agents by name, each once; `all` is every one of the paper's, and a name with a k one that looks so far ahead.
+/// Resolves names of agents, with or without a k, and drops duplicates. `all` means every agent of the paper.
 fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
     once(names, |name| {
         Ok(match (name, with_k(name)) {
@@ -180,7 +180,7 @@ mod tests {
         }
     }
 
-    /// The layout of runs that earlier programs made.
+    /// Folders of earlier programs rely on these names and calls.
     #[test]
     fn a_run_is_named_and_called_as_ever() {
         let settings = Settings {

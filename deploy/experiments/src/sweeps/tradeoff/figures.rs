@@ -1,4 +1,4 @@
-//! The pictures of a trade-off: return against speed with the levels that no other beats in both, and return against wall-clock time.
+//! The figures of a trade-off: return against speed with the Pareto front of the levels, and return against wall-clock time.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
@@ -18,8 +18,8 @@ struct Placed {
     ends: [f64; 2],
 }
 
-/// Return against frames a second, a panel for each dial with its base, all over the same axes; a dashed line joins those points of
-/// all dials that no other beats in both. `returns` is which return, and `name` what it is called.
+/// Draws return against frames per second: a panel for each dial with its base, all with the same axes. A dashed line joins the Pareto
+/// front of all dials. `returns` selects the return, and `name` is its name.
 pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure {
     let of_runs = results.points.values().flat_map(|it| it.values(returns));
     let all = Spread::of(of_runs);
@@ -60,7 +60,7 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
     }
 }
 
-/// Where a point stands; its interval is cut where no run's return is, as one of few seeds may be far wider than all there is.
+/// Returns the position of a point. Its interval is cut to the range of all returns, because few seeds may give a far wider one.
 fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -> Option<Placed> {
     let value = point.mean(returns)?;
     let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
@@ -71,7 +71,7 @@ fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -
     })
 }
 
-/// Those than which no other is faster and no worse, or better and no slower; the slowest first.
+/// Returns the Pareto front, the slowest point first: no other point is faster and no worse, or better and no slower.
 fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
     let beaten = |it: &Placed| {
         placed.iter().any(|other| {
@@ -85,7 +85,7 @@ fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
     front.into_iter()
 }
 
-/// Training return over seconds, a panel for each dial with its base.
+/// Draws the training return over seconds, with a panel for each dial and its base.
 pub(super) fn wall(results: &Results) -> Figure {
     let panels = results.by_dial().map(|rows| {
         let series = rows.iter().enumerate().map(|(index, row)| {

@@ -1,6 +1,6 @@
-//! Fixed batches: rows of a world that no replay serves, on which the speed and the error of updates are measured.
-//! They are spread over 512 steps of 16 environments, so over whole episodes. Frames, stacks and enlargement are the run's own; k is 1, and
-//! nothing is augmented.
+//! Fixed batches: rows sampled directly from a world, without a replay, to measure the speed and the error of updates.
+//! The rows are spread over 512 steps of 16 environments, and so over whole episodes. Frames, stacks and enlargement are those of the
+//! run. k is 1, and nothing is augmented.
 
 use anyhow::Context;
 use driml_actor::{Acting, NetworkPolicy, Policy, RandomPolicy};
@@ -12,23 +12,23 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 const ENVS: usize = 16;
-/// Steps over which the rows of an environment are spread evenly.
+/// The number of steps over which the rows of an environment are spread evenly.
 const SPAN: usize = 512;
-/// Share of random actions where a network chooses the others.
+/// The share of random actions if a network chooses the others.
 const EPSILON: f64 = 0.1;
-/// Seed of the world and the actions: the same rows for every level of a dial that leaves the world alone.
+/// The seed of the world and the actions, so that all levels of a dial that does not change the world have the same rows.
 const SEED: u64 = 1_000_003;
 
-/// What all environments saw and did at one step.
+/// One step of all environments.
 struct Moment {
-    /// [N, H, W, C] at the network's size; empty where no row has them.
+    /// The states [N, H, W, C] at the size of the network's input; empty if no row needs them.
     states: Vec<u8>,
     actions: Vec<u8>,
     rewards: Vec<f32>,
     ends: Vec<StepEnd>,
 }
 
-/// Plays the world of `config` for `rows` rows, greedily with `weights` but for one action in ten, else at random.
+/// Plays the world of `config` and returns `rows` rows. With `weights` nine actions in ten are greedy; without, all are random.
 pub(super) fn play(
     config: &RunConfig,
     weights: Option<&[u8]>,
@@ -77,12 +77,12 @@ pub(super) fn play(
     Ok(batch)
 }
 
-/// Whether the return ends there.
+/// Whether the return ends at this step.
 fn ends(end: StepEnd) -> bool {
     matches!(end, StepEnd::TimedOut | StepEnd::Terminal)
 }
 
-/// `steps` steps of all environments, with the states of those that are `wanted_at`.
+/// Plays `steps` steps of all environments. The states are kept for the steps at which they are `wanted_at`.
 fn history(
     config: &RunConfig,
     weights: Option<&[u8]>,

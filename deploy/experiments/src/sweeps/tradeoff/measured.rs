@@ -1,6 +1,6 @@
-//! What is measured of a level in this process: how fast it learns and acts beside its dial's base, in turns, so that a machine with other
-//! work on it slows both alike; and how exact its arithmetic is with its run's weights, against f32 by candle's own operations.
-//! What whole runs do and earn is in their summaries: a level may be exact and learn less.
+//! Measures a level in this process. Speed: how fast it learns and acts, in turns with its dial's base, so that other load on the machine
+//! slows both alike. Exactness: the errors with the weights of its run, against f32 with candle's own operations.
+//! The speed and returns of whole runs are in their summaries: a level may be exact and still learn less.
 
 use anyhow::Context;
 use driml_launch::run_folder::RunFolder;
@@ -16,20 +16,20 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{fixed_batch, results::Measured};
 
-/// Rows of the batch whose loss and gradient are compared, at most.
+/// The most rows of the batch whose loss and gradient are compared.
 const ROWS_MAX: usize = 64;
-/// States whose values and greedy actions are compared, for each of these rows.
+/// The number of states for each of these rows whose values and greedy actions are compared.
 const STATES_A_ROW: usize = 16;
 
-/// What is timed of a configuration.
+/// The work of a configuration that is timed.
 struct Side {
-    /// An update of so many rows.
+    /// An update with `rows` rows.
     update: Work<'static>,
     rows: usize,
-    /// An action for a frame of each of so many environments, as an actor has.
+    /// Choosing an action for one frame of each of `envs` environments, as an actor does.
     act: Work<'static>,
     envs: usize,
-    /// Of one broadcast.
+    /// The bytes of one broadcast of the weights.
     weights_bytes: usize,
 }
 
@@ -58,7 +58,7 @@ fn side(config: &RunConfig) -> anyhow::Result<Side> {
     })
 }
 
-/// Times `level` beside `base`: some seconds of both, less for the smoke length.
+/// Times `level` and `base` in turns, for some seconds each, less in the smoke length.
 pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow::Result<Measured> {
     let effort = Effort::new(smoke);
     let (from, to) = (side(base)?, side(level)?);
@@ -69,27 +69,27 @@ pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow
     let run = &level.run;
     let frame_bytes = run.frame_height * run.frame_width * run.frame_channels;
     let measured = [
-        // Of an update of all rows, and how many times as many rows a second are learned from as at the base.
+        // The time of an update of the whole batch, and the rows learned per second as a multiple of the base's.
         ("update_seconds", 1.0 / updates[1]),
         ("rows_gain", gain(&updates, from.rows, to.rows)),
-        // Of choosing an action for one frame, among as many as an actor has environments, and how many times as many frames a second are
-        // acted on as at the base.
+        // The time of an action for one frame, in a batch of as many frames as an actor has environments, and the frames acted on per
+        // second as a multiple of the base's.
         ("act_seconds", 1.0 / (acts[1] * to.envs as f64)),
         ("act_gain", gain(&acts, from.envs, to.envs)),
-        // Of one broadcast of the weights, and of one frame as an actor sends it and the replay holds it, uncompressed.
+        // The size of one broadcast of the weights, and of one uncompressed frame as the actor sends it and the replay stores it.
         ("weights_bytes", to.weights_bytes as f64),
         ("frame_bytes", f64::from(frame_bytes)),
     ];
     Ok(measured.map(|(name, it)| (name.to_owned(), it)).into())
 }
 
-/// Rows whose loss and gradient are compared, and states whose values and greedy actions are.
+/// Returns the number of rows whose loss and gradient are compared, and of states whose values and greedy actions are compared.
 pub(super) fn sizes(config: &RunConfig) -> (usize, usize) {
     let rows = ROWS_MAX.min(config.learner.batch_size as usize);
     (rows, rows * STATES_A_ROW)
 }
 
-/// Errors of losses, gradients and values on fixed rows, with the newest checkpoint of a run with `config`.
+/// Returns the errors of loss, gradient and values on fixed rows, with the newest checkpoint of a run with `config`.
 pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Measured> {
     let (model, update) = (&config.model, &config.learner.update);
     let compute = Compute::cpu(config.learner.precision);
@@ -117,17 +117,17 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<M
     let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]
         .map(|values| QError::of(&values, &expected, model.num_actions));
     let errors = [
-        // Relative: of the total loss, of the gradient, and 1 - cosine of its angle to the reference.
+        // The relative errors of the total loss and of the gradient, and 1 - cosine of the gradient's angle to the reference.
         ("loss_error", found.loss),
         ("gradient_error", found.gradient),
         ("gradient_angle", found.angle),
-        // Of the learner's values, in units of return.
+        // The errors of the learner's values, in units of return.
         ("q_rms_error", learning.rms),
         ("q_max_error", learning.max),
-        // Share of states with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
+        // The share of states with the reference's greedy action: for the learner, and for an actor with the published weights.
         ("same_action_learner", learning.same_action),
         ("same_action_actor", acting.same_action),
-        // Of the actor's values.
+        // The error of the actor's values.
         ("actor_q_rms_error", acting.rms),
     ];
     Ok(errors.map(|(name, it)| (name.to_owned(), it)).into())

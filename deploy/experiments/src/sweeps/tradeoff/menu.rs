@@ -1,5 +1,5 @@
-//! What a call of `driml tradeoff` asks for: the dials that can be turned, their levels as settings, and the runs that follow.
-//! It measures nothing; the menu itself, and what all levels share in a world, is `tradeoff.toml`.
+//! The settings of a call of `driml tradeoff`: the dials, their levels as settings, and the runs that follow.
+//! Nothing is measured here. `tradeoff.toml` has the menu itself, and what all levels of a world share.
 
 use std::collections::BTreeMap;
 
@@ -13,61 +13,61 @@ use crate::{
     sweep::plan::{Call, PlannedRun},
 };
 
-/// Seeds of a base for each of a level's: all levels are compared with it, so that its luck is in all of their differences.
+/// A base has this many times the seeds of a level. All levels are compared with it, so chance in the base affects all differences.
 const BASE_SEEDS: u32 = 2;
 
-/// The file with all of it.
+/// The contents of `tradeoff.toml`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Menu {
     full: Length,
     smoke: Length,
-    /// By a world's name or its kind.
+    /// The settings of worlds, by the name of a world or of its kind.
     world: BTreeMap<String, WorldBase>,
-    /// In the order in which they are tried.
+    /// The dials, in the order in which they are tried.
     dial: Vec<Dial>,
 }
 
-/// What every world's runs have at a length.
+/// The settings that a length (full or smoke) gives to the runs in every world.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Length {
     preset: String,
-    /// Of each level.
+    /// The number of seeds of each level.
     seeds: u32,
-    /// Played with each run's weights.
+    /// The number of greedy episodes played with the weights of each run.
     episodes: u32,
-    /// Of a run; as its world says if this says nothing.
+    /// The frames of a run; `None` takes those of the world.
     frames: Option<u64>,
-    /// After those of the world, in the form of `--set`.
+    /// Settings in the form of `--set`, applied after those of the world.
     sets: Vec<String>,
 }
 
-/// What all runs in the worlds of one kind have, or in one game of it.
+/// The settings of all runs in the worlds of one kind, or in one game.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WorldBase {
     frames: u64,
-    /// In the form of `--set`.
+    /// Settings in the form of `--set`.
     sets: Vec<String>,
 }
 
-/// A dial in one world: a base and the levels that are compared with it.
+/// A dial: a setting to vary, with a base and the levels that are compared with the base.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Dial {
     pub(super) name: String,
-    /// The name of the level that the settings of the world have.
+    /// The name of the level that the world's settings give.
     pub(super) base: String,
     buys: String,
     costs: String,
-    /// The agent of its base; C51 if it names none.
+    /// The agent of the base; C51 by default.
     #[serde(default = "c51")]
     pub(super) agent: String,
-    /// Kinds of worlds that have it; all if it names none.
+    /// The kinds of worlds that have this dial; all if empty.
     #[serde(default)]
     worlds: Vec<String>,
-    /// Levels that set what the dial is named for.
+    /// Levels given as values of the setting that the dial is named after.
     #[serde(default, skip_serializing)]
     values: Vec<String>,
     #[serde(default, skip_serializing)]
@@ -82,20 +82,20 @@ fn c51() -> String {
 #[serde(deny_unknown_fields)]
 struct Level {
     name: String,
-    /// In the form of `--set`, over the settings of the world.
+    /// Settings in the form of `--set`, applied after those of the world.
     #[serde(default)]
     sets: Vec<String>,
-    /// Another agent than the dial's.
+    /// The agent, if it differs from that of the dial.
     agent: Option<String>,
 }
 
-/// One choice of all settings: what a run, of any seed, is made with.
+/// One choice of all settings except the seed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Point {
-    /// Names its runs and pieces.
+    /// The name of the point in the names of its runs and pieces.
     pub(super) key: String,
     pub(super) agent: String,
-    /// Over the settings of the world.
+    /// Settings applied after those of the world.
     pub(super) sets: Vec<String>,
 }
 
@@ -105,7 +105,7 @@ pub(super) struct LevelOf {
     pub(super) level: String,
     pub(super) base: Point,
     pub(super) point: Point,
-    /// Whether the call asks for its dial. What others have made of a dial is on the page too.
+    /// Whether the call requests this dial. The page also has the runs of dials that other calls requested.
     pub(super) is_asked: bool,
 }
 
@@ -152,40 +152,40 @@ impl Dial {
     }
 }
 
-/// A name as files have it: letters, digits, dots and single dashes.
+/// Converts a name to one for files: letters, digits, dots and single dashes.
 fn slug(name: &str) -> String {
     let parts = name.split(|c: char| !c.is_ascii_alphanumeric() && c != '.');
     let parts = parts.filter(|part| !part.is_empty());
     parts.collect::<Vec<_>>().join("-")
 }
 
-/// What all runs of a folder have in common. Dials, levels and seeds can be added.
+/// The settings that all runs of a folder share. Dials, levels and seeds can be added later.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Common {
     pub(super) env: String,
     pub(super) preset: String,
     pub(super) sets: Vec<String>,
-    /// Of each run.
+    /// The number of frames of each run.
     pub(super) frames: u64,
-    /// Played with each run's weights.
+    /// The number of greedy episodes played with the weights of each run.
     pub(super) episodes: u32,
-    /// Runs at once: it decides the threads of each, and so what wall-clock time means.
+    /// The number of concurrent runs. It decides the threads of each run, and so what wall-clock time means.
     pub(super) jobs: u32,
 }
 
-/// A call, with what it leaves open filled in.
+/// The settings of a call, with defaults filled in.
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
     pub(super) common: Common,
-    /// Those of the world.
+    /// All levels that the world has.
     pub(super) levels: Vec<LevelOf>,
     pub(super) seeds: u32,
-    /// Whether the frames may still be made fewer to fit the budget.
+    /// Whether the number of frames may still be reduced to fit the budget.
     pub(super) frames_open: bool,
 }
 
 impl Settings {
-    /// What the call asks for. A folder that has runs keeps their length.
+    /// Returns the settings of a call. A folder with earlier runs keeps their length.
     pub(super) fn of(
         args: &TradeoffArgs,
         world: WorldName,
@@ -216,13 +216,13 @@ impl Settings {
         })
     }
 
-    /// Whether the call asks for this point, as a level or as the base of one.
+    /// Whether the call requests this point, as a level or as the base of a level.
     pub(super) fn asks_for(&self, point: &Point) -> bool {
         let mut asked = self.levels.iter().filter(|it| it.is_asked);
         asked.any(|it| it.points().contains(&point))
     }
 
-    /// The base beside which a point is timed, whichever dial asks for it: that of its level, or itself if it is none.
+    /// Returns the base beside which a point is timed, whichever dial requests it: the base of its level, or itself if it is only a base.
     pub(super) fn base_of<'a>(&'a self, point: &'a Point) -> &'a Point {
         let level = self.levels.iter().find(|it| it.point == *point);
         level.map_or(point, |it| &it.base)
@@ -255,7 +255,7 @@ impl Common {
     }
 }
 
-/// The levels of all dials that a world has, in their order. `names` are the dials that are asked for; all if it is empty.
+/// Returns the levels of all dials of a world, in the order of the menu. `names` are the requested dials; all if empty.
 fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Vec<LevelOf>, Usage> {
     dials.retain(|it| it.worlds.is_empty() || it.worlds.iter().any(|kind| kind == world.kind()));
     let known: Vec<_> = dials.iter().map(|dial| dial.name.as_str()).collect();
@@ -271,7 +271,7 @@ fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Ve
     Ok(levels.collect())
 }
 
-/// What all runs in a world have: the game's own entry comes before that of its kind.
+/// Returns the settings of all runs in a world. The entry of a game takes precedence over that of its kind.
 fn world_base(
     mut worlds: BTreeMap<String, WorldBase>,
     world: WorldName,
@@ -301,7 +301,7 @@ mod tests {
     }
 
     fn settings(world: &str, smoke: &str) -> Settings {
-        // Else the free memory of the moment decides.
+        // Without this the free memory would decide the replay's capacity.
         let line = format!("--env={world} --set=replay.capacity_transitions=10000{smoke}");
         of(&line, None).unwrap()
     }
@@ -324,7 +324,7 @@ mod tests {
         }
     }
 
-    /// Worlds, a dial, and the settings that are its base's there.
+    /// Each line has worlds, a dial, and the settings that its base has in these worlds.
     const BASES: &str = "\
 mspacman coinrun chain|learner.precision|learner.precision=f32
 mspacman coinrun chain|actor.precision|actor.precision=f32
@@ -388,7 +388,7 @@ coinrun|observation|input.height=64 input.width=64";
             let mut common = common.clone();
             common.preset = preset.to_owned();
             let mut config = common.config(point).unwrap();
-            // A priced preset says in its notes what it gives up.
+            // The notes of a preset with a price say what it gives up, so the points differ in them.
             config.notes.clear();
             config
         };
@@ -412,7 +412,7 @@ coinrun|observation|input.height=64 input.width=64";
         let again = of("--env mspacman", Some(found)).unwrap();
         let kept = (again.common.frames, again.common.jobs);
         assert_eq!((kept, again.frames_open), ((777, 2), false));
-        // A report measures nothing, so it chooses no length.
+        // A report measures nothing, so it does not choose a length.
         assert!(!of("--env mspacman --report", None).unwrap().frames_open);
     }
 

@@ -1,22 +1,22 @@
-//! Which levels fit into a budget.
-//! It knows seconds and names; what they cost is measured in `measured` or by runs that are finished.
+//! Chooses which levels fit into a budget.
+//! This module only knows seconds and names. The costs come from `measured` or from finished runs.
 
 use std::collections::BTreeSet;
 
-/// What is left to run of all seeds of a point.
+/// The cost of the unfinished runs of a point, over all seeds.
 #[derive(Clone, Debug)]
 pub(super) struct Cost {
     pub(super) key: String,
     pub(super) seconds: f64,
 }
 
-/// Machine time, and what it is spent on.
+/// A budget of machine time, and the points on which it is spent.
 #[derive(Debug, Default)]
 pub(super) struct Budget {
     pub(super) seconds_max: f64,
-    /// Of all that was taken, each point counted once.
+    /// The seconds of everything taken. Each point counts once.
     pub(super) seconds: f64,
-    /// Keys of the points that were taken.
+    /// The keys of the points taken.
     paid: BTreeSet<String>,
 }
 
@@ -28,8 +28,8 @@ impl Budget {
         }
     }
 
-    /// Takes a level with all its seeds and its base, if both fit. What costs nothing any more always fits. A level that does not fit
-    /// leaves room to those after it.
+    /// Takes a level and its base with all their seeds if both fit, and returns whether it does. A level that costs nothing always fits. A
+    /// level that does not fit leaves its room to later levels.
     pub(super) fn takes(&mut self, base_and_level: &[Cost; 2]) -> bool {
         let both = base_and_level.iter();
         let new = both.clone().filter(|it| !self.paid.contains(&it.key));
@@ -43,8 +43,8 @@ impl Budget {
     }
 }
 
-/// Frames of a run: `full`, or a half or a quarter of it if the first level fits into the budget with its base only so.
-/// `seconds` is what these two take with all seeds and `full` frames.
+/// Returns the frames of a run: the largest of `full`, its half and its quarter with which the first level and its base fit into the
+/// budget, or `full` if none fits. `seconds` is what both take with all seeds and `full` frames.
 pub(super) fn frames(full: u64, seconds: f64, budget_seconds: f64) -> u64 {
     let lengths = [full, full / 2, full / 4];
     let fits = |frames: &u64| seconds * *frames as f64 / full as f64 <= budget_seconds;
@@ -63,7 +63,7 @@ mod tests {
             [("c51", 100.0), ("f16", 100.0)],
             [("driml-fix", 200.0), ("embedding_dim", 40.0)],
         ];
-        // What is finished costs nothing and is always there.
+        // Finished points cost nothing and are always taken.
         let finished = [[("c51", 0.0), ("bf16", 0.0)], [("c51", 0.0), ("f16", 50.0)]];
         for (levels, seconds_max, chosen, seconds) in [
             (&all[..], 0.0, &[false; 4][..], 0.0),

@@ -1,4 +1,4 @@
-//! Data, figures and page of a trade-off. What the page says of the numbers is its template, `tradeoff.md.j2`.
+//! Writes data, figures and page of a trade-off. The text of the page is the template `tradeoff.md.j2`.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,10 +15,10 @@ use crate::{
     stats::{Interval, apart_by_chance, difference, mean},
 };
 
-/// What the bench and the errors against the reference give, as the data has it.
+/// The columns of the benchmark and of the errors against the reference.
 const MEASURED: &str = "update_seconds,rows_gain,act_seconds,act_gain,weights_bytes,frame_bytes,loss_error,gradient_error,gradient_angle,\
     q_rms_error,q_max_error,same_action_learner,same_action_actor,actor_q_rms_error";
-/// C51 beside an agent with DIM in training return, as the data has it.
+/// The columns of the comparison of C51 and agents with DIM at equal frames and equal time.
 const EQUAL_TIME: &str = "agent,base,equal_seconds,\
     minus_base_at_equal_frames,minus_base_at_equal_frames_low,minus_base_at_equal_frames_high,\
     minus_base_at_equal_time,minus_base_at_equal_time_low,minus_base_at_equal_time_high";
@@ -79,28 +79,28 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
     session.csv("levels", &columns, rows)
 }
 
-/// Mean, low and high end; empty where there is none.
+/// Returns the cells for mean, low end and high end; missing numbers are empty.
 fn interval_cells(of: Option<Interval>) -> [Option<f64>; 3] {
     let (low, high) = of.and_then(|it| it.ends).unzip();
     [of.map(|it| it.mean), low, high].map(|it| it.map(rounded))
 }
 
-/// C51 beside an agent with DIM in training return: of the base's runs and of the level's.
+/// The training returns of C51 (the base) and an agent with DIM (the level). Arrays are [base, level], with a value for each run.
 #[derive(Serialize)]
 struct EqualTime {
     agent: String,
     base: String,
-    /// When runs of the faster of the two are done.
+    /// The mean seconds after which the runs of the faster of the two end.
     seconds: f64,
-    /// At the end of each run.
+    /// The returns at the end of each run.
     end: [Vec<f64>; 2],
-    /// At that time.
+    /// The returns at `seconds`.
     then: [Vec<f64>; 2],
 }
 
 impl EqualTime {
-    /// Runs that ended alone are compared, in training return: the agent after part of a run was not kept. None where a side has no
-    /// return at that time.
+    /// Compares training returns of finished runs, because the agent at an earlier time was not kept. `None` if a side has no return at
+    /// `seconds`.
     fn of(row: &Row<'_>) -> Option<Self> {
         let sides = [row.base, row.result];
         let [base, level] = sides.map(|point| {
@@ -124,7 +124,7 @@ impl EqualTime {
         (!of.then.iter().any(Vec::is_empty)).then_some(of)
     }
 
-    /// As [`EQUAL_TIME`] has it.
+    /// Returns the cells of the columns [`EQUAL_TIME`].
     fn cells(&self) -> impl Serialize {
         let minus_base = [&self.end, &self.then].map(|[base, level]| {
             let difference = difference(base, level);
@@ -134,7 +134,7 @@ impl EqualTime {
     }
 }
 
-/// The value at a time: the last one before it.
+/// Returns the last value of a curve up to this time.
 fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
     let before = curve.iter().take_while(|(x, _)| *x <= seconds).last();
     before.map(|(_, value)| *value)
@@ -164,7 +164,7 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     })
 }
 
-/// A line as the template reads it: what was measured, and of each measure the numbers of its runs.
+/// Converts a row for the template: the measured numbers, and for each measure the numbers of the runs.
 fn page_row(row: &Row<'_>) -> Value {
     let measured = |name: &'static str| {
         let found = row.result.measured.get(name).copied();
@@ -175,7 +175,7 @@ fn page_row(row: &Row<'_>) -> Value {
     context! { level => row.name, agent => row.agent, frames_gain => row.frames_gain(), ..named }
 }
 
-/// How many seeds the intervals of bases are over, or of the other points, the fewest first.
+/// Returns the numbers of seeds that bases have, or that other points have, in increasing order.
 fn seeds(results: &Results, of_bases: bool) -> BTreeSet<usize> {
     let bases: BTreeSet<&str> = results.levels.iter().map(|of| &*of.base.key).collect();
     let all = results.points.iter();
@@ -183,8 +183,8 @@ fn seeds(results: &Results, of_bases: bool) -> BTreeSet<usize> {
     some.map(|(_, point)| point.seeds.len()).collect()
 }
 
-/// How many differences of the page's returns are judged, and how many of them would be called better or worse if no level changed
-/// anything and returns were normal.
+/// Returns how many differences of returns the page judges, and how many of them would be called better or worse by chance if no level
+/// changed anything and returns were normally distributed.
 fn by_chance(results: &Results) -> (usize, f64) {
     let mut known = BTreeMap::new();
     let each = results.level_rows().flat_map(|row| {

@@ -1,4 +1,4 @@
-//! What was measured at each point: the bench, the runs of its seeds and how their agents play. All of the page is made from it.
+//! The results of each point: the benchmark, the runs of its seeds, and the returns of their agents. The page is made from these alone.
 
 use std::collections::BTreeMap;
 
@@ -8,12 +8,12 @@ use crate::{
     sweep::plan::FinishedRun,
 };
 
-/// Numbers of the bench, or errors against the reference, by their names in the data.
+/// Numbers of the benchmark, or errors against the reference, by their column names in the data.
 pub(super) type Measured = BTreeMap<String, f64>;
 
 #[derive(Default)]
 pub(super) struct PointResult {
-    /// The bench, and the errors at the weights of its first seed.
+    /// The benchmark, and the errors with the weights of the first finished seed.
     pub(super) measured: Measured,
     pub(super) seeds: Vec<SeedResult>,
 }
@@ -24,24 +24,24 @@ pub(super) struct SeedResult {
     pub(super) ran: FinishedRun,
     /// Training return over seconds.
     pub(super) curve: Vec<(f64, f64)>,
-    /// Returns of its agent, played greedily.
+    /// The returns of the agent, played greedily.
     pub(super) greedy: Vec<f64>,
 }
 
 pub(super) struct Results {
     pub(super) common: Common,
-    /// Levels that have runs, as their bases do.
+    /// The levels that have finished runs, and whose bases have.
     pub(super) levels: Vec<LevelOf>,
-    /// By the point's key.
+    /// The results by the key of the point.
     pub(super) points: BTreeMap<String, PointResult>,
     pub(super) random: Vec<f64>,
-    /// Levels that are asked for and have no run.
+    /// The requested levels without a run.
     pub(super) left_out: Vec<String>,
-    /// The calls that made it.
+    /// The command lines that made the runs.
     pub(super) commands: Vec<String>,
 }
 
-/// A number of a run, and how the data calls it.
+/// A number that is read from a run, with its column name in the data.
 #[derive(Clone, Copy)]
 pub(super) struct Measure {
     pub(super) name: &'static str,
@@ -52,11 +52,11 @@ const fn measure(name: &'static str, of: fn(&SeedResult) -> Option<f64>) -> Meas
     Measure { name, of }
 }
 
-/// Mean of the greedily played episodes.
+/// The mean return of the greedily played episodes.
 pub(super) const GREEDY: Measure = measure("greedy_return", |it| mean(&it.greedy));
-/// Mean of the last 100 training episodes.
+/// The mean return of the last 100 training episodes.
 pub(super) const TRAINING: Measure = measure("training_return", |it| it.ran.summary.mean_return);
-/// None of a run that was resumed: it has filled its replay and started its processes again.
+/// `None` for a resumed run, whose time includes filling its replay and starting its processes again.
 pub(super) const FRAMES_PER_SECOND: Measure = measure("frames_per_second", |it| {
     let summary = &it.ran.summary;
     (summary.resumed_after_updates == 0).then_some(summary.frames_per_second)
@@ -67,15 +67,15 @@ pub(super) const MEASURES: [Measure; 7] = [
     TRAINING,
     FRAMES_PER_SECOND,
     measure("wall_seconds", |it| Some(it.ran.summary.wall_seconds)),
-    // Highest resident memory of all processes.
+    // The sum over all processes of their highest resident memory.
     measure("rss_mib", |it| {
         Some(it.ran.summary.rss_mib_max.values().flatten().sum())
     }),
-    // Updates by which the weights that acted were behind, median.
+    // The median number of updates by which the acting weights were behind.
     measure("weights_behind_updates", |it| {
         Some(it.ran.summary.replay.weights_behind_updates?.p50)
     }),
-    // Seconds for which newer weights had been there, median.
+    // The median number of seconds for which newer weights had existed.
     measure("weights_behind_seconds", |it| {
         Some(it.ran.summary.replay.weights_behind_s?.p50)
     }),
@@ -91,25 +91,25 @@ impl PointResult {
     }
 }
 
-/// A base or a level of a dial: a line of the tables.
+/// A base or a level of a dial: a row of the tables.
 pub(super) struct Row<'a> {
     pub(super) dial: &'a Dial,
     pub(super) name: &'a str,
     pub(super) agent: &'a str,
     pub(super) is_base: bool,
     pub(super) result: &'a PointResult,
-    /// What it is compared with.
+    /// The results that this row is compared with.
     pub(super) base: &'a PointResult,
 }
 
 impl Row<'_> {
-    /// Level minus base, with its interval. Seeds are not paired: through real processes no two runs of a seed are alike.
+    /// Returns level minus base, with its interval. Seeds are not paired: with real processes, two runs of one seed differ.
     pub(super) fn difference(&self, measure: Measure) -> Option<Difference> {
         difference(&self.base.values(measure), &self.result.values(measure))
     }
 
-    /// The level's frames a second over the base's, of the seeds that both have: a base's further seeds run at another time, beside other
-    /// runs.
+    /// Returns the level's frames per second divided by the base's, over the seeds that both have. Further seeds of a base run at another
+    /// time, beside other runs.
     pub(super) fn frames_gain(&self) -> Option<f64> {
         let mean_of = |point: &PointResult, other: &PointResult| {
             let both = |it: &&SeedResult| other.seeds.iter().any(|of| of.seed == it.seed);
@@ -121,7 +121,7 @@ impl Row<'_> {
 }
 
 impl Results {
-    /// Of each dial that has runs its base, and then its levels.
+    /// Returns for each dial with runs the base, followed by the levels.
     pub(super) fn by_dial<'a>(&'a self) -> impl Iterator<Item = Vec<Row<'a>>> {
         let dials = self.levels.chunk_by(|a, b| a.dial.name == b.dial.name);
         dials.map(move |levels| {

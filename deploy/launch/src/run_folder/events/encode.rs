@@ -1,11 +1,11 @@
-//! The bytes of TensorBoard's event files: protobuf's wire format for the few messages that are written, and the frame of a record.
-//! By hand, as these are five small messages: `prost` brings a compiler, `tfrecord` an async runtime, and `tensorboard-rs` has stood
-//! still since 2021.
+//! Encodes TensorBoard's event files: protobuf's wire format for the few messages that are written, and the framing of records.
+//! Written by hand, as these are five small messages: `prost` brings a compiler, `tfrecord` an async runtime, and `tensorboard-rs` has
+//! not changed since 2021.
 //!
 //! Sources: `event.proto`, `summary.proto` and `record_writer.cc` of TensorFlow. Field numbers are theirs.
 
 const FILE_VERSION: &str = "brain.Event:2";
-/// Protobuf's types on the wire.
+/// Protobuf's wire types.
 const VARINT: u8 = 0;
 const FIXED64: u8 = 1;
 const BYTES: u8 = 2;
@@ -14,7 +14,7 @@ const FIXED32: u8 = 5;
 #[derive(Debug)]
 pub(super) enum Value {
     Scalar(f32),
-    /// How often each of 0, 1, 2, ... was counted.
+    /// The count of each of the numbers 0, 1, 2, ...
     Counts(Vec<u64>),
     Image {
         width: usize,
@@ -23,7 +23,7 @@ pub(super) enum Value {
     },
 }
 
-/// When something was so: seconds since 1970, and the step that it is drawn over.
+/// The time of an event: seconds since 1970, and the step over which it is drawn.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct At {
     pub(super) seconds: f64,
@@ -34,7 +34,7 @@ pub(super) fn version(at: At) -> Vec<u8> {
     record(at, 3, FILE_VERSION.as_bytes())
 }
 
-/// A record that says that what was written before for this step or later does not count any more.
+/// A record that invalidates what was written before for this step or later.
 pub(super) fn begin_anew(at: At) -> Vec<u8> {
     const START: u64 = 1;
     record(at, 7, &number(1, START))
@@ -58,8 +58,8 @@ pub(super) fn summary(at: At, values: &[(String, Value)]) -> Vec<u8> {
     record(at, 5, &fields)
 }
 
-/// A `HistogramProto` in which each number has its own bucket, from half below it to half above. Its least and largest value are
-/// those buckets' ends, as TensorBoard draws nothing beyond them.
+/// A `HistogramProto` in which each number has a bucket, from half below it to half above. The minimum and the maximum are the ends of
+/// the outer buckets in use, as TensorBoard draws nothing beyond them.
 fn histogram(counts: &[u64]) -> Vec<u8> {
     let total = counts.iter().map(|&n| n as f64).sum::<f64>();
     let (mut sum, mut squares) = (0.0, 0.0);
@@ -74,7 +74,7 @@ fn histogram(counts: &[u64]) -> Vec<u8> {
         .map(|(found, half)| found.map_or(0.0, |(value, _)| value as f64 + half));
     let facts = [(1, least), (2, most), (3, total), (4, sum), (5, squares)];
     let facts = facts.map(|(field, value)| fixed(field, FIXED64, &f64::to_le_bytes(value)));
-    // A first, empty bucket ends where that of 0 begins.
+    // A first, empty bucket ends where the bucket of 0 begins.
     let limits = (0..=counts.len()).map(|value| value as f64 - 0.5);
     let numbers = std::iter::once(0.0).chain(counts.iter().map(|&n| n as f64));
     let buckets = [bytes(6, &packed(limits)), bytes(7, &packed(numbers))];
@@ -98,7 +98,7 @@ fn bytes(field: u8, value: &[u8]) -> Vec<u8> {
     fixed(field, BYTES, &[&length[..], value].concat())
 }
 
-/// Seven bits a byte, the lowest first; all but the last byte have the eighth.
+/// Seven bits per byte, the lowest first; all but the last byte have the eighth bit set.
 fn varint(mut value: u64) -> Vec<u8> {
     let mut bytes = Vec::new();
     while value > 0x7f {
@@ -109,7 +109,7 @@ fn varint(mut value: u64) -> Vec<u8> {
     bytes
 }
 
-/// The record of an event with one field beside its time and step.
+/// The record of an event that has one field beside its time and step.
 fn record(At { seconds, step }: At, field: u8, value: &[u8]) -> Vec<u8> {
     let seconds = fixed(1, FIXED64, &seconds.to_le_bytes());
     let event = [seconds, number(2, step), bytes(field, value)].concat();
@@ -118,12 +118,12 @@ fn record(At { seconds, step }: At, field: u8, value: &[u8]) -> Vec<u8> {
     [&length[..], &of_length, &event, &of_event].concat()
 }
 
-/// A checksum of data that may hold checksums.
+/// Masks a checksum, as TensorFlow does because the data of a record may contain checksums.
 const fn masked(crc: u32) -> u32 {
     crc.rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
-/// CRC-32C (Castagnoli), bit by bit: records are a kilobyte a second.
+/// CRC-32C (Castagnoli), bit by bit: fast enough for a kilobyte of records per second.
 fn crc32c(data: &[u8]) -> u32 {
     const POLYNOMIAL: u32 = 0x82f6_3b78;
     let mut crc = u32::MAX;

@@ -1,7 +1,7 @@
-//! TensorBoard's event file beside `metrics.csv`: every row as points of curves over frames, histograms of k and of actions, and
-//! pictures of the action affinity A. Nothing of this program reads it.
+//! TensorBoard's event file beside `metrics.csv`: each row as points of curves over frames, histograms of k and of actions, and
+//! images of the action affinity A. This program never reads the file.
 //!
-//! A resumed run begins another file, which takes back what the one before has beyond the rows that stay; TensorBoard reads both.
+//! A resumed run begins another file, which invalidates what the file before has beyond the rows that are kept; TensorBoard reads both.
 
 mod encode;
 
@@ -22,9 +22,9 @@ use super::{
     table::AppendLog,
 };
 
-/// How often histograms are written, and looked whether there is another A; curves are written with each row.
+/// How often histograms are written and a new A is looked for; curves are written with each row.
 const SLOW_PERIOD: Duration = Duration::from_secs(10);
-/// Pixels of one entry of A, of what stands below, and around.
+/// Pixels of one entry of A, of the caption below, and of the margin around.
 const CELL: usize = 24;
 const CAPTION: usize = 22;
 const MARGIN: usize = 8;
@@ -34,14 +34,14 @@ pub(super) struct Events {
     pub(super) file: AppendLog,
     checkpoints: PathBuf,
     slow_at: Option<Instant>,
-    /// Counts when histograms were written last.
+    /// The counts of the last histograms.
     k: Vec<u64>,
     actions: Vec<u64>,
     drawn: Option<u64>,
 }
 
 impl Events {
-    /// Begins a file; what earlier files of the run have beyond `frames_kept` is taken back.
+    /// Creates a file, which invalidates what earlier files of the run have beyond `frames_kept`.
     pub(super) fn create(folder: &RunFolder, frames_kept: u64) -> anyhow::Result<Self> {
         let seconds = now();
         let name = |number: u32| match number {
@@ -68,8 +68,8 @@ impl Events {
         })
     }
 
-    /// Adds points of curves by name, and from time to time and at the run's end histograms and A. A warning is returned as by
-    /// [`AppendLog::add`].
+    /// Adds points of curves by name, and, every ten seconds and at the run's end, histograms and A. Returns a warning as
+    /// [`AppendLog::add`] does.
     pub(super) fn add(
         &mut self,
         points: &[(String, f64)],
@@ -92,7 +92,7 @@ impl Events {
         self.file.add(records)
     }
 
-    /// What was counted since the last histograms.
+    /// Histograms of what was counted since the last ones.
     fn histograms(&mut self, at: At, replay: &ReplayStatus) -> Option<Vec<u8>> {
         let mut histograms = Vec::new();
         for (name, now, before) in [
@@ -112,7 +112,7 @@ impl Events {
         (!histograms.is_empty()).then(|| encode::summary(at, &histograms))
     }
 
-    /// Draws A of a checkpoint that was not there before. One that cannot be read just now is tried again.
+    /// Draws A of a new checkpoint. A checkpoint that cannot be read just now is tried again later.
     fn affinity(&mut self, at: At) -> Option<Vec<u8>> {
         let (updates, path) = checkpoint::list(&self.checkpoints).ok()?.pop()?;
         if self.drawn.is_some_and(|drawn| drawn >= updates) {
@@ -134,7 +134,7 @@ fn now() -> f64 {
     since.unwrap_or_default().as_secs_f64()
 }
 
-/// What was counted since `before`; all of it where a counter is another one.
+/// The counts since `before`, or all counts if a counter has restarted.
 fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
     let before = before.iter().copied().chain(std::iter::repeat(0));
     let both = now.iter().zip(before);
@@ -142,7 +142,7 @@ fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
     difference.unwrap_or_else(|| now.to_vec())
 }
 
-/// A as cells, each row an action, each column the next one.
+/// Draws A as cells: each row is an action, each column the next action.
 fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
     let length = side * CELL;
     let width = (length + 2 * MARGIN).max(320);
@@ -188,7 +188,7 @@ mod tests {
             let text = fs::read(path).unwrap();
             let mut rest = &text[..];
             let mut records = 0;
-            // Length, its sum, the record, its sum.
+            // A record's length, its checksum, the data, its checksum.
             while let Some(length) = rest.first_chunk() {
                 rest = &rest[8 + 4 + u64::from_le_bytes(*length) as usize + 4..];
                 records += 1;

@@ -1,5 +1,5 @@
 //! AMX: products of whole tiles of bf16, up to 16 rows by 16 columns by 32 terms an instruction.
-//! The arithmetic of the tiles is a trait, so that what cuts products into tiles is tested on processors without them.
+//! The tile arithmetic is a trait, so that the code that cuts products into tiles is tested on processors without AMX.
 #![allow(unsafe_code, reason = "instructions of one kind of processor")]
 #![cfg(target_arch = "x86_64")]
 
@@ -18,8 +18,8 @@ use super::avx512_rounding;
 use super::element::Rounding;
 use super::simd::{LANES, Loop, Mode, RawTile, Simd};
 
-/// Multiplies two small matrices whose product is exact in either order of the sum, in both ways that tiles are used, and looks at
-/// the result: a virtual machine may promise tiles that it does not keep.
+/// Checks two small products, exact in any order of summation, one for each layout of a left operand. A
+/// virtual machine may announce tiles that do not work.
 fn multiplies_right(simd: Bf16) -> bool {
     const K: usize = 2 * (STEPS + 3);
     let value = |at: usize| bf16::from_f32((at % 5) as f32 - 2.0);
@@ -57,20 +57,20 @@ fn multiplies_right(simd: Bf16) -> bool {
     right
 }
 
-/// A row for each row of a register, none of which crosses the lines of a cache.
+/// One row for each row of a register. No row crosses a cache line.
 #[repr(align(64))]
 struct Block<T>([[T; LANES]; ROWS]);
 
-/// bf16 operands in pairs, on tiles.
+/// AMX, with bf16 operands in pairs.
 #[derive(Clone, Copy)]
 pub(crate) struct Amx(
-    /// For all that is not a product: a processor with AMX's bf16 has AVX-512's.
+    /// For everything but products: a processor with AMX for bf16 has AVX512_BF16.
     Bf16,
 );
 
 impl Amx {
-    /// It, if this processor and kernel have AMX for bf16, and it multiplies right. Asks the kernel once for leave to use the tile
-    /// registers.
+    /// Returns the AMX instruction set if the processor and the kernel support it for bf16 and a test product
+    /// is right. Asks the kernel once for permission to use the tile registers.
     pub(super) fn new() -> Option<Self> {
         static IS_THERE: OnceLock<bool> = OnceLock::new();
         let vectors = Bf16::new()?;
@@ -80,7 +80,7 @@ impl Amx {
     }
 }
 
-/// Most rows of a tile as the products are cut: four registers of them.
+/// Most rows of a tile: four registers of rows.
 pub(super) const ROWS_MAX: usize = SUMS * ROWS;
 
 bf16_rounding!(Amx);
@@ -89,7 +89,7 @@ impl Simd for Amx {
     type Element = bf16;
     const VECS_MAX: usize = SUMS;
     const LEFT_STEPS_ADJOIN: bool = true;
-    /// The sum of most products, so that it leaves the registers once.
+    /// Covers the reduction axis of most products, so that accumulators leave the registers once.
     const STEPS_IN_CACHE: usize = 1024;
 
     fn rows_max(_: usize) -> usize {
@@ -102,7 +102,7 @@ impl Simd for Amx {
             #[inline(always)]
             fn run(self) {
                 let Self(simd, tile, rows, vecs) = self;
-                // SAFETY: `Amx::new` found the instructions; the rest is the caller's.
+                // SAFETY: `Amx::new` found the instructions; the caller guarantees the rest.
                 unsafe { compute(simd, &mut Hardware, tile, rows, vecs) }
             }
         }
@@ -120,10 +120,10 @@ impl Simd for Amx {
     }
 }
 
-/// Computes a tile of products. `simd` is for what is not one.
+/// Computes a tile of products with `tiles`. `simd` transposes blocks.
 ///
 /// # Safety
-/// As for `Simd::compute`, on a processor that `tiles` is for.
+/// As for `Simd::compute`. The processor has the instructions that `tiles` uses.
 #[inline(always)]
 pub(super) unsafe fn compute<S: Simd, T: Tiles>(
     simd: S,
@@ -132,9 +132,9 @@ pub(super) unsafe fn compute<S: Simd, T: Tiles>(
     rows: usize,
     vecs: usize,
 ) {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
-        // Steps that lie side by side fill the row of a left register; else the rows do, and the product is turned round.
+        // Adjacent steps fill the rows of a left register directly. If rows are adjacent instead, blocks are transposed first.
         if tile.step == 2 {
             by_rows(tiles, tile, rows, vecs);
         } else {
@@ -143,7 +143,7 @@ pub(super) unsafe fn compute<S: Simd, T: Tiles>(
     }
 }
 
-/// The product of rows whose steps lie side by side.
+/// Computes the product of rows whose steps are adjacent.
 ///
 /// # Safety
 /// As for `compute`, with a step of 2.
@@ -153,7 +153,7 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
     let width = vecs * LANES;
     let mut first = 0;
     while first < rows {
-        // Whole registers of rows, or what is left; as square a block of them as there are sums for.
+        // Whole registers of rows, or the remaining rows. The accumulators cover a block that is as square as possible.
         let (groups, count) = match (rows - first) / ROWS {
             0 => (1, rows - first),
             whole => (whole.min(SUMS / vecs.min(2)), ROWS),
@@ -184,7 +184,7 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
                             let left = left.add(group * ROWS * tile.row_stride);
                             tiles.load_left(left, tile.row_stride * 2, in_tail);
                             for at in 0..block_vecs {
-                                // Back and forth: a group begins with the right operand that the one before has ended with.
+                                // Back and forth: a group starts with the right operand with which the previous group ended.
                                 let vec = if group % 2 == 0 {
                                     at
                                 } else {
@@ -206,8 +206,8 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
     }
 }
 
-/// The product of rows whose steps are apart, and which lie side by side themselves: blocks of 16 of both are turned, so that steps
-/// lie side by side.
+/// Computes the product of adjacent rows whose steps are apart. Blocks of 16 steps by 16 rows are transposed,
+/// so that steps become adjacent.
 ///
 /// # Safety
 /// As for `compute`, with a row stride of 2.
@@ -223,7 +223,7 @@ unsafe fn by_columns<S: Simd, T: Tiles>(
         tile.row_stride == 2,
         "neither steps nor rows lie side by side"
     );
-    // Of all runs, whose steps follow each other in the panel.
+    // The steps of all runs. In the panel they follow each other.
     let steps = tile.runs * tile.steps;
     let (tail, width) = (steps % STEPS, vecs * LANES);
     for first in (0..rows).step_by(ROWS) {
@@ -268,16 +268,16 @@ unsafe fn by_columns<S: Simd, T: Tiles>(
     }
 }
 
-/// Registers of sums, and the rows and columns of the output that they are for.
+/// Accumulator registers, and the rows and columns of the output that they stand for.
 struct Sums {
-    /// The first row, rows of a register, and registers of rows.
+    /// The first row, the rows of a register, and the number of registers along the rows.
     rows: (usize, usize, usize),
-    /// The first register of columns, and how many there are.
+    /// The first register of columns, and the number of such registers.
     vecs: (usize, usize),
 }
 
 impl Sums {
-    /// Each register's number, where its sums go, and how many columns it has there; without columns the place is not used.
+    /// Iterates over the registers: index, output address, and number of output columns. If that is 0, the address is not used.
     #[inline(always)]
     fn places(&self, tile: &RawTile<bf16>) -> impl Iterator<Item = (usize, *mut f32, usize)> {
         let ((first, _, groups), (first_vec, vecs)) = (self.rows, self.vecs);
@@ -290,15 +290,15 @@ impl Sums {
         })
     }
 
-    /// Whether sums begin with what is in the output. To be added afterwards they leave the registers, and what was just stored is
-    /// slow to read; where rows of the output overlap, as those of a convolution's gradient do, they are.
+    /// Whether the accumulators start from the output's values. Adding afterwards is slower, because it reads memory
+    /// that was just stored. If output rows overlap, as in a convolution's gradient, the sums are added afterwards.
     #[inline(always)]
     fn begin_with_output(tile: &RawTile<bf16>) -> bool {
         tile.mode == Mode::Add && tile.out_stride >= tile.cols
     }
 
     /// # Safety
-    /// The output has them, as far as `tile.cols` goes.
+    /// The output has these rows and columns, up to `tile.cols`.
     #[inline(always)]
     unsafe fn load<T: Tiles>(&self, tiles: &mut T, tile: &RawTile<bf16>) {
         if !Self::begin_with_output(tile) {
@@ -306,12 +306,12 @@ impl Sums {
         }
         for (sums, out, cols) in self.places(tile) {
             if cols == LANES {
-                // SAFETY: the caller's.
+                // SAFETY: guaranteed by the caller.
                 unsafe { tiles.load_sums(sums, out, tile.out_stride * 4) }
             } else if cols > 0 {
                 let mut block = Block([[0.0; LANES]; ROWS]);
                 for (row, to) in block.0.iter_mut().enumerate().take(self.rows.1) {
-                    // SAFETY: the caller's.
+                    // SAFETY: guaranteed by the caller.
                     let from = unsafe { from_raw_parts(out.add(row * tile.out_stride), cols) };
                     to[..cols].copy_from_slice(from);
                 }
@@ -321,17 +321,17 @@ impl Sums {
         }
     }
 
-    /// Writes them, or adds them if they were to be added and did not begin with the output.
+    /// Writes the accumulators, or adds them if the mode is `Add` and they did not start from the output.
     ///
     /// # Safety
     /// As for `load`.
     #[inline(always)]
     unsafe fn store<T: Tiles>(&self, tiles: &mut T, tile: &RawTile<bf16>) {
         let replaces = tile.mode == Mode::Replace || Self::begin_with_output(tile);
-        // All of them first: what was just stored is slow to read.
+        // All registers are stored first, because memory that was just stored is slow to read.
         let mut blocks = [const { MaybeUninit::<Block<f32>>::uninit() }; SUMS];
         for ((sums, out, cols), block) in self.places(tile).zip(&mut blocks) {
-            // SAFETY: the caller's; a block has room for a register.
+            // SAFETY: guaranteed by the caller; a block has room for a register.
             unsafe {
                 match replaces && cols == LANES {
                     true => tiles.store(sums, out, tile.out_stride * 4),
@@ -344,14 +344,14 @@ impl Sums {
                 continue;
             }
             for row in 0..self.rows.1 {
-                // SAFETY: so many rows were stored; the output is exclusively borrowed by the tile.
+                // SAFETY: `self.rows.1` rows were stored; the tile borrows the output exclusively.
                 unsafe {
                     let sums = &*block.as_ptr().cast::<[f32; LANES]>().add(row);
                     let out = from_raw_parts_mut(out.add(row * tile.out_stride), cols);
                     if replaces {
                         out.copy_from_slice(&sums[..cols]);
                     } else if let Ok(out) = <&mut [f32; LANES]>::try_from(&mut *out) {
-                        // A length that is known is one instruction.
+                        // A known length compiles to one instruction.
                         add(out, sums);
                     } else {
                         add(out, sums);

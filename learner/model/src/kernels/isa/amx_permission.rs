@@ -1,11 +1,11 @@
-//! Whether there is AMX for bf16, and leave from the kernel to use its registers.
-//! It knows no tile.
+//! Detects AMX for bf16, and asks the kernel for permission to use its registers.
+//! This module knows no tiles.
 #![allow(unsafe_code, reason = "a system call")]
 #![cfg(target_arch = "x86_64")]
 
 use std::arch::asm;
 
-/// CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. That the operating system knows tiles is asked by `granted`.
+/// Reads CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. `granted` checks that the operating system supports tiles.
 #[allow(
     unused_unsafe,
     reason = "the instruction is unsafe in Rust 1.90 and safe in later ones"
@@ -17,7 +17,7 @@ pub(super) fn has_amx_bf16() -> bool {
     leaf_7.is_some_and(|it| it.edx & (1 << 22) != 0 && it.edx & (1 << 24) != 0)
 }
 
-/// Asks Linux for the 8 KiB of state that tiles are (`arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)`), for all threads.
+/// Asks Linux for the 8 KiB of tile state (`arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)`), for all threads.
 #[cfg(target_os = "linux")]
 pub(super) fn granted() -> bool {
     const ARCH_PRCTL: i64 = 158;

@@ -1,5 +1,5 @@
-//! AMX's tile registers, as a trait: what holds operands and sums, and the instructions that multiply them.
-//! It cuts no product into tiles.
+//! AMX's tile registers as a trait: they hold operands and accumulators, and instructions multiply them.
+//! This module does not cut products into tiles.
 #![allow(unsafe_code, reason = "instructions of one kind of processor")]
 #![cfg(target_arch = "x86_64")]
 
@@ -13,24 +13,24 @@ use super::simd::LANES;
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
 pub(super) const STEPS: usize = 16;
 pub(super) const ROWS: usize = 16;
-/// Tile registers that hold sums.
+/// The number of tile registers that serve as accumulators.
 pub(super) const SUMS: usize = 4;
 
-/// Eight tile registers: four of sums, and a left and a right operand, each twice: for whole runs of `STEPS`, and for what is left.
+/// Eight tile registers: four accumulators, and a left and a right operand, each twice: for `STEPS` steps and for the remaining steps.
 ///
 /// # Safety
-/// Of all methods: `configure` came before, pointers may be read or written as the sizes given to it say, and the processor has
-/// what the implementation needs.
+/// For all methods: `configure` was called before, pointers may be read or written for the sizes given to it,
+/// and the processor has the instructions that the implementation uses.
 pub(super) trait Tiles {
-    /// Sizes: left operands [rows, steps], right ones [steps, 16], sums [rows, 16]; `tail` steps in the second pair of operands, 0 if
-    /// there are none. Sums are 0 afterwards.
+    /// Sets the sizes: left operands [rows, steps], right ones [steps, 16], accumulators [rows, 16]. The
+    /// second pair of operands has `tail` steps, 0 if there are none. The accumulators are 0 afterwards.
     unsafe fn configure(&mut self, rows: usize, tail: usize);
-    /// Strides are in bytes.
+    /// Loads a left operand. Strides are in bytes.
     unsafe fn load_left(&mut self, at: *const bf16, stride: usize, tail: bool);
     unsafe fn load_right(&mut self, at: *const bf16, stride: usize, tail: bool);
-    /// Adds left times right to the sums of this number.
+    /// Adds left times right to the accumulator with this index.
     unsafe fn dot(&mut self, sums: usize, tail: bool);
-    /// Sums that begin with what is at `at`.
+    /// Sets an accumulator to the values at `at`.
     unsafe fn load_sums(&mut self, sums: usize, at: *const f32, stride: usize);
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize);
 }
@@ -38,11 +38,11 @@ pub(super) trait Tiles {
 pub(super) struct Hardware;
 
 thread_local! {
-    /// Rows and tail that the thread's registers are configured for, as that takes as long as ten products.
+    /// The rows and tail that this thread's registers are configured for. Configuring takes as long as ten products.
     static SIZES: Cell<(usize, usize)> = const { Cell::new((0, 0)) };
 }
 
-/// What `ldtilecfg` reads.
+/// The operand of `ldtilecfg`.
 #[repr(C, align(64))]
 struct TileConfig {
     palette: u8,
@@ -85,8 +85,8 @@ macro_rules! store {
     };
 }
 
-// SAFETY of all: the caller answers for pointers and processor. Between the calls nothing else uses tile registers: compilers
-// do not without being told to, and every user of this module configures them anew.
+// SAFETY for all methods: the caller guarantees the pointers and the processor. Between the calls nothing else uses
+// tile registers: compilers use them only when told to, and every user of this module configures them again.
 impl Tiles for Hardware {
     unsafe fn configure(&mut self, rows: usize, tail: usize) {
         if SIZES.replace((rows, tail)) == (rows, tail) {
@@ -104,7 +104,7 @@ impl Tiles for Hardware {
             rows: [0; 16],
         };
         let mut set = |tile: usize, rows: usize, columns: usize| {
-            // At most 16 and 64.
+            // At most 16 rows and 64 bytes.
             (config.rows[tile], config.row_bytes[tile]) = (rows as u8, (columns * 4) as u16);
         };
         for sums in 0..SUMS {

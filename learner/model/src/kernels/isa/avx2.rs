@@ -1,4 +1,4 @@
-//! AVX2: 8 f32 products an instruction, on f32 operands or on bf16 ones that are widened first.
+//! AVX2: 8 f32 products an instruction. bf16 operands are widened to f32 first.
 #![allow(unsafe_code, reason = "instructions of one kind of processor")]
 #![cfg(target_arch = "x86_64")]
 
@@ -26,7 +26,7 @@ pub(crate) struct Bf16(());
 macro_rules! simd {
     ($simd:ident, $element:ty) => {
         impl $simd {
-            /// It, if this processor and the operating system have AVX2 and fused multiplication and addition.
+            /// Returns the instruction set if the processor and the operating system have AVX2 and fused multiply-add.
             pub(super) fn new() -> Option<Self> {
                 let there = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
                 there.then_some(Self(()))
@@ -49,7 +49,7 @@ macro_rules! simd {
             }
 
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                // SAFETY: `new` found the instructions; the rest is the caller's.
+                // SAFETY: `new` found the instructions; the caller guarantees the rest.
                 unsafe { Self::compute_sized(tile, rows, vecs) }
             }
 
@@ -78,7 +78,7 @@ impl Sums for [__m256; 2] {
 
     #[inline(always)]
     unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
-        // SAFETY: whole registers where the caller vouches for 16 scalars; else only the first `count` are touched.
+        // SAFETY: whole registers are accessed only if `count` is 16, else only the first `count` scalars.
         unsafe {
             if count == LANES {
                 for (half, sums) in self.into_iter().enumerate() {
@@ -103,7 +103,7 @@ impl Sums for [__m256; 2] {
     }
 }
 
-// SAFETY of both: loads and stores are of the addresses that the caller vouches for; none of them asks for alignment.
+// SAFETY for both: loads and stores use addresses that the caller guarantees. None of them needs alignment.
 
 impl Vector for F32 {
     type Element = f32;
@@ -179,7 +179,7 @@ impl Vector for Bf16 {
 
     #[inline(always)]
     unsafe fn mul_add(sums: [__m256; 2], row: [__m256i; 2], columns: [__m256i; 2]) -> [__m256; 2] {
-        // No closure: it may be compiled without AVX2, and each instruction is then a call.
+        // No closure: it could be compiled without AVX2, and each instruction would then be a call.
         unsafe {
             [
                 mul_add_pairs(sums[0], row[0], columns[0]),

@@ -19,7 +19,7 @@ use super::{
     vector::{Sums, Vector, compute_sizes},
 };
 
-/// Whether this processor, and the operating system, have AVX-512 as server processors do.
+/// Whether the processor and the operating system have the AVX-512 extensions of server processors.
 fn is_there() -> bool {
     is_x86_feature_detected!("avx512f")
         && is_x86_feature_detected!("avx512bw")
@@ -42,13 +42,13 @@ impl F32 {
 }
 
 impl Bf16 {
-    /// It, if this processor has AVX512_BF16 beside AVX-512.
+    /// Returns the instruction set if the processor has AVX512_BF16 in addition to AVX-512.
     pub(super) fn new() -> Option<Self> {
         (is_there() && is_x86_feature_detected!("avx512bf16")).then_some(Self(()))
     }
 }
 
-/// Most rows of a tile: its sums, its columns and one row fit into the 32 registers.
+/// Most rows of a tile. The accumulators, the columns and one row must fit into the 32 registers.
 const fn rows_max(vecs: usize) -> usize {
     match vecs {
         1 => 16,
@@ -68,7 +68,7 @@ macro_rules! simd {
             }
 
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                // SAFETY: `new` found the instructions; the rest is the caller's.
+                // SAFETY: `new` found the instructions; the caller guarantees the rest.
                 unsafe { Self::compute_sized(tile, rows, vecs) }
             }
 
@@ -112,7 +112,7 @@ simd!(
 
 impl Rounding for F32 {}
 
-/// [`Rounding`] for an instruction set that has AVX512_BF16.
+/// Implements [`Rounding`] for an instruction set with AVX512_BF16.
 macro_rules! bf16_rounding {
     ($simd:ty) => {
         impl Rounding for $simd {
@@ -152,7 +152,7 @@ pub(super) use bf16_rounding;
 
 bf16_rounding!(Bf16);
 
-/// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
+/// Transposes 16 registers of 16 words: exchanges 32-bit words, pairs of them, then quarters of registers twice.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
 unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
@@ -167,7 +167,7 @@ unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
             _mm512_unpackhi_epi32(a, b)
         }
     });
-    // Of four rows, columns 4 q + at % 4 in quarter q.
+    // Each register holds four rows, with columns 4 q + at % 4 in quarter q.
     let fours: [__m512i; LANES] = std::array::from_fn(|at| {
         let first = (at & !3) + (at & 2) / 2;
         let (a, b) = (pairs[first], pairs[first + 2]);
@@ -179,7 +179,7 @@ unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
     });
     let column = |at: usize| at & 3;
     let eights: [__m512i; LANES] = std::array::from_fn(|at| {
-        // Rows 0..8 for at < 8, else 8..16; of quarters 0 and 2, or 1 and 3.
+        // Holds rows 0..8 for at < 8, else 8..16, and quarters 0 and 2, or 1 and 3.
         let first = at / 8 * 8 + column(at);
         let (a, b) = (fours[first], fours[first + 4]);
         if at & 4 == 0 {
@@ -212,7 +212,7 @@ impl Sums for __m512 {
     unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
         debug_assert!(count <= LANES);
         let mask = first_lanes(count);
-        // SAFETY: the lanes that the mask leaves out are neither read nor written; the caller answers for the others.
+        // SAFETY: the mask excludes lanes that must not be accessed; the caller guarantees the others.
         unsafe {
             let sums = if add {
                 _mm512_add_ps(_mm512_maskz_loadu_ps(mask, at), self)
@@ -224,7 +224,7 @@ impl Sums for __m512 {
     }
 }
 
-// SAFETY of both: loads and stores are of the addresses that the caller vouches for; none of them asks for alignment.
+// SAFETY for both: loads and stores use addresses that the caller guarantees. None of them needs alignment.
 
 impl Vector for F32 {
     type Element = f32;
@@ -264,9 +264,9 @@ impl Vector for Bf16 {
 
     #[inline(always)]
     unsafe fn mul_add(sums: __m512, row: __m512i, columns: __m512i) -> __m512 {
-        // The row is last: that operand the instruction can broadcast from memory. A separate broadcast takes a third of the loop's
-        // time.
-        // SAFETY: two names of one register of 32 bf16.
+        // The row is the last argument, because the instruction can broadcast that one from memory. A
+        // separate broadcast takes a third of the loop's time.
+        // SAFETY: both types are one register of 32 bf16.
         unsafe {
             _mm512_dpbf16_ps(
                 sums,

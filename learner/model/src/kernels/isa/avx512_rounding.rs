@@ -1,4 +1,4 @@
-//! AVX512_BF16: what `Rounding` asks of an instruction set, 16 or 32 scalars at a time.
+//! AVX512_BF16: the methods of `Rounding`, 16 or 32 scalars at a time.
 //! It multiplies nothing: `avx512` does.
 #![allow(unsafe_code, reason = "instructions of one kind of processor")]
 #![cfg(target_arch = "x86_64")]
@@ -36,7 +36,7 @@ pub(super) unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
     }
     for (part, to) in tail.chunks(LANES).zip(to_tail.chunks_mut(LANES)) {
         let mask = first_lanes(part.len());
-        // SAFETY: the mask leaves out what lies beyond the slices, which are as long as each other and at most a register.
+        // SAFETY: the mask excludes what lies beyond the slices, which are equally long and at most a register.
         unsafe {
             let words = _mm512_cvtneps_pbh(_mm512_maskz_loadu_ps(mask, part.as_ptr()));
             let words = transmute::<__m256bh, __m256i>(words);
@@ -49,7 +49,7 @@ pub(super) unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 pub(super) unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-    // Word i of a pair's register is i / 2 of the first row's words, 0 to 15, or of the second's, 16 to 31.
+    // Word i of a register of pairs is word i / 2 of the first row (words 0 to 15) if i is even, else of the second (16 to 31).
     const ORDER: [u16; 2 * LANES] = {
         let mut order = [0; 2 * LANES];
         let mut at = 0;
@@ -62,7 +62,7 @@ pub(super) unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [b
     // SAFETY: `ORDER` is the 64 bytes of a register.
     let order = unsafe { _mm512_loadu_si512(ORDER.as_ptr().cast()) };
     let interleaved = |first: __m512, second: __m512| {
-        // SAFETY: two names of one register of 32 bf16.
+        // SAFETY: both types are one register of 32 bf16.
         let words = unsafe { transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(second, first)) };
         _mm512_permutexvar_epi16(order, words)
     };
@@ -85,7 +85,7 @@ pub(super) unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [b
     if !first_tail.is_empty() {
         let mask = first_lanes(first_tail.len());
         let words_mask = ((1u64 << (2 * first_tail.len())) - 1) as u32;
-        // SAFETY: the masks leave out what lies beyond the slices, fewer than `LANES` columns of each row.
+        // SAFETY: the masks exclude what lies beyond the slices. Each row has fewer than `LANES` columns left.
         unsafe {
             let words = interleaved(
                 _mm512_maskz_loadu_ps(mask, first_tail.as_ptr()),
@@ -100,7 +100,7 @@ pub(super) unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [b
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 pub(super) unsafe fn paired(first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
-    // Word i of the first or second register of pairs is word i / 2, or 16 + i / 2, of the first row's, 0 to 31, or of the second's.
+    // Word i of the first (second) register of pairs is word i / 2 (16 + i / 2) of the first row if i is even, else of the second.
     const ORDERS: [[u16; 2 * LANES]; 2] = {
         let mut orders = [[0; 2 * LANES]; 2];
         let mut at = 0;
@@ -137,7 +137,7 @@ pub(super) unsafe fn paired(first: &[bf16], second: &[bf16], pairs: &mut [bf16])
     }
 }
 
-/// The f32 of 16 bytes, whose lower 16 bits are 0.
+/// Converts 16 bytes to f32, whose lower 16 bits are 0.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 unsafe fn floats_of(bytes: &[u8; LANES]) -> __m512 {
@@ -157,7 +157,7 @@ pub(super) unsafe fn of_bytes(bytes: &[u8], to: &mut [bf16]) {
         let [low, high] = block.as_chunks::<LANES>().0 else {
             unreachable!("two halves")
         };
-        // SAFETY: what 32 bytes become is a register of bf16.
+        // SAFETY: 32 bytes become one register of bf16.
         unsafe {
             let words = _mm512_cvtne2ps_pbh(floats_of(high), floats_of(low));
             let words = transmute::<__m512bh, __m512i>(words);
@@ -179,7 +179,7 @@ pub(super) unsafe fn paired_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16
     let (second_blocks, second_tail) = second[..columns].as_chunks::<LANES>();
     let (pair_blocks, pair_tail) = pairs.as_chunks_mut::<{ 2 * LANES }>();
     for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
-        // SAFETY: what 16 bytes of either row become is a register of pairs.
+        // SAFETY: 16 bytes of each row become one register of pairs.
         unsafe {
             let first = _mm512_srli_epi32::<16>(_mm512_castps_si512(floats_of(first)));
             let second = _mm512_castps_si512(floats_of(second));
@@ -193,7 +193,7 @@ pub(super) unsafe fn paired_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16
     }
 }
 
-/// A mask of the first `count` of 16 lanes.
+/// Returns a mask of the first `count` of 16 lanes.
 #[inline(always)]
 pub(super) const fn first_lanes(count: usize) -> u16 {
     ((1u32 << count) - 1) as u16

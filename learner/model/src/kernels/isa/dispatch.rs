@@ -24,7 +24,7 @@ pub(crate) enum AnySimd {
     EmulatedAmx(super::emulated::EmulatedAmx),
 }
 
-/// `with_simd!(simd, s => expression)`: the expression, with `s` as the instruction set of its concrete type.
+/// `with_simd!(simd, s => expression)` evaluates the expression with `s` bound to the instruction set, of its concrete type.
 macro_rules! with_simd {
     ($simd:expr, $typed:ident => $body:expr) => {
         match $simd {
@@ -47,10 +47,10 @@ macro_rules! with_simd {
 }
 pub(crate) use with_simd;
 
-/// Makes one where the processor has its instructions.
+/// Returns an instruction set if the processor has its instructions.
 type Candidate = fn() -> Option<AnySimd>;
 
-/// The instruction sets of a precision, the fastest first; the last one runs anywhere.
+/// The instruction sets for each precision, fastest first. The last one runs anywhere.
 const F32: &[Candidate] = &[
     #[cfg(target_arch = "x86_64")]
     || avx512::F32::new().map(AnySimd::Avx512F32),
@@ -69,7 +69,7 @@ const BF16: &[Candidate] = &[
 ];
 
 impl AnySimd {
-    /// The fastest one that this processor has for `precision`.
+    /// Returns the fastest instruction set that this processor has for `precision`.
     pub(crate) fn of(precision: Precision) -> Self {
         let mut all = Self::there(precision);
         all.next().expect("portable code runs anywhere")
@@ -83,7 +83,7 @@ impl AnySimd {
         candidates.iter().filter_map(|candidate| candidate())
     }
 
-    /// Every one that can be had here, the emulated one included.
+    /// Returns every instruction set that runs here, including the emulated one.
     #[cfg(test)]
     pub(crate) fn every(precision: Precision) -> Vec<Self> {
         #[allow(unused_mut, reason = "only x86-64 has an emulated one")]
@@ -126,7 +126,7 @@ pub fn is_bf16_fast() -> bool {
     }
 }
 
-/// What products of this precision run on here, in words: for `driml doctor` and the head of a table of figures.
+/// Describes the instruction set for products of this precision, for `driml doctor` and the heads of tables.
 pub fn describe_kernels(precision: Precision) -> &'static str {
     AnySimd::of(precision).describe()
 }
@@ -139,8 +139,8 @@ mod tests {
     use crate::kernels::isa::element::Rounding;
     use crate::kernels::isa::{Columns, Element, LANES, Left, Mode, Simd, multiply_tile};
 
-    /// Compares a tile of ones plus, or else, a product with a plain sum; whether the instruction set has such a tile. `rows_inside` says
-    /// whether a row's steps lie apart, and the rows side by side.
+    /// Compares a tile, written or added to ones, with a plain sum. Returns whether the instruction set has this
+    /// size of tile. With `rows_inside` the rows are adjacent and a row's steps are apart, else the reverse.
     fn check_tile<S: Simd>(
         simd: S,
         [rows, vecs]: [usize; 2],
@@ -154,7 +154,7 @@ mod tests {
         }
         let depth = S::Element::DEPTH;
         let (k, width) = (steps * depth, vecs * LANES);
-        // Two runs of `k` terms a row, all in one piece.
+        // Two runs of `k` terms a row.
         let (row_stride, step, run_stride) = if rows_inside {
             (depth, depth * rows, rows * k)
         } else {
@@ -233,7 +233,7 @@ mod tests {
         assert!(tried >= 2 * 3 * 4, "{tried} tiles");
     }
 
-    /// Lengths that fill no register; values over the whole of the float space, subnormals and what is not finite included.
+    /// Lengths that do not fill registers; values from the whole range of f32, including subnormals, infinities and NaN.
     #[test]
     fn every_instruction_set_rounds_to_the_nearest_and_puts_scalars_in_pairs() {
         let nearest = |value: f32| bf16::from_f32(value).to_f32();
@@ -257,7 +257,7 @@ mod tests {
             Some(f32::from_bits(bits))
         });
         for value in special.clone().chain(walk.by_ref().take(1_000_000)) {
-            // Exact also where it is subnormal.
+            // Subnormals are exact too.
             let (got, wanted) = (bf16::of(value).to_f32(), nearest(value));
             let is_nearest = got.to_bits() == wanted.to_bits();
             assert!(
@@ -275,7 +275,7 @@ mod tests {
             let bytes = |by: usize| (0..len).map(move |at| (at * by % 256) as u8);
             let [first_bytes, second_bytes] = [31, 7].map(|by| bytes(by).collect::<Vec<_>>());
             for simd in AnySimd::every(Precision::Bf16) {
-                // What lies beyond is left alone.
+                // Elements beyond the results must not change.
                 let [mut rounded, mut of_first, mut of_second] =
                     [(); 3].map(|()| vec![bf16::NEG_ONE; len + 3]);
                 let [mut pairs, mut joined, mut of_bytes] =

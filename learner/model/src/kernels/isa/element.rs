@@ -1,5 +1,5 @@
-//! What operands of products are stored as: f32, or bf16 in pairs along the sum.
-//! It multiplies nothing.
+//! The types in which operands of products are stored: f32, or bf16 in pairs along the reduction axis.
+//! This module multiplies nothing.
 
 use half::bf16;
 
@@ -8,10 +8,10 @@ use crate::kernels::buffer::Pooled;
 /// Columns of one register, on every instruction set.
 pub(crate) const LANES: usize = 16;
 
-/// Instructions that round, and that put scalars in pairs.
+/// Instructions that round scalars and interleave them in pairs.
 pub(crate) trait Rounding: Copy {
-    /// The nearest bf16 of each of `values`, ties to even, into the first of `to`. A subnormal may become a 0 of its sign, which is
-    /// what products with these instructions take it for.
+    /// Rounds `values` to the nearest bf16, ties to even, into the first elements of `to`. A subnormal may
+    /// become a 0 of its sign, because products with these instructions treat it as 0.
     #[inline(always)]
     fn round(self, values: &[f32], to: &mut [bf16]) {
         for (to, &value) in to.iter_mut().zip(values) {
@@ -19,7 +19,7 @@ pub(crate) trait Rounding: Copy {
         }
     }
 
-    /// As [`Rounding::round`], of two rows as pairs: `pairs` [columns, 2].
+    /// Rounds two rows as [`Rounding::round`] and interleaves them: `pairs` [columns, 2].
     #[inline(always)]
     fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
         for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
@@ -27,7 +27,7 @@ pub(crate) trait Rounding: Copy {
         }
     }
 
-    /// Two rows that are rounded already, as long as each other, as pairs: `pairs` [columns, 2].
+    /// Interleaves two rows of bf16 of equal length: `pairs` [columns, 2].
     #[inline(always)]
     fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
         for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
@@ -35,7 +35,7 @@ pub(crate) trait Rounding: Copy {
         }
     }
 
-    /// Pixels as [`Element::of_byte`], into the first of `to`.
+    /// Converts pixels as [`Element::of_byte`], into the first elements of `to`.
     #[inline(always)]
     fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
         for (to, &byte) in to.iter_mut().zip(bytes) {
@@ -43,7 +43,7 @@ pub(crate) trait Rounding: Copy {
         }
     }
 
-    /// As [`Rounding::pair`], of pixels.
+    /// Converts two rows of pixels and interleaves them, as [`Rounding::pair`].
     #[inline(always)]
     fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
         for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
@@ -53,47 +53,47 @@ pub(crate) trait Rounding: Copy {
 }
 
 pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
-    /// Neighbours along the sum that are stored together, and multiplied in one step.
+    /// Neighbouring scalars along the reduction axis that are stored together and multiplied in one step.
     const DEPTH: usize;
 
-    /// What products of bytes stored by [`Element::of_byte`] are multiplied by, to be products of bytes / 255.
+    /// The factor that turns products of bytes stored by [`Element::of_byte`] into products of byte / 255.
     const BYTE_SCALE: f32;
 
-    /// The nearest element, ties to even.
+    /// Rounds to the nearest element, ties to even.
     fn of(value: f32) -> Self;
 
-    /// Stores `values` as [`Element::of`] in `to`, which is as long, with the instructions of `simd`.
+    /// Rounds `values` as [`Element::of`] into `to`, which has the same length, with the instructions of `rounding`.
     fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]);
 
-    /// A pixel: times [`Element::BYTE_SCALE`] it is the byte / 255.
+    /// Converts a pixel. The result times [`Element::BYTE_SCALE`] is byte / 255.
     fn of_byte(byte: u8) -> Self;
 
     fn value(self) -> f32;
 
-    /// Stores `DEPTH` rows that follow each other along the sum: `step` [columns, DEPTH], with 0 for what the rows do not have.
-    /// `second` is for a depth of 2.
+    /// Interleaves `DEPTH` rows that follow each other along the reduction axis: `step` [columns, DEPTH],
+    /// with 0 where the rows end. `second` is used only if `DEPTH` is 2.
     fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]);
 
-    /// `LANES` steps of `values`, [`LANES`, DEPTH], each as 32 bits.
+    /// Rounds `values` [`LANES`, DEPTH] to `LANES` steps of 32 bits each.
     fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]);
 
-    /// Pixels as [`Element::of_byte`], into the first of `to`.
+    /// Converts pixels as [`Element::of_byte`], into the first elements of `to`.
     fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]);
 
-    /// Pixels as [`Element::of_byte`], each with the one `shift` further if `DEPTH` is 2, or with 0 where they end before:
-    /// `steps` [pixels, DEPTH].
+    /// Converts pixels as [`Element::of_byte`]. If `DEPTH` is 2, each is paired with the one `shift` further,
+    /// or with 0 beyond the end: `steps` [pixels, DEPTH].
     fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]);
 
-    /// The same of elements.
+    /// As [`Element::steps_of_bytes`], for elements.
     fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
 
-    /// The scalars of a step [DEPTH] as 32 bits.
+    /// Packs the scalars of a step [DEPTH] into 32 bits.
     fn pack(step: &[Self]) -> u32;
 
-    /// The scalars of a step, into `step` [DEPTH].
+    /// Unpacks the scalars of a step into `step` [DEPTH].
     fn unpack(bits: u32, step: &mut [Self]);
 
-    /// Scalars that need no rounding, as they are.
+    /// Returns `values` themselves if they need no rounding.
     fn in_place(values: &[f32]) -> Option<&[Self]>;
 }
 
@@ -169,10 +169,10 @@ impl Element for f32 {
 
 impl Element for bf16 {
     const DEPTH: usize = 2;
-    /// Every byte is a bf16, so that pixels lose nothing if they are scaled after the product.
+    /// Every byte is exact in bf16, so pixels lose nothing if they are scaled after the product.
     const BYTE_SCALE: f32 = 1.0 / 255.0;
 
-    /// As `bf16::from_f32`, without its branch, so that loops over it use the instruction set's registers.
+    /// As `bf16::from_f32`, but without a branch, so that loops over it are vectorised.
     #[inline(always)]
     fn of(value: f32) -> Self {
         let bits = value.to_bits();

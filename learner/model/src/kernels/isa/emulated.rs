@@ -1,4 +1,4 @@
-//! Tiles in plain Rust, which do what AMX's instructions do: for tests on any processor.
+//! AMX's tile registers emulated in plain Rust, for tests on any processor.
 #![allow(unsafe_code, reason = "tiles are read and written through pointers")]
 #![cfg(all(test, target_arch = "x86_64"))]
 
@@ -33,7 +33,7 @@ impl Registers {
     }
 }
 
-/// Rows of as many pairs as `to` has columns, so many bytes apart.
+/// Loads rows of `cols` pairs each, `stride` bytes apart.
 unsafe fn load<const N: usize>(at: *const bf16, stride: usize, to: &mut [[u32; N]], cols: usize) {
     for (row, to) in to.iter_mut().enumerate() {
         for (col, to) in to.iter_mut().enumerate().take(cols) {

@@ -1,4 +1,4 @@
-//! What a processor multiplies with: the instruction sets that products can run on, and the choice among them at run time.
+//! The instruction sets that products can run on, and the choice among them at run time.
 //! It knows neither matrices nor layers: an instruction set computes one tile, a few rows by a few columns, in registers.
 
 mod amx;

@@ -1,5 +1,5 @@
-//! The most that a processor multiplies: a tile whose operands do not leave the first cache, over and over.
-//! It is what the kernels are held against, and computes nothing that is wanted.
+//! The peak multiplication rate of a processor: one tile whose operands stay in the L1 cache, over and over.
+//! Benchmarks compare the kernels with this rate. The product itself is not used.
 
 use rayon::prelude::*;
 
@@ -12,10 +12,10 @@ use super::{
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
 
-/// Scalars along the sum: with a panel of one register of columns 16 KiB of f32.
+/// Scalars along the reduction axis. A panel one register wide then takes 16 KiB in f32.
 const DEPTH: usize = 256;
 
-/// Multiplies the tallest tile that is a register wide so many times on every thread of the pool; the FLOPs that these are.
+/// Multiplies the tallest tile that is one register wide `times` times on every thread of the pool. Returns the FLOPs of all of them.
 pub fn multiply_in_first_cache(precision: Precision, times: usize) -> f64 {
     with_simd!(AnySimd::of(precision), simd => multiply(simd, times))
 }

@@ -1,4 +1,4 @@
-//! Portable code for processors that have none of the other instruction sets, which the compiler vectorises as far as it can.
+//! Portable code for processors without the other instruction sets. The compiler vectorises it as far as it can.
 
 use half::bf16;
 
@@ -29,7 +29,7 @@ macro_rules! simd {
             }
 
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                // SAFETY: it takes no special instruction; the rest is the caller's.
+                // SAFETY: no special instruction is needed; the caller guarantees the rest.
                 compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4;);
             }
 
@@ -39,7 +39,7 @@ macro_rules! simd {
             }
         }
 
-        // SAFETY: reads and writes are of the addresses that the caller vouches for.
+        // SAFETY: reads and writes use addresses that the caller guarantees.
         #[allow(unsafe_code, reason = "tiles are read and written through pointers")]
         impl Vector for $simd {
             type Element = $element;
@@ -73,7 +73,7 @@ macro_rules! simd {
     };
 }
 
-// SAFETY: writes are to the addresses that the caller vouches for.
+// SAFETY: writes use addresses that the caller guarantees.
 #[allow(unsafe_code, reason = "tiles are read and written through pointers")]
 impl Sums for [f32; LANES] {
     #[inline(always)]

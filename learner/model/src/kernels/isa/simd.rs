@@ -1,23 +1,23 @@
-//! What an instruction set must be able to do: compute one tile of a product in registers.
-//! It names none; the choice is in `dispatch`.
+//! The interface of an instruction set: it computes one tile of a product in registers.
+//! This module names no instruction set; `dispatch` chooses one.
 
 pub(crate) use super::element::LANES;
 use super::element::{Element, Rounding};
 
-/// What a product does to the output's old content.
+/// What a product does with the old content of the output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mode {
     /// out = a b
     Replace,
-    /// out = out + a b, row after row, so that rows of the output may overlap. Where they do not, an instruction set may begin the
-    /// sum with `out`.
+    /// out = out + a b, row after row, so that rows of the output may overlap. If they do not, an instruction
+    /// set may start its accumulators from `out`.
     Add,
 }
 
-/// A tile as the instruction sets take it.
+/// A tile in the form that instruction sets take.
 ///
-/// `left` may be read at row * row_stride + run * run_stride + step * step_len for every row, run and step, `DEPTH` scalars each;
-/// `panel` holds runs * steps * vecs * LANES * DEPTH scalars; `out` may be read and written at row * out_stride, `cols` scalars each.
+/// `left` may be read at row * row_stride + run * run_stride + i * step, i < steps, for every row and run, `DEPTH` scalars each.
+/// `panel` holds runs * steps * vecs * LANES * DEPTH scalars. `out` may be read and written at row * out_stride, `cols` scalars each.
 pub(crate) struct RawTile<E> {
     pub(super) left: *const E,
     pub(super) row_stride: usize,
@@ -32,29 +32,29 @@ pub(crate) struct RawTile<E> {
     pub(super) mode: Mode,
 }
 
-/// An instruction set, with the type that its operands are stored as. Sums are f32.
+/// An instruction set, with the type in which it stores operands. Sums are f32.
 ///
-/// A value exists only where the processor has its instructions: `new` looks before it makes one.
+/// A value exists only if the processor has the instructions: `new` checks that first.
 pub(crate) trait Simd: Rounding + Send + Sync + 'static {
     type Element: Element;
 
-    /// Most registers of columns in a tile.
+    /// Largest width of a tile, in registers of columns.
     const VECS_MAX: usize;
 
-    /// Steps of a panel that are multiplied by all rows of a task before the next: 32 KiB of the widest panel.
+    /// Steps of a panel that all rows of a task are multiplied by before the next steps: 32 KiB of the widest panel.
     const STEPS_IN_CACHE: usize = 128;
 
-    /// Whether steps of a left operand are best side by side, even where copying them so means to transpose it, and begin with a line
-    /// of the cache.
+    /// Whether a left operand's steps should be adjacent, and its rows begin on cache lines, even if packing
+    /// has to transpose the operand.
     const LEFT_STEPS_ADJOIN: bool = false;
 
-    /// Most rows of a tile that is `vecs` registers wide.
+    /// Largest number of rows of a tile that is `vecs` registers wide.
     fn rows_max(vecs: usize) -> usize;
 
     /// Computes a tile of `rows` by `vecs` registers.
     ///
     /// # Safety
-    /// All that `tile` points to is as [`RawTile`] says; `rows` and `vecs` are within the limits above.
+    /// `tile` fulfils the conditions of [`RawTile`]; `rows` and `vecs` are within the limits above.
     #[allow(unsafe_code, reason = "implemented with the processor's instructions")]
     unsafe fn compute(self, tile: &RawTile<Self::Element>, rows: usize, vecs: usize);
 
@@ -66,19 +66,19 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
         *block = turned;
     }
 
-    /// Runs `work` compiled for these instructions, so that its loops use its registers.
+    /// Runs `work`, compiled for these instructions, so that its loops use the vector registers.
     fn vectorize<W: Loop>(self, work: W);
 }
 
 /// Loops over slices, made by `vectorized!`.
 pub(crate) trait Loop {
-    /// Runs them. `#[inline(always)]`, as a separate function or a closure would be compiled without the extensions.
+    /// Runs the loops. Must be `#[inline(always)]`, because a separate function or a closure is compiled without the extensions.
     fn run(self);
 }
 
-/// Defines a function whose body is compiled for the instruction set that is its first argument.
+/// Defines a function whose body is compiled for the instruction set in its first argument.
 ///
-/// `fn name<S>(simd, argument: &'a [S::Element], ..) { .. }`; further type parameters are elements, and references live for `'a`.
+/// `fn name<S>(simd, argument: &'a [S::Element], ..) { .. }`; further type parameters are elements, and references have the lifetime `'a`.
 macro_rules! vectorized {
     (
         $(#[$meta:meta])*

@@ -1,15 +1,15 @@
-//! One tile of a matrix product: what it reads and writes, checked before an instruction set computes it.
-//! It does not cut matrices into tiles.
+//! One tile of a matrix product: its operands and output are checked before an instruction set computes it.
+//! This module does not cut matrices into tiles.
 
 use super::{
     element::Element,
     simd::{LANES, Mode, RawTile, Simd},
 };
 
-/// The left operand of a tile: rows at a fixed distance, whose scalars along the sum lie in runs of steps.
+/// The left operand of a tile: rows at a fixed distance. Along the reduction axis, each row consists of runs of steps.
 ///
-/// A step is [`Element::DEPTH`] neighbours. The rows of a matrix are one run each; the windows of an image are a run for each
-/// row of the kernel, so that they need not be copied out.
+/// A step is [`Element::DEPTH`] neighbouring scalars. A matrix row is one run. An image window has one run
+/// for each row of the kernel, so that windows need not be copied.
 #[derive(Clone, Copy)]
 pub(crate) struct Left<'a, E> {
     pub(crate) values: &'a [E],
@@ -26,7 +26,7 @@ pub(crate) struct Left<'a, E> {
 }
 
 impl<'a, E: Element> Left<'a, E> {
-    /// Rows of a matrix, so many scalars apart, which are whole steps.
+    /// Rows of a matrix, `row_stride` scalars apart, which must be whole steps.
     pub(crate) const fn rows(values: &'a [E], row_stride: usize) -> Self {
         Self {
             values,
@@ -39,7 +39,7 @@ impl<'a, E: Element> Left<'a, E> {
         }
     }
 
-    /// Whether so many rows lie inside the values.
+    /// Whether `rows` rows lie inside the values.
     fn holds(&self, rows: usize) -> bool {
         let last = self.start
             + (rows - 1) * self.row_stride
@@ -50,11 +50,11 @@ impl<'a, E: Element> Left<'a, E> {
 }
 
 pub(crate) struct Columns<'a> {
-    /// From the first row's first column on.
+    /// The output, from the first row's first column on.
     pub(crate) out: &'a mut [f32],
     /// Scalars from one row to the next.
     pub(crate) stride: usize,
-    /// Columns that are written; at most `vecs` registers of them.
+    /// Columns that are written, at most `vecs` registers.
     pub(crate) cols: usize,
     /// Registers of columns that are computed.
     pub(crate) vecs: usize,
@@ -63,7 +63,7 @@ pub(crate) struct Columns<'a> {
 
 /// Multiplies `rows` rows of `left` by `panel` [runs * steps, vecs * LANES, DEPTH].
 ///
-/// Each sum is taken in the order of the runs and steps, on every instruction set.
+/// Every instruction set sums in the order of the runs and steps.
 ///
 /// # Panics
 /// If a size is 0 or beyond the instruction set's, or an operand or the output is too short.
@@ -109,15 +109,15 @@ pub(crate) fn multiply_tile<S: Simd>(
         cols,
         mode,
     };
-    // SAFETY: the sizes are the instruction set's, and the asserts above are what `RawTile` asks for: the largest index of each operand
-    // is inside its slice, and all others are smaller, as strides are not negative. `out` is exclusively borrowed.
+    // SAFETY: the sizes are within the instruction set's limits, and the asserts above check what `RawTile` requires. The
+    // largest index of each operand is inside its slice, and strides are not negative. `out` is borrowed exclusively.
     #[allow(unsafe_code, reason = "tiles are read and written through pointers")]
     unsafe {
         simd.compute(&tile, rows, vecs);
     }
 }
 
-/// Registers of columns in each panel of a right operand with this many columns.
+/// Returns the width, in registers, of each panel of a right operand with this many columns.
 pub(crate) fn tile_vecs<S: Simd>(cols: usize) -> usize {
     match cols.div_ceil(LANES) {
         0 | 1 => 1,
@@ -126,7 +126,7 @@ pub(crate) fn tile_vecs<S: Simd>(cols: usize) -> usize {
     }
 }
 
-/// Cuts `rows` into as few tiles as go, of about equal size: (first, rows) of each.
+/// Cuts `rows` into as few tiles as possible, of about equal height, and yields (first, rows) of each.
 pub(crate) fn row_tiles<S: Simd>(
     rows: usize,
     vecs: usize,

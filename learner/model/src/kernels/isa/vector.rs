@@ -1,20 +1,20 @@
-//! The loop that all instruction sets with vector registers share: a tile's sums stay in registers while steps pass.
-//! It names no instruction: each instruction set brings its own.
+//! The loop that all instruction sets with vector registers share: a tile's accumulators stay in registers over all steps.
+//! It names no instructions: each instruction set supplies its own.
 
 use super::{
     element::Element,
     simd::{LANES, Mode, RawTile},
 };
 
-/// Sums of `LANES` columns, in registers.
+/// Accumulators of `LANES` columns, in registers.
 #[allow(unsafe_code, reason = "instructions of one kind of processor")]
 pub(super) trait Sums: Copy {
     unsafe fn zero() -> Self;
-    /// Writes the first `count` sums, after adding what is there if `add`. `count` may be 0; `at` is then not looked at.
+    /// Writes the first `count` sums, after adding the old values if `add`. If `count` is 0, `at` is not accessed.
     unsafe fn write(self, at: *mut f32, count: usize, add: bool);
 }
 
-/// The vector instructions that the shared loop is written in.
+/// The vector instructions in which the shared loop is written.
 #[allow(unsafe_code, reason = "instructions of one kind of processor")]
 pub(super) trait Vector: Copy {
     type Element: Element;
@@ -22,30 +22,30 @@ pub(super) trait Vector: Copy {
     /// One step of `LANES` columns, or of one row.
     type Operand: Copy;
 
-    /// The step at this place, for all columns.
+    /// Loads the step at `at` of one row and broadcasts it to all columns.
     unsafe fn row(at: *const Self::Element) -> Self::Operand;
-    /// The steps of `LANES` neighbouring columns.
+    /// Loads the steps of `LANES` neighbouring columns.
     unsafe fn columns(at: *const Self::Element) -> Self::Operand;
     unsafe fn mul_add(sums: Self::Sums, row: Self::Operand, columns: Self::Operand) -> Self::Sums;
 }
 
-/// The loop of every instruction set with vectors, to be compiled for it.
+/// The loop of every instruction set with vector registers. The caller compiles it for its instructions.
 ///
 /// # Safety
-/// The processor has the instructions of `V`; otherwise as `Simd::compute`.
+/// The processor has the instructions of `V`. Otherwise as for `Simd::compute`.
 #[inline(always)]
 #[allow(unsafe_code, reason = "instructions and pointers")]
 pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
     tile: &RawTile<V::Element>,
 ) {
-    // SAFETY: every address is one that `RawTile` says may be used; the caller answers for the instructions.
+    // SAFETY: `RawTile` allows every address that is used; the caller guarantees the instructions.
     unsafe {
         let mut sums = [[V::Sums::zero(); VECS]; ROWS];
         let (mut panel, mut run) = (tile.panel, tile.left);
         for _ in 0..tile.runs {
             let mut at = run;
             for _ in 0..tile.steps {
-                // No closure here: it may be compiled without these instructions, and each is then a call.
+                // No closure here: it could be compiled without these instructions, and each would then be a call.
                 let mut columns = [V::columns(panel); VECS];
                 for (v, columns) in columns.iter_mut().enumerate().skip(1) {
                     *columns = V::columns(panel.add(v * LANES * V::Element::DEPTH));
@@ -62,7 +62,7 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
             }
             run = run.wrapping_add(tile.run_stride);
         }
-        // By value: references to the sums would keep them in memory in the loops above.
+        // By value: references would keep the accumulators in memory in the loops above.
         for (r, sums) in sums.into_iter().enumerate() {
             let out = tile.out.add(r * tile.out_stride);
             for (v, sums) in sums.into_iter().enumerate() {
@@ -73,7 +73,7 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
     }
 }
 
-/// Calls [`compute`] with the sizes as constants; the arms must be all that an instruction set allows.
+/// Calls [`compute`] with the sizes as constants. The arms must cover every size that the instruction set allows.
 macro_rules! compute_sizes {
     ($vector:ty, $tile:expr, $rows:expr, $vecs:expr; $($v:literal: $($r:literal)*;)*) => {
         match ($vecs, $rows) {
