@@ -184,7 +184,7 @@ impl Process {
         self.wait()
     }
 
-    /// Asks it to stop and waits until it exits: with code 0 if its run is over, else with 130.
+    /// Sends SIGTERM, waits until the process exits, and checks for code 0 (its run is over) or 130.
     #[track_caller]
     pub fn stop_ok(self) -> Ended {
         let ended = self.stop();

@@ -158,7 +158,7 @@ impl Server {
             }
             Next::Finished => bail!("the replay server reports that the run is over"),
         });
-        // A request that is on its way wants its answer before the session is closed.
+        // A request in flight must get its reply before the session is closed.
         shutdown.set();
         while matches!(source.next(ANSWER_MAX)?, Next::Batch(_)) {}
         rate

@@ -72,8 +72,8 @@ pub(super) fn join<T>(
     listen(flags.exit_with_parent).context("listening for signals")
 }
 
-/// Removes what a process leaves outside the run folder. `ran` is whether its run is over; one that is not fails as [`Interrupted`], so
-/// that a scheduler that stops the process does not count it as complete.
+/// Removes what a process leaves outside the run folder. If `ran` is false, the run is not over, and this fails as [`Interrupted`], so that
+/// a scheduler that stops the process does not count it as complete.
 pub(super) fn clean_up_after(ran: anyhow::Result<bool>) -> anyhow::Result<()> {
     rendezvous::leave();
     shared_memory::remove_own();

@@ -106,7 +106,7 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     });
 }
 
-/// Soon, and as one that plays or learns: with exit code 130.
+/// The process exits soon and, as one that plays or learns, with exit code 130.
 #[test]
 fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
     let system = system();
