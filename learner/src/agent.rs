@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batch::Batch,
     error::UpdateError,
-    evaluation::{Evaluation, Networks, UpdateReport, distribution},
+    evaluation::{Evaluation, Networks, UpdateReport, detached_logits},
     noise::UpdateNoise,
     optimiser::{
         adam::Adam,
@@ -21,7 +21,7 @@ use crate::{
         target,
     },
     settings::UpdateSettings,
-    tensors::{flat, states},
+    tensors::{states_tensor, to_vec_f32},
 };
 
 /// The parameters of all networks of an agent.
@@ -228,14 +228,14 @@ impl Agent {
             let evaluation = self.evaluate(batch)?;
             let grad_norm = self.apply(&evaluation.gradients)?;
             let taken = evaluation.taken_logits.unsqueeze(1)?;
-            let q_sum: f32 = flat(&self.networks.online.q_values(&taken)?)?.iter().sum();
+            let q_values = to_vec_f32(&self.networks.online.q_values(&taken)?)?;
             Ok(UpdateReport {
                 c51_kl: evaluation.c51_kl,
                 row_kls: evaluation.row_kls,
                 losses: evaluation.losses,
                 total: evaluation.total,
                 grad_norm,
-                q_mean: q_sum / batch.rows as f32,
+                q_mean: q_values.iter().sum::<f32>() / batch.rows as f32,
             })
         })
     }
@@ -275,9 +275,9 @@ impl Agent {
     /// taken actions. Noisy layers use their means.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
         let networks = &self.networks;
-        let states = states(self.model(), batch.states_t, &networks.compute.device)?;
-        let logits = distribution(&networks.online, &states, None)?;
-        Ok(flat(&networks.online.q_values(&logits)?)?)
+        let states = states_tensor(self.model(), batch.states_t, &networks.compute.device)?;
+        let logits = detached_logits(&networks.online, &states, None)?;
+        Ok(to_vec_f32(&networks.online.q_values(&logits)?)?)
     }
 
     /// Clips `gradients`, takes one Adam step and moves the slow networks that are due.

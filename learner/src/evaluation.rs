@@ -17,7 +17,7 @@ use crate::{
     noise::UpdateNoise,
     optimiser::gradients::Gradients,
     settings::UpdateSettings,
-    tensors::{finite, flat, states},
+    tensors::{read_finite, states_tensor, to_vec_f32},
 };
 
 /// The results of one update, as in a row of metrics.
@@ -129,16 +129,17 @@ impl Networks {
         }
         // Before any number is read: reading waits for a GPU, which should have all of its work queued by then.
         let gradients = Gradients::of(&self.parameters, &total)?;
-        let c51_kl = finite("the C51 loss", &kl)?;
+        let c51_kl = read_finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
         for WeightedLoss { name, loss, .. } in &auxiliary {
-            losses.push((*name, finite(name, loss)?));
+            losses.push((*name, read_finite(name, loss)?));
         }
         let taken_logits = taken_logits.detach();
         let row_kls = match batch.importance_weight {
             None => Vec::new(),
             Some(_) => {
-                let kls = row_kls(&flat(&taken_logits)?, &target.projection, self.model.atoms);
+                let logits = to_vec_f32(&taken_logits)?;
+                let kls = row_kls(&logits, &target.projection, self.model.atoms);
                 kls.into_iter().map(|kl| kl as f32).collect()
             }
         };
@@ -146,7 +147,7 @@ impl Networks {
             c51_kl,
             row_kls,
             losses,
-            total: finite("the total loss", &total)?,
+            total: read_finite("the total loss", &total)?,
             taken_logits,
             next_greedy_action: target.next_greedy_action,
             target_projection: target.projection,
@@ -175,7 +176,7 @@ impl Networks {
         }
         let bootstraps: Vec<usize> = batch.bootstraps().collect();
         if !bootstraps.is_empty() {
-            let (actions, logits) = self.next_greedy(batch, noise)?;
+            let (actions, logits) = self.next_greedy_actions(batch, noise)?;
             let rows = bootstraps.iter().zip(actions);
             for ((&row, action), logits) in rows.zip(logits.chunks_exact(atoms)) {
                 next_greedy_action[row] = action;
@@ -202,7 +203,7 @@ impl Networks {
     }
 
     /// Computes, for the n rows that bootstrap, the greedy actions in s_{t+n} [n] and the target network's logits of these actions [n, N].
-    fn next_greedy(
+    fn next_greedy_actions(
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
@@ -212,29 +213,29 @@ impl Networks {
         } = self.model;
         let len = self.model.frame_len();
         let frames = batch.next_states(len);
-        let PassInput { bytes, places } =
-            PassInput::of(&frames, batch.states_n, len, self.deduplicate);
-        let states_n = states(&self.model, bytes, &self.compute.device)?;
-        let target_logits = distribution(&self.target, &states_n, noise.target.as_ref())?;
+        let PassInput { bytes, indices } =
+            PassInput::new(&frames, batch.states_n, len, self.deduplicate);
+        let states_n = states_tensor(&self.model, bytes, &self.compute.device)?;
+        let target_logits = detached_logits(&self.target, &states_n, noise.target.as_ref())?;
         let (network, values) = if self.settings.double_dqn {
-            let logits = distribution(&self.online, &states_n, noise.choice.as_ref())?;
+            let logits = detached_logits(&self.online, &states_n, noise.double_dqn.as_ref())?;
             ("online", self.online.q_values(&logits)?)
         } else {
             ("target", self.target.q_values(&target_logits)?)
         };
-        let values = flat(&values)?;
+        let values = to_vec_f32(&values)?;
         if !values.iter().all(|q| q.is_finite()) {
             let what = format!("the {network} network's value of an s_{{t+n}}");
             return Err(UpdateError::NonFinite(what));
         }
-        let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
-        let logits = flat(&target_logits)?;
+        let greedy_by_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
+        let logits = to_vec_f32(&target_logits)?;
         let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
         for row in 0..frames.len() {
-            let state = places.as_ref().map_or(row, |it| it[row] as usize);
-            let action = of_state[state];
-            let at = (state * num_actions + usize::from(action)) * atoms;
-            chosen.extend_from_slice(&logits[at..at + atoms]);
+            let state = indices.as_ref().map_or(row, |it| it[row] as usize);
+            let action = greedy_by_state[state];
+            let start = (state * num_actions + usize::from(action)) * atoms;
+            chosen.extend_from_slice(&logits[start..start + atoms]);
             actions.push(action);
         }
         Ok((actions, chosen))
@@ -242,7 +243,7 @@ impl Networks {
 }
 
 /// Computes the logits [B, A, N] of `frames`, detached from the graph.
-pub(crate) fn distribution(
+pub(crate) fn detached_logits(
     network: &Network,
     frames: &Tensor,
     noise: Option<&HeadNoise>,

@@ -10,7 +10,7 @@ use crate::{
     error::UpdateError,
     losses::{c51::softmax, scores::Scores},
     settings::UpdateSettings,
-    tensors::{flat, states},
+    tensors::{states_tensor, to_vec_f32},
 };
 
 /// A trained network to inspect.
@@ -25,7 +25,7 @@ pub struct Insight {
 
 /// The network's outputs for a batch of states.
 #[derive(Debug)]
-pub struct Seen {
+pub struct NetworkOutputs {
     /// Expected returns [B, A].
     pub q_values: Vec<f32>,
     /// Probabilities [B, A, N] of the returns at the atoms.
@@ -35,7 +35,7 @@ pub struct Seen {
 
 impl Insight {
     /// Inspects the online network of `agent` and shares its parameters. `compute` must be on the agent's device.
-    pub fn of(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
+    pub fn from_agent(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
         Self::new(agent.model(), agent.settings(), agent.online(), compute)
     }
 
@@ -65,20 +65,20 @@ impl Insight {
     }
 
     /// Computes the network's outputs for states [B, H, W, C] of the network's input size.
-    pub fn look(&self, bytes: &[u8]) -> Result<Seen, UpdateError> {
-        let features = self
-            .network
-            .features(&states(&self.model, bytes, &self.compute.device)?)?;
+    pub fn evaluate(&self, bytes: &[u8]) -> Result<NetworkOutputs, UpdateError> {
+        let features =
+            self.network
+                .features(&states_tensor(&self.model, bytes, &self.compute.device)?)?;
         let logits = self.network.logits(&features.f4, None)?;
         let q_values = self.network.q_values(&logits)?;
-        let logits = flat(&logits)?;
+        let logits = to_vec_f32(&logits)?;
         let mut probabilities = vec![0.0; logits.len()];
         let rows = probabilities.chunks_exact_mut(self.model.atoms);
         for (probabilities, logits) in rows.zip(logits.chunks_exact(self.model.atoms)) {
             softmax(logits, probabilities);
         }
-        Ok(Seen {
-            q_values: flat(&q_values)?,
+        Ok(NetworkOutputs {
+            q_values: to_vec_f32(&q_values)?,
             probabilities,
             features,
         })
@@ -95,9 +95,9 @@ impl Insight {
     /// Batches of different lengths, or an unknown action.
     pub fn local_matches(
         &self,
-        now: &Seen,
+        now: &NetworkOutputs,
         actions: &[u8],
-        later: &Seen,
+        later: &NetworkOutputs,
     ) -> Result<Option<Vec<f64>>, UpdateError> {
         let Some(tanh_clip) = self.local_clip else {
             return Ok(None);
@@ -111,7 +111,7 @@ impl Insight {
         };
         let scores = Scores::new(dots.width, tanh_clip);
         let (locations, rows, _) = dots.dots.dims3()?;
-        let dots = flat(&dots.dots)?;
+        let dots = to_vec_f32(&dots.dots)?;
         let mut matches = vec![0.0; rows * locations];
         for (index, candidates) in dots.chunks_exact(rows).enumerate() {
             let (location, row) = (index / rows, index % rows);

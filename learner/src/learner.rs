@@ -17,11 +17,11 @@ use crate::{
     evaluation::UpdateReport,
     importance::drawn_evenly,
     prepare::{Columns, Preparation},
-    progress::Progress,
+    run_counts::RunCounts,
 };
 
 /// The name under which the noisy layers' seed is derived from the run's seed.
-const NOISE: &str = "noisy layers";
+const NOISE_SEED_NAME: &str = "noisy layers";
 
 /// Why a learner could not be created, learn or be saved.
 #[derive(Debug, thiserror::Error)]
@@ -53,10 +53,10 @@ pub struct Learner {
 }
 
 /// Applies the settings that an agent's state does not contain.
-fn configured(agent: Agent, config: &LearnerConfig) -> Agent {
+fn apply_settings(agent: Agent, config: &LearnerConfig) -> Agent {
     agent
         .with_deduplication(config.learner.deduplicate_states)
-        .with_noise_seed(config.spec.seed_for(NOISE, 0))
+        .with_noise_seed(config.spec.seed_for(NOISE_SEED_NAME, 0))
 }
 
 impl Learner {
@@ -72,11 +72,11 @@ impl Learner {
         Ok(Self {
             spec_hash: spec.hash(),
             state: LearnerState {
-                agent: configured(agent, &config),
+                agent: apply_settings(agent, &config),
                 affinity,
                 rng,
                 weights_version: 0,
-                progress: Progress::default(),
+                run_counts: RunCounts::default(),
             },
             preparation: Preparation::new(&config)?,
             config,
@@ -111,7 +111,7 @@ impl Learner {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.state = LearnerState {
-            agent: configured(restored.agent, &this.config),
+            agent: apply_settings(restored.agent, &this.config),
             ..restored
         };
         Ok(this)
@@ -133,13 +133,13 @@ impl Learner {
     }
 
     /// The run's other counts: transitions stored and rows learned, by shard.
-    pub const fn progress(&self) -> &Progress {
-        &self.state.progress
+    pub const fn run_counts(&self) -> &RunCounts {
+        &self.state.run_counts
     }
 
-    /// [`Learner::progress`] for the caller to update: [`Learner::update`] does not know which shards a batch comes from.
-    pub const fn progress_mut(&mut self) -> &mut Progress {
-        &mut self.state.progress
+    /// [`Learner::run_counts`] for the caller to update: [`Learner::update`] does not know which shards a batch comes from.
+    pub const fn run_counts_mut(&mut self) -> &mut RunCounts {
+        &mut self.state.run_counts
     }
 
     /// Updates the network and the affinity estimate from one batch.
@@ -170,7 +170,7 @@ impl Learner {
     }
 
     /// Writes the results of the last update into `status`.
-    pub fn note(&self, report: &UpdateReport, status: &mut LearnerStatus) {
+    pub fn write_status(&self, report: &UpdateReport, status: &mut LearnerStatus) {
         status.updates = self.updates();
         status.c51_kl = report.c51_kl;
         let losses = report.losses.iter();
@@ -182,7 +182,7 @@ impl Learner {
 
     /// Makes the next weights' version larger than `version`. Actors accept only weights newer than theirs, which may be those of a
     /// learner that crashed after its last checkpoint.
-    pub fn publish_above(&mut self, version: u64) {
+    pub fn raise_weights_version(&mut self, version: u64) {
         self.state.weights_version = self.state.weights_version.max(version);
     }
 
@@ -209,7 +209,7 @@ impl Learner {
     }
 
     /// Exports the current weights under a new version number.
-    pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
+    pub fn export_weights(&mut self) -> Result<Weights, LearnerError> {
         let dtype = self.config.learner.publish_dtype;
         let safetensors = self.agent().weights_as(dtype)?;
         self.state.weights_version += 1;
@@ -228,7 +228,7 @@ impl Learner {
         self.save_with(folder, None)
     }
 
-    /// Writes a checkpoint into `folder`, together with the bytes of the caller's `companion`, which [`checkpoint::companion`] reads.
+    /// Writes a checkpoint into `folder`, together with the bytes of the caller's `companion`, which [`checkpoint::read_companion`] reads.
     pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
         let LearnerConfig {
             spec, model, input, ..

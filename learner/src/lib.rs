@@ -66,9 +66,9 @@ mod noise;
 pub mod optimiser;
 pub mod parity;
 mod prepare;
-mod progress;
 mod ranges;
 pub mod remote;
+mod run_counts;
 mod settings;
 mod tensors;
 
@@ -88,6 +88,6 @@ pub use evaluation::{Evaluation, UpdateReport};
 pub use learner::{Learner, LearnerError};
 pub use noise::UpdateNoise;
 pub use optimiser::adam::AdamSettings;
-pub use progress::{Progress, ServedPart};
 pub use remote::run::{RunArgs, run};
+pub use run_counts::{BatchPart, RunCounts};
 pub use settings::UpdateSettings;

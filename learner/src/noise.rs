@@ -13,7 +13,7 @@ pub struct UpdateNoise {
     /// Noise of the online network in s_t.
     pub online: Option<HeadNoise>,
     /// Noise of the online network when it chooses an action in s_{t+n}, with double DQN.
-    pub choice: Option<HeadNoise>,
+    pub double_dqn: Option<HeadNoise>,
     /// Noise of the target network.
     pub target: Option<HeadNoise>,
 }
@@ -24,11 +24,11 @@ impl UpdateNoise {
         // ChaCha is counter-based: its output is a function of seed, stream and position.
         let mut rng = ChaCha8Rng::from_seed(seed);
         rng.set_stream(updates);
-        let mut noise = || HeadNoise::draw(model, &mut rng);
+        let mut draw = || HeadNoise::draw(model, &mut rng);
         Self {
-            online: noise(),
-            choice: noise(),
-            target: noise(),
+            online: draw(),
+            double_dqn: draw(),
+            target: draw(),
         }
     }
 }

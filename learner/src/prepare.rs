@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use crate::{
     augment::Augment, auxiliary::positives::Positives, batch::Batch, config::LearnerConfig,
-    deduplicate::one_after_another, importance::importance_weights,
+    deduplicate::concatenate, importance::importance_weights,
 };
 
 /// The columns of a received batch that need a conversion before an update can read them.
@@ -114,7 +114,7 @@ impl Preparation {
             // Draws for missing positives too, so that a run's augmentations do not depend on which positives are missing.
             if batch.states_k.len() < batch.positive_valid.len() * self.state_bytes {
                 let each = batch.positive_states(self.state_bytes).into_iter();
-                augment.apply(&one_after_another(each, self.state_bytes), seen_k, rng);
+                augment.apply(&concatenate(each, self.state_bytes), seen_k, rng);
             } else {
                 augment.apply(batch.states_k, seen_k, rng);
             }

@@ -8,7 +8,7 @@ use driml_model::{ModelConfig, floats};
 use crate::error::UpdateError;
 
 /// The bytes of states as a tensor [B, H, W, C] u8 on `device`, where the network converts them to floats.
-pub(crate) fn states<'a>(
+pub(crate) fn states_tensor<'a>(
     model: &ModelConfig,
     bytes: impl Into<Cow<'a, [u8]>>,
     device: &Device,
@@ -23,28 +23,28 @@ pub(crate) fn states<'a>(
 }
 
 /// All values of an f32 tensor, in row-major order.
-pub(crate) fn flat(tensor: &Tensor) -> candle_core::Result<Vec<f32>> {
+pub(crate) fn to_vec_f32(tensor: &Tensor) -> candle_core::Result<Vec<f32>> {
     tensor.flatten_all()?.to_vec1()
 }
 
 /// All values of a tensor as f64, in row-major order.
-pub(crate) fn flat_f64(tensor: &Tensor) -> candle_core::Result<Vec<f64>> {
+pub(crate) fn to_vec_f64(tensor: &Tensor) -> candle_core::Result<Vec<f64>> {
     tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()
 }
 
 /// Calls `change` with the values of `var`, to change in place, and those of `other`. Both are on the CPU and equally long.
-pub(crate) fn change(
+pub(crate) fn modify_in_place(
     var: &Var,
     other: &Tensor,
     change: impl FnMut(&mut [f32], &[f32]),
 ) -> candle_core::Result<()> {
     // candle passes the operation by shared reference only.
-    var.inplace_op2(other, &Change(RefCell::new(change)))
+    var.inplace_op2(other, &InPlaceOperation(RefCell::new(change)))
 }
 
-struct Change<F>(RefCell<F>);
+struct InPlaceOperation<F>(RefCell<F>);
 
-impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for Change<F> {
+impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for InPlaceOperation<F> {
     fn name(&self) -> &'static str {
         "change"
     }
@@ -70,7 +70,7 @@ impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for Change<F> {
 }
 
 /// Reads a scalar loss; an error that names it if it is not finite.
-pub(crate) fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
+pub(crate) fn read_finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
     let value = loss.to_scalar::<f32>()?;
     match value.is_finite() {
         true => Ok(value),

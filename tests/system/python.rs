@@ -9,7 +9,7 @@ use std::{
 
 use driml_learner::{
     Agent, Compute, checkpoint,
-    insight::{Insight, Seen},
+    insight::{Insight, NetworkOutputs},
 };
 use driml_machine::resources::Machine;
 use driml_settings::{config::RunConfig, flags::of_names};
@@ -67,7 +67,7 @@ const RUNS: [&str; 5] = [
 ];
 
 /// Makes a run. Returns its agent and the agent's outputs for random states, which are in a file beside the run.
-fn trained(system: &TestSystem, flags: &str) -> (Agent, Seen) {
+fn trained(system: &TestSystem, flags: &str) -> (Agent, NetworkOutputs) {
     let _ = fs::remove_dir_all(system.path("run"));
     system.run_ok(&format!("local --lockstep {flags} --run-dir run"));
     let config = RunConfig::parse("config.toml", &system.read("run/config.toml")).unwrap();
@@ -80,9 +80,9 @@ fn trained(system: &TestSystem, flags: &str) -> (Agent, Seen) {
     fs::write(system.path("states"), &states).unwrap();
     let mut agent = restored.unwrap().unwrap().agent;
     agent.take_average().unwrap();
-    let insight = Insight::of(&agent, Compute::CPU).unwrap();
-    let seen = insight.look(&states).unwrap();
-    (agent, seen)
+    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let ours = insight.evaluate(&states).unwrap();
+    (agent, ours)
 }
 
 fn largest_difference(ours: &[f32], theirs: &serde_json::Value) -> f64 {
@@ -103,7 +103,7 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
     let scripts = root().join("deploy/python");
     let script = scripts.join("driml_net.py").display().to_string();
     for flags in RUNS {
-        let (agent, seen) = trained(&system, flags);
+        let (agent, ours) = trained(&system, flags);
         let path = |name: &str| system.path(name).display().to_string();
         let args = [
             &scripts.display().to_string(),
@@ -115,8 +115,8 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
             serde_json::from_str(&run(&python, &["-c", ASK], &args)).unwrap()
         };
         let theirs = ask();
-        let value = largest_difference(&seen.q_values, &theirs[0]);
-        let probability = largest_difference(&seen.probabilities, &theirs[1]);
+        let value = largest_difference(&ours.q_values, &theirs[0]);
+        let probability = largest_difference(&ours.probabilities, &theirs[1]);
         note(&format!(
             "{flags}: values {value:.1e}, probabilities {probability:.1e}"
         ));
@@ -132,7 +132,7 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
                 model.height, model.width, model.input_channels
             );
             let answer = run(&python, &["-c", ASK_ONNX], &[&net, &path("states"), &shape]);
-            let off = largest_difference(&seen.q_values, &serde_json::from_str(&answer).unwrap());
+            let off = largest_difference(&ours.q_values, &serde_json::from_str(&answer).unwrap());
             note(&format!("{flags}: ONNX values {off:.1e}"));
             assert!(off < VALUE_OFF, "{flags}: {off}");
         }

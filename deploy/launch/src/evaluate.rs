@@ -9,7 +9,7 @@ use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, Watch, 
 use driml_envs::{RestrictedWorld, WorldConfig};
 use driml_learner::{
     Compute, UpdateError, checkpoint,
-    insight::{Insight, Seen},
+    insight::{Insight, NetworkOutputs},
 };
 use driml_machine::error::{Usage, usage};
 use driml_model::{Enlarge, Parameters, Precision, StoredAs, is_dim};
@@ -240,15 +240,15 @@ pub struct Viewer {
 
 impl Viewer {
     /// What the network computes for the states of a step.
-    pub fn look(&mut self, states: &[u8]) -> Result<Seen, UpdateError> {
+    pub fn look(&mut self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
         let Some(enlarge) = &self.enlarge else {
-            return self.insight.look(states);
+            return self.insight.evaluate(states);
         };
         // Enlarging keeps the number of states.
         let count = states.len() / enlarge.input_bytes();
         self.enlarged.resize(count * enlarge.output_bytes(), 0);
         enlarge.apply(states, &mut self.enlarged);
-        self.insight.look(&self.enlarged)
+        self.insight.evaluate(&self.enlarged)
     }
 }
 

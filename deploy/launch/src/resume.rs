@@ -42,7 +42,7 @@ pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     folder.config().exists()
         && saved.last().is_some_and(|(_, newest)| {
-            let companion = checkpoint::companion(newest).unwrap_or_default();
+            let companion = checkpoint::read_companion(newest).unwrap_or_default();
             companion.map_or_else(|| world.is_resumable(), |it| !it.is_empty())
         })
 }
@@ -203,9 +203,9 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         let checkpoints = checkpoints.display();
         usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
     })?;
-    let (updates, progress) = checkpoint::progress(newest)?;
+    let (updates, counts) = checkpoint::read_run_counts(newest)?;
     // A run in lockstep has a companion, which is empty if the state of its world cannot be saved.
-    let companion = checkpoint::companion(newest)?;
+    let companion = checkpoint::read_companion(newest)?;
     if companion.as_ref().is_some_and(Vec::is_empty) {
         bail!(usage!(
             "the run in {} cannot be resumed, because the state of its world cannot be saved: start it again",
@@ -223,7 +223,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     // Before the first update, only a run in lockstep keeps its frames and rows.
     let (frames, rows) = match updates {
         0 if !lockstep => (0, 0),
-        _ => (progress.frames(), progress.rows()),
+        _ => (counts.frames(), counts.rows()),
     };
     let has_other_pace = before.learner.batch_size != config.learner.batch_size
         || before.replay.replay_ratio != config.replay.replay_ratio

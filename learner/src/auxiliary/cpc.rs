@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     batch::Batch,
-    deduplicate::State,
+    deduplicate::StateBytes,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Dots},
 };
@@ -51,7 +51,7 @@ impl AuxiliaryLoss for Cpc {
     }
 
     /// The positives that exist, offset by offset; nothing is computed for missing ones.
-    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
+    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<StateBytes<'a>> {
         let states = batch.positive_states(state_bytes);
         states.into_iter().filter(Option::is_some).collect()
     }

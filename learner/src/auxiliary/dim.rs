@@ -11,7 +11,7 @@ use super::{
 };
 use crate::{
     batch::Batch,
-    deduplicate::State,
+    deduplicate::StateBytes,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Dots},
 };
@@ -89,7 +89,7 @@ impl AuxiliaryLoss for Dim {
     }
 
     /// A row without a positive keeps its place with a blank state, so that anchors and candidates stay aligned. Its results are masked.
-    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>> {
+    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<StateBytes<'a>> {
         batch.positive_states(state_bytes)
     }
 

@@ -12,10 +12,10 @@ use super::{
 };
 use crate::{
     batch::Batch,
-    deduplicate::{PassInput, State},
+    deduplicate::{PassInput, StateBytes},
     error::UpdateError,
     losses::scores::Dots,
-    tensors::states,
+    tensors::states_tensor,
 };
 
 /// An item of the menu: what is known of a loss before its settings are read.
@@ -55,7 +55,7 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
 
     /// The later states, of `state_bytes` bytes each, whose online features the loss needs, if any. They pass through the network together
     /// with s_t; `None` stands for a blank state.
-    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
+    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<StateBytes<'a>> {
         Vec::new()
     }
 
@@ -133,25 +133,26 @@ impl OnlineFeatures {
         device: &Device,
     ) -> Result<Self, UpdateError> {
         let len = model.frame_len();
-        let mut all: Vec<State<'_>> = batch.states_t.chunks_exact(len).map(Some).collect();
+        let mut states: Vec<StateBytes<'_>> = batch.states_t.chunks_exact(len).map(Some).collect();
         let anchors = batch.anchors.unwrap_or_default().chunks_exact(len);
-        all.extend(anchors.map(Some));
-        let anchors = all.len() - batch.rows;
-        all.extend(loss.later_states(batch, len));
+        states.extend(anchors.map(Some));
+        let anchor_count = states.len() - batch.rows;
+        states.extend(loss.later_states(batch, len));
 
-        let once = deduplicate && anchors == 0;
-        let PassInput { bytes, places } = PassInput::of(&all, batch.states_t, len, once);
-        let features = network.features(&states(model, bytes, device)?)?;
-        let of = |states: Range<usize>| match &places {
-            Some(places) => features.select(&places[states]),
-            None => features.narrow(states.start, states.len()),
+        let deduplicate = deduplicate && anchor_count == 0;
+        let input = PassInput::new(&states, batch.states_t, len, deduplicate);
+        let features = network.features(&states_tensor(model, input.bytes, device)?)?;
+        let features_of = |range: Range<usize>| match &input.indices {
+            Some(indices) => features.select(&indices[range]),
+            None => features.narrow(range.start, range.len()),
         };
-        let some = |states: Range<usize>| (!states.is_empty()).then(|| of(states)).transpose();
-        let (first_anchor, first_later) = (batch.rows, batch.rows + anchors);
-        let now = of(0..first_anchor)?;
+        let some_features =
+            |range: Range<usize>| (!range.is_empty()).then(|| features_of(range)).transpose();
+        let (first_anchor, first_later) = (batch.rows, batch.rows + anchor_count);
+        let now = features_of(0..first_anchor)?;
         Ok(Self {
-            anchors: some(first_anchor..first_later)?.unwrap_or_else(|| now.clone()),
-            later: some(first_later..all.len())?,
+            anchors: some_features(first_anchor..first_later)?.unwrap_or_else(|| now.clone()),
+            later: some_features(first_later..states.len())?,
             now,
         })
     }
@@ -183,8 +184,8 @@ impl LossInputs<'_> {
         let key = self.key.expect("a loss with key_tau is given its encoder");
         let (batch, len) = (self.batch, self.model.frame_len());
         let positives = batch.positive_states(len);
-        let PassInput { bytes, .. } = PassInput::of(&positives, batch.states_k, len, false);
-        Ok(key.encode(&states(self.model, bytes, self.device)?)?)
+        let PassInput { bytes, .. } = PassInput::new(&positives, batch.states_k, len, false);
+        Ok(key.encode(&states_tensor(self.model, bytes, self.device)?)?)
     }
 
     /// a_t [B], on the CPU, where the network reads it.

@@ -10,7 +10,7 @@ use super::error::{CheckpointError, damaged};
 use crate::{
     affinity::AffinityEstimator,
     agent::Agent,
-    progress::{COUNT_MAX, Progress},
+    run_counts::{COUNT_MAX, RunCounts},
 };
 
 pub(super) const FORMAT: u32 = 4;
@@ -39,7 +39,7 @@ pub struct LearnerState {
     /// Newest version of the weights that was published.
     pub weights_version: u64,
     /// The run's other counts.
-    pub progress: Progress,
+    pub run_counts: RunCounts,
 }
 
 /// The contents of `state.json`: all of a checkpoint that is not a tensor.
@@ -51,7 +51,7 @@ pub(super) struct StateFile {
     pub(super) updates: u64,
     pub(super) adam_step: u64,
     pub(super) weights_version: u64,
-    pub(super) progress: Progress,
+    pub(super) progress: RunCounts,
     pub(super) rng: ChaCha8Rng,
     pub(super) affinity: Option<AffinityEstimator>,
     /// SHA-256 of the other files, by name.
@@ -98,9 +98,9 @@ impl StateFile {
                 return Err(format!("{name} is {count}, more than {COUNT_MAX}"));
             }
         }
-        let progress = &self.progress;
-        if !progress.is_sane() {
-            return Err(format!("{progress:?} are counts that no run reaches"));
+        let counts = &self.progress;
+        if !counts.is_plausible() {
+            return Err(format!("{counts:?} are counts that no run reaches"));
         }
         let valid = self.affinity.as_ref().map(AffinityEstimator::check_valid);
         valid.transpose().map_err(|why| why.to_string())?;

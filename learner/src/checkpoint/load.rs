@@ -18,7 +18,7 @@ use super::{
 use crate::{
     affinity::AffinityEstimator,
     agent::{Agent, NetworkParameters},
-    progress::Progress,
+    run_counts::RunCounts,
     settings::UpdateSettings,
 };
 
@@ -91,7 +91,7 @@ pub fn load(
         affinity: state.affinity,
         rng: state.rng,
         weights_version: state.weights_version,
-        progress: state.progress,
+        run_counts: state.progress,
     })
 }
 
@@ -121,7 +121,7 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
 ///
 /// # Errors
 /// A missing or damaged file.
-pub fn progress(path: &Path) -> Result<(u64, Progress), CheckpointError> {
+pub fn read_run_counts(path: &Path) -> Result<(u64, RunCounts), CheckpointError> {
     let state = read_state(path)?;
     Ok((state.updates, state.progress))
 }
@@ -130,7 +130,7 @@ pub fn progress(path: &Path) -> Result<(u64, Progress), CheckpointError> {
 ///
 /// # Errors
 /// A missing or damaged file.
-pub fn affinity(path: &Path) -> Result<Option<AffinityEstimator>, CheckpointError> {
+pub fn read_affinity(path: &Path) -> Result<Option<AffinityEstimator>, CheckpointError> {
     Ok(read_state(path)?.affinity)
 }
 
@@ -138,7 +138,7 @@ pub fn affinity(path: &Path) -> Result<Option<AffinityEstimator>, CheckpointErro
 ///
 /// # Errors
 /// A missing or damaged file.
-pub fn companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
+pub fn read_companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
     let state = read_state(path)?;
     let there = state.sha256.contains_key(COMPANION);
     there

@@ -12,5 +12,5 @@ pub use contents::{AVERAGE, LearnerState, check_state};
 pub use description::{KEY as DESCRIPTION, describe, described};
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
-pub use load::{affinity, companion, load, load_latest, progress};
+pub use load::{load, load_latest, read_affinity, read_companion, read_run_counts};
 pub use save::{Label, save};

@@ -83,7 +83,7 @@ fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), Che
         updates: agent.updates(),
         adam_step: agent.adam.step_count(),
         weights_version: state.weights_version,
-        progress: state.progress.clone(),
+        progress: state.run_counts.clone(),
         rng: state.rng.clone(),
         affinity: state.affinity.clone(),
         sha256,

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::gradients::Gradients;
-use crate::{error::UpdateError, ranges::check_range, tensors::change};
+use crate::{error::UpdateError, ranges::check_range, tensors::modify_in_place};
 
 /// Elements that a thread takes at a time.
 const CHUNK: usize = 1 << 14;
@@ -183,7 +183,7 @@ impl Adam {
             match moments {
                 Moments::Fused { m, v } => {
                     let mut all_finite = true;
-                    change(var, gradient, |p, g| {
+                    modify_in_place(var, gradient, |p, g| {
                         let chunks = p.par_chunks_mut(CHUNK).zip(g.par_chunks(CHUNK));
                         let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
                         let finite = chunks

@@ -3,7 +3,7 @@
 
 use driml_model::{Kernels, Parameters};
 
-use crate::{error::UpdateError, tensors::change};
+use crate::{error::UpdateError, tensors::modify_in_place};
 
 /// Largest size of a parameter for which a copy can follow: the difference of two parameters is then finite.
 pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
@@ -38,7 +38,7 @@ pub fn follow(
             )));
         };
         match kernels {
-            Kernels::Fused(_) => change(var, source, |target, online| {
+            Kernels::Fused(_) => modify_in_place(var, source, |target, online| {
                 let tau = tau as f32;
                 if tau >= 1.0 {
                     return target.copy_from_slice(online);

@@ -21,7 +21,7 @@ use crate::{
     noise::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::UpdateSettings,
-    tensors::flat_f64,
+    tensors::to_vec_f64,
 };
 
 /// Why a case could not be checked.
@@ -158,17 +158,17 @@ impl Case {
 
     /// The noise of the noisy layers, made from the normal numbers in the case.
     pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise, ParityError> {
-        let of = |who: &str| {
+        let head_noise = |network: &str| {
             HeadNoise::of_normals(model, |layer, side, len| {
-                let name = format!("noise.{who}.{layer}.{side}");
+                let name = format!("noise.{network}.{layer}.{side}");
                 let normals = self.tensors.read::<f32>(&name, DType::F32, &[len])?;
                 Ok::<_, ParityError>(normals.into_iter().map(f64::from).collect())
             })
         };
         Ok(UpdateNoise {
-            online: of("online")?,
-            choice: of("choice")?,
-            target: of("target")?,
+            online: head_noise("online")?,
+            double_dqn: head_noise("choice")?,
+            target: head_noise("target")?,
         })
     }
 
@@ -204,7 +204,7 @@ impl Case {
             return Err(ParityError::tensor(&name, why));
         }
         self.unused.borrow_mut().remove(&name);
-        Ok(flat_f64(tensor)?)
+        Ok(to_vec_f64(tensor)?)
     }
 
     /// Checks that every expectation was used: one that nothing was compared with must not pass as met.

@@ -5,7 +5,7 @@ use candle_core::Device;
 use driml_model::{Compute, Kernels, greedy};
 use driml_protocol::NO_ACTION;
 
-use crate::{agent::Agent, batch::Batch, error::UpdateError, tensors::flat_f64};
+use crate::{agent::Agent, batch::Batch, error::UpdateError, tensors::to_vec_f64};
 
 /// The reference's way of computing: on the CPU, without this project's kernels.
 pub const REFERENCE: Compute = Compute {
@@ -40,7 +40,7 @@ impl ErrorOfUpdate {
         for (name, var) in reference.online().iter() {
             let [got, expected] = [&own.gradients, &expected.gradients].map(|gradients| {
                 let gradient = gradients.get(name);
-                gradient.map_or_else(|| Ok(vec![0.0; var.elem_count()]), flat_f64)
+                gradient.map_or_else(|| Ok(vec![0.0; var.elem_count()]), to_vec_f64)
             });
             for (got, expected) in got?.iter().zip(expected?) {
                 apart += (got - expected).powi(2);

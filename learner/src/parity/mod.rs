@@ -28,7 +28,7 @@ use crate::{
     },
     evaluation::Evaluation,
     losses::scores::{Dots, Scores},
-    tensors::flat_f64,
+    tensors::to_vec_f64,
 };
 
 /// The comparison of one group of tensors.
@@ -202,7 +202,7 @@ impl Check<'_> {
         for (name, tensor) in case.online() {
             let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
             let got = match evaluation.gradients.get(name) {
-                Some(gradient) => flat_f64(gradient)?,
+                Some(gradient) => to_vec_f64(gradient)?,
                 None => vec![0.0; expected.len()],
             };
             let apart = norm(got.iter().zip(&expected).map(|(got, wanted)| got - wanted));
@@ -231,12 +231,12 @@ impl Check<'_> {
             let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
             // Parameters that no lambda uses are not built, so they stay as in the file.
             let var = agent.online().get(name);
-            let got = flat_f64(var.map_or(tensor, |var| var.as_tensor()))?;
+            let got = to_vec_f64(var.map_or(tensor, |var| var.as_tensor()))?;
             online.add("updated", name, largest(&got, &expected), tolerance);
         }
         for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
             let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
-            let error = largest(&flat_f64(var)?, &expected);
+            let error = largest(&to_vec_f64(var)?, &expected);
             keys.add("updated_key", name, error, tolerance);
         }
         self.lines.extend(online.0.into_values());
@@ -321,7 +321,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     })?;
     let saturates = |it: &Dots| -> Result<bool, ParityError> {
         let scores = Scores::new(it.width, settings.tanh_clip);
-        let mut dots = flat_f64(&it.dots)?.into_iter();
+        let mut dots = to_vec_f64(&it.dots)?.into_iter();
         Ok(dots.any(|dot| dot.abs() * scores.scale > scores.tanh_clip))
     };
     let mut forward = Vec::new();

@@ -22,7 +22,7 @@ use super::{
     error::BatchError,
     shards::{PartialBatch, Portion},
 };
-use crate::progress::{Progress, ServedPart};
+use crate::run_counts::{BatchPart, RunCounts};
 
 /// Time-out of a request. A replay server replies within a second, if only that it has no batch yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
@@ -61,8 +61,8 @@ pub struct Counters {
 
 impl Counters {
     /// The counters of a learner after `updates` updates, all of which are saved.
-    pub fn of(updates: u64, progress: &Progress) -> Arc<Self> {
-        let shards = progress.shards.iter();
+    pub fn of(updates: u64, counts: &RunCounts) -> Arc<Self> {
+        let shards = counts.shards.iter();
         Arc::new(Self {
             updates: updates.into(),
             saved_updates: updates.into(),
@@ -72,9 +72,9 @@ impl Counters {
 
     /// The counters of a learner that has learned nothing.
     pub fn at_start(shards: usize) -> Arc<Self> {
-        let mut progress = Progress::default();
-        progress.spread_over(shards);
-        Self::of(0, &progress)
+        let mut counts = RunCounts::default();
+        counts.spread_over(shards);
+        Self::of(0, &counts)
     }
 
     fn learned(&self, shard: usize) -> Learned {
@@ -91,7 +91,7 @@ pub struct Served {
     /// The batch to learn from.
     pub batch: Batch,
     /// The batch's rows by shard.
-    pub parts: Vec<ServedPart>,
+    pub parts: Vec<BatchPart>,
 }
 
 /// A message from a fetching thread.
@@ -227,10 +227,10 @@ impl Fetcher {
     }
 
     /// Counts the rows received from a shard.
-    fn received(&self, shard: usize, part: &Batch) -> ServedPart {
+    fn received(&self, shard: usize, part: &Batch) -> BatchPart {
         let rows = part.header.rows;
         self.shared.counters.received[shard].fetch_add(rows.into(), Ordering::AcqRel);
-        ServedPart {
+        BatchPart {
             shard,
             rows,
             inserted: part.header.counts.inserted,

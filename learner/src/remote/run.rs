@@ -99,20 +99,20 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     );
     let spec_hash = learner.spec_hash();
     let clients = shards.clients(&keys, spec_hash);
-    let progress = learner.progress_mut();
-    progress.spread_over(clients.len());
-    if progress.run == 0 {
-        progress.run = rand::random();
+    let counts = learner.run_counts_mut();
+    counts.spread_over(clients.len());
+    if counts.run == 0 {
+        counts.run = rand::random();
     }
-    let progress = (updates, &*progress);
-    let joined = shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
+    let counts = (updates, &*counts);
+    let joined = shards.take_part(&clients, requests.learner, counts, args.restart, shutdown)?;
     let Some(membership) = joined else {
         return Ok(false);
     };
-    learner.publish_above(membership.weights_version);
+    learner.raise_weights_version(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
     let publisher = Publisher::open(&clients, spec_hash, requests.learner, &sampling, shutdown)?;
-    publisher.publish(learner.next_weights()?);
+    publisher.publish(learner.export_weights()?);
     if updates > 0 {
         publisher.with_status(|status| status.updates = updates);
         if let Some(affinity) = learner.affinity_update(publisher.learner) {
@@ -126,7 +126,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         activity.clone(),
         shutdown.clone(),
     )?;
-    let counters = Counters::of(updates, learner.progress());
+    let counters = Counters::of(updates, learner.run_counts());
     let mut batches = BatchSource::start(&clients, requests, &counters, shutdown)?;
     let device = args.device;
     tracing::info!("learning on {device} from batches of {rows} rows, run {spec_hash:016x}");
@@ -153,14 +153,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     for (shard, client) in clients.iter().enumerate() {
         match client.fetch::<ReplayStatus>(LAST_COUNT_MAX) {
             Ok(status) => learner
-                .progress_mut()
-                .note_inserted(shard, status.transitions_inserted),
+                .run_counts_mut()
+                .record_inserted(shard, status.transitions_inserted),
             Err(e) => tracing::debug!("the last count of shard {shard}: {e}"),
         }
     }
     let saved = checkpointer.finish(&learner);
     if learned.is_ok() && !learner.publication_is_due() {
-        publisher.publish(learner.next_weights()?);
+        publisher.publish(learner.export_weights()?);
     }
     let is_over = learned?;
     saved?;
@@ -215,7 +215,7 @@ fn learn(
         said_next = SILENT_MAX;
         let started = Instant::now();
         let report = learner.update(&batch)?;
-        learner.progress_mut().note(&parts);
+        learner.run_counts_mut().add_batch(&parts);
         let counters = &checkpointer.counters;
         counters.updates.store(learner.updates(), Ordering::Release);
         // Numbered by updates, which only increase within one learner process.
@@ -227,11 +227,11 @@ fn learn(
             publisher.affinity.put(affinity);
         }
         if learner.publication_is_due() {
-            publisher.publish(learner.next_weights()?);
+            publisher.publish(learner.export_weights()?);
         }
         let ended = Instant::now();
         publisher.with_status(|status| {
-            learner.note(&report, status);
+            learner.write_status(&report, status);
             status.waiting_s += (started - waiting_since).as_secs_f64();
             status.computing_s += (ended - started).as_secs_f64();
         });
@@ -274,7 +274,7 @@ impl Checkpointer {
     }
 
     fn counts(learner: &Learner) -> (u64, u64) {
-        (learner.updates(), learner.progress().frames())
+        (learner.updates(), learner.run_counts().frames())
     }
 
     /// Saves a last checkpoint, if updates were made or frames stored since the newest one.

@@ -16,7 +16,7 @@ use driml_protocol::{
 use rand::Rng;
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
-use crate::progress::{Progress, ServedPart};
+use crate::run_counts::{BatchPart, RunCounts};
 
 /// Largest age at which a shard's counts are used, and the same for an empty shard.
 const AGE_MAX: Duration = Duration::from_millis(500);
@@ -75,13 +75,13 @@ impl Shards {
         self.sessions.iter().map(client).collect()
     }
 
-    /// Joins the run as its one learner, `learner`, after `updates` updates and with the counts `progress`. `restart` restarts the run
+    /// Joins the run as its one learner, `learner`, after `updates` updates and with the counts `counts`. `restart` restarts the run
     /// from its first update. `None` if the shutdown comes first.
     pub(crate) fn take_part(
         &self,
         clients: &[RunClient],
         learner: u64,
-        (updates, progress): (u64, &Progress),
+        (updates, counts): (u64, &RunCounts),
         restart: bool,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Option<Membership>> {
@@ -96,10 +96,10 @@ impl Shards {
             membership._alive.push(alive);
             let join = LearnerJoin {
                 learner,
-                run: progress.run,
+                run: counts.run,
                 updates,
-                counts: progress.shards[shard],
-                other_shards: progress.other_shards(shard),
+                counts: counts.shards[shard],
+                other_shards: counts.other_shards(shard),
                 restart,
             };
             let joined = join::take_part(client, &join, shutdown)?;
@@ -190,7 +190,7 @@ impl Portion {
 pub(super) struct PartialBatch {
     pub(super) portions: Vec<Portion>,
     pub(super) parts: Vec<Batch>,
-    pub(super) from: Vec<ServedPart>,
+    pub(super) from: Vec<BatchPart>,
     /// Whether all transitions of the run are stored.
     pub(super) all_in: bool,
     /// Time since the last whole batch, or since the transitions that this batch may wait for were stored.

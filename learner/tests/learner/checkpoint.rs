@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_learner::{
-    AffinityEstimator, Alphabet, LearnedAffinity, Progress,
+    AffinityEstimator, Alphabet, LearnedAffinity, RunCounts,
     checkpoint::{self, CheckpointError, Label, LearnerState, list, load_latest, lock},
 };
 use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
@@ -34,7 +34,7 @@ pub(crate) fn start() -> LearnerState {
         affinity: Some(AffinityEstimator::Learned(affinity)),
         rng,
         weights_version: 7,
-        progress: progress(),
+        run_counts: run_counts(),
     }
 }
 
@@ -69,7 +69,7 @@ pub(crate) fn try_save(
 
 fn resume(folder: &Path) -> LearnerState {
     let run = load(folder).unwrap().expect("a checkpoint");
-    assert_eq!((run.weights_version, &run.progress), (7, &progress()));
+    assert_eq!((run.weights_version, &run.run_counts), (7, &run_counts()));
     run
 }
 
@@ -84,12 +84,12 @@ fn bytes(run: &LearnerState) -> [Vec<u8>; 2] {
     [all(run.agent.online()), all(run.agent.target())]
 }
 
-pub(crate) fn progress() -> Progress {
+pub(crate) fn run_counts() -> RunCounts {
     let counts = |inserted, rows_sampled| ShardCounts {
         inserted,
         rows_sampled,
     };
-    Progress {
+    RunCounts {
         run: u64::MAX,
         shards: vec![counts(100, 200), counts(7, 0)],
     }

@@ -36,7 +36,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
             let error = load(folder.path()).expect_err(name);
             assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
             check_says(error, &[name, "remove"]);
-            let error = checkpoint::affinity(&path);
+            let error = checkpoint::read_affinity(&path);
             assert_eq!(error.is_err(), name.starts_with("state.json"), "{name}");
         };
         for cut in [0, whole.len() / 2] {

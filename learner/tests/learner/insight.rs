@@ -7,13 +7,13 @@ use crate::synthetic::{ALL_DIM, agent, random_batch};
 #[test]
 fn distributions_have_the_network_s_values() {
     let (agent, rows) = (agent(ALL_DIM, 5), random_batch(4, 3));
-    let insight = Insight::of(&agent, Compute::CPU).unwrap();
-    let seen = insight.look(&rows.states_t).unwrap();
-    assert_eq!(seen.q_values, agent.q_values_t(&rows.batch()).unwrap());
+    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let outputs = insight.evaluate(&rows.states_t).unwrap();
+    assert_eq!(outputs.q_values, agent.q_values_t(&rows.batch()).unwrap());
     let support = agent.model().atoms_support();
-    assert_eq!(seen.probabilities.len(), 4 * 4 * support.len());
-    let laws = seen.probabilities.chunks(support.len());
-    for (q, law) in seen.q_values.iter().zip(laws) {
+    assert_eq!(outputs.probabilities.len(), 4 * 4 * support.len());
+    let laws = outputs.probabilities.chunks(support.len());
+    for (q, law) in outputs.q_values.iter().zip(laws) {
         let mean: f32 = law.iter().zip(&support).map(|(p, z)| p * z).sum();
         assert!((law.iter().sum::<f32>() - 1.0).abs() < 1e-5);
         assert!((mean - q).abs() < 5e-5, "{mean} and {q}");
@@ -25,9 +25,9 @@ fn distributions_have_the_network_s_values() {
 fn matches_are_what_the_loss_is_made_of() {
     let (agent, mut rows) = (agent(ALL_DIM, 5), random_batch(4, 3));
     rows.positive_valid.fill(1);
-    let insight = Insight::of(&agent, Compute::CPU).unwrap();
+    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
     assert_eq!(insight.local_shape(), Some((2, 3)));
-    let [now, later] = [&rows.states_t, &rows.states_k].map(|it| insight.look(it).unwrap());
+    let [now, later] = [&rows.states_t, &rows.states_k].map(|it| insight.evaluate(it).unwrap());
     let matches = insight.local_matches(&now, &rows.action, &later).unwrap();
     let matches = matches.expect("this agent compares local features");
     assert_eq!(matches.len(), 4 * 2 * 3);
@@ -44,9 +44,9 @@ fn an_agent_without_the_local_pair_has_no_map() {
         ..ALL_DIM
     };
     let (agent, rows) = (agent(lambda, 5), random_batch(4, 3));
-    let insight = Insight::of(&agent, Compute::CPU).unwrap();
-    let seen = insight.look(&rows.states_t).unwrap();
+    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let it = insight.evaluate(&rows.states_t).unwrap();
     assert_eq!(insight.local_shape(), None);
-    let matches = insight.local_matches(&seen, &rows.action, &seen).unwrap();
+    let matches = insight.local_matches(&it, &rows.action, &it).unwrap();
     assert_eq!(matches, None);
 }

@@ -163,8 +163,8 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
         |seed: u8| agent_with(HeadConfig::RAINBOW, settings.clone(), 1).with_noise_seed([seed; 32]);
     let (mut one, mut same, other) = (agent(1), agent(1), agent(2));
     let first = one.noise();
-    assert!(first.online.is_some() && first.online != first.choice);
-    assert!(first.target != first.online && first.target != first.choice);
+    assert!(first.online.is_some() && first.online != first.double_dqn);
+    assert!(first.target != first.online && first.target != first.double_dqn);
     assert!(same.noise() == first && other.noise() != first);
     for _ in 0..2 {
         one.update(&rows.batch()).unwrap();

@@ -32,7 +32,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let config = LearnerConfig::from_toml(&client.config_toml).unwrap();
     let good = Learner::new(config, &Compute::CPU)
         .unwrap()
-        .next_weights()
+        .export_weights()
         .unwrap()
         .safetensors;
     let of = |version, weights: &[u8], learner| upload(hash, learner, version, weights);

@@ -32,7 +32,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
             folder.display()
         )
     })?;
-    let affinity = checkpoint::affinity(path)?
+    let affinity = checkpoint::read_affinity(path)?
         .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
     let side = affinity.num_actions();
     let values = affinity.matrix().into_iter().map(|a| Some(f64::from(a)));

@@ -102,7 +102,7 @@ fn what_is_counted_is_what_is_built() {
             assert_eq!(said, built as u64, "{agent} on {world}");
             assert_eq!(find(&inspection.parameters, "key encoder").is, key as u64);
 
-            let weights = learner.next_weights().unwrap().safetensors.len();
+            let weights = learner.export_weights().unwrap().safetensors.len();
             assert_eq!(find(&inspection.bytes, "a broadcast").is, weights as u64);
             // Rows with every state that a row may have.
             let header = BatchHeader::of(&config.run, config.learner.batch_size)

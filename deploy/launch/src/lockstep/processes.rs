@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
 use driml_envs::EnvError;
-use driml_learner::{Learner, LearnerConfig, ServedPart, checkpoint};
+use driml_learner::{BatchPart, Learner, LearnerConfig, checkpoint};
 use driml_machine::error::usage;
 use driml_protocol::{
     ActorJoin, Batch, BufferPool, InsertReply, LearnerStatus, Leave, Weights, WeightsHeader, codec,
@@ -57,7 +57,7 @@ impl SavedParts {
     fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;
-        let bytes = checkpoint::companion(path)?.filter(|it| !it.is_empty());
+        let bytes = checkpoint::read_companion(path)?.filter(|it| !it.is_empty());
         let bytes = bytes
             .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
         let content = bytes.strip_prefix(&FORMAT.to_le_bytes()).with_context(|| {
@@ -144,7 +144,7 @@ impl Lockstep {
         let Weights {
             header,
             safetensors,
-        } = learner.next_weights()?;
+        } = learner.export_weights()?;
         let turn = Turn {
             next_actor: 0,
             unwanted: vec![0; config.local.actors as usize],
@@ -209,7 +209,7 @@ impl Lockstep {
     /// Writes a checkpoint into `folder`, from which a resumed run continues exactly as this one.
     pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
         let inserted = self.replay.counts().inserted;
-        self.learner.progress_mut().note_inserted(0, inserted);
+        self.learner.run_counts_mut().record_inserted(0, inserted);
         let Some(mark) = self.replay.mark()? else {
             // An empty companion says that the run is in lockstep, and cannot be resumed.
             return Ok(self.learner.save_with(folder, Some(&[]))?);
@@ -274,7 +274,7 @@ impl Lockstep {
 
     fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
         let report = self.learner.update(batch)?;
-        self.learner.progress_mut().note(&[ServedPart {
+        self.learner.run_counts_mut().add_batch(&[BatchPart {
             shard: 0,
             rows: batch.header.rows,
             inserted: batch.header.counts.inserted,
@@ -285,7 +285,7 @@ impl Lockstep {
             set.map_err(anyhow::Error::msg)
                 .context("the replay rejected priorities")?;
         }
-        self.learner.note(&report, &mut self.turn.status);
+        self.learner.write_status(&report, &mut self.turn.status);
         if let Some(affinity) = self.learner.affinity_update(LEARNER) {
             let set = self.replay.set_affinity(&affinity);
             set.map_err(anyhow::Error::msg)?;
@@ -300,7 +300,7 @@ impl Lockstep {
         let Weights {
             header,
             safetensors,
-        } = self.learner.next_weights()?;
+        } = self.learner.export_weights()?;
         for actor in &mut self.actors {
             actor.set_weights(header.version, &safetensors)?;
         }

@@ -9,7 +9,7 @@ use driml_actor::Step;
 use driml_envs::StepEnd;
 use driml_figure::{FigureError, Film, Picture};
 use driml_launch::evaluate::{Player, Viewer};
-use driml_learner::insight::Seen;
+use driml_learner::insight::NetworkOutputs;
 use driml_machine::error::{Usage, usage};
 use driml_protocol::Horizon;
 
@@ -56,7 +56,7 @@ pub(crate) struct Recording {
 /// One step of all environments.
 struct Moment {
     shots: Vec<Shot>,
-    seen: Option<Seen>,
+    seen: Option<NetworkOutputs>,
     actions: Vec<u8>,
     ends: Vec<StepEnd>,
 }

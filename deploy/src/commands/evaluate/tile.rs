@@ -3,7 +3,7 @@
 
 use driml_envs::FrameShape;
 use driml_figure::{Image, Ink, Picture, Rect};
-use driml_learner::insight::Seen;
+use driml_learner::insight::NetworkOutputs;
 use driml_settings::config::RunConfig;
 
 /// The approximate length of an enlarged frame's longer side, in pixels. The zoom is a whole number.
@@ -112,7 +112,7 @@ impl Layout {
     }
 
     /// Returns the outputs in `seen` for environment `i`, in which `action` was taken.
-    pub(super) fn look(&self, seen: &Seen, i: usize, action: u8) -> Look {
+    pub(super) fn look(&self, seen: &NetworkOutputs, i: usize, action: u8) -> Look {
         let (actions, atoms) = (self.action_names.len(), self.support.len());
         let taken = i * actions + usize::from(action);
         Look {

@@ -118,7 +118,7 @@ impl Events {
         if self.drawn.is_some_and(|drawn| drawn >= updates) {
             return None;
         }
-        let affinity = checkpoint::affinity(&path).ok()?;
+        let affinity = checkpoint::read_affinity(&path).ok()?;
         self.drawn = Some(updates);
         let affinity = affinity?;
         let picture = draw(affinity.num_actions(), &affinity.matrix()).ok()?;
