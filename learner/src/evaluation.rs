@@ -163,12 +163,7 @@ impl Networks {
         batch: &Batch<'_>,
         noise: &UpdateNoise,
     ) -> Result<BellmanTarget, UpdateError> {
-        let ModelConfig {
-            atoms,
-            v_min,
-            v_max,
-            ..
-        } = self.model;
+        let atoms = self.model.atoms;
         let mut next_greedy_action = vec![NO_ACTION; batch.rows];
         let mut probs = vec![0f32; batch.rows * atoms];
         for probs in probs.chunks_exact_mut(atoms) {
@@ -192,8 +187,8 @@ impl Networks {
             &probs,
             batch.n_step_return,
             batch.bootstrap_discount,
-            v_min,
-            v_max,
+            self.model.v_min,
+            self.model.v_max,
             &mut projection,
         );
         Ok(BellmanTarget {

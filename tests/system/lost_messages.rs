@@ -13,7 +13,7 @@ use std::{
 };
 
 use driml_actor::DeliveryLimits;
-use driml_learner::remote::batch_source::Served;
+use driml_learner::remote::batch_source::ServedBatch;
 use driml_protocol::{
     Ack, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply,
     Keyed, Keys, Leave, ReplayStatus, Request, RunSpec, ShardCounts, Shutdown, codec, session,
@@ -311,7 +311,7 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     for shards in [1, 3] {
         let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
         let mut batches = 0;
-        while let Some(Served { batch, parts }) = served.learner.next() {
+        while let Some(ServedBatch { batch, parts }) = served.learner.next() {
             assert_eq!(batch.rows(), ROWS as usize);
             assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
             batches += 1;

@@ -4,7 +4,9 @@
 use std::time::Duration;
 
 use driml_actor::{Delivery, DeliveryLimits};
-use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
+use driml_learner::remote::batch_source::{
+    BatchSource, Counters, NextBatch, Requests, ServedBatch,
+};
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End, RunClient, Shutdown};
 
 /// The time-out of a batch and of a reply.
@@ -18,30 +20,28 @@ impl SyntheticLearner {
     /// Starts a learner that requests batches of `rows` rows from these replay servers, one per shard, `in_flight` at a time.
     pub(crate) fn start(clients: &[RunClient], learner: u64, rows: u32, in_flight: u32) -> Self {
         let requests = Requests {
-            learner,
+            learner_id: learner,
             rows,
             in_flight,
             shared_memory: false,
             unreachable_max: PATIENCE,
         };
         let (counters, never) = (Counters::at_start(clients.len()), Shutdown::default());
-        let source = BatchSource::start(clients, requests, &counters, &never);
-        Self {
-            source: source.unwrap(),
-        }
+        let source = BatchSource::start(clients, requests, &counters, &never).unwrap();
+        Self { source }
     }
 
     /// Returns the next batch; `None` at the end of the run.
-    pub(crate) fn next(&mut self) -> Option<Served> {
+    pub(crate) fn next(&mut self) -> Option<ServedBatch> {
         match self.source.next(PATIENCE).unwrap() {
-            Next::Batch(served) => Some(*served),
-            Next::Finished => None,
-            Next::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
+            NextBatch::Ready(served) => Some(*served),
+            NextBatch::Finished => None,
+            NextBatch::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
         }
     }
 
     pub(crate) fn end(self) {
-        self.source.end();
+        self.source.join_threads();
     }
 }
 

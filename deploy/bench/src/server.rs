@@ -12,7 +12,7 @@ use driml_actor::{ActorSettings, Delivery, DeliveryLimits};
 use driml_launch::{endpoint::NAMESPACE, managed_process::ManagedProcess};
 use driml_learner::{
     LearnerConfig,
-    remote::batch_source::{BatchSource, Counters, Next, Requests},
+    remote::batch_source::{BatchSource, Counters, NextBatch, Requests},
 };
 use driml_machine::effort::Effort;
 use driml_protocol::{
@@ -135,7 +135,7 @@ impl Server {
             learner, transport, ..
         } = &self.learner;
         let requests = Requests {
-            learner: LEARNER,
+            learner_id: LEARNER,
             rows: learner.batch_size,
             in_flight: learner.batches_in_flight,
             shared_memory: transport.shared_memory,
@@ -144,7 +144,7 @@ impl Server {
         let clients = std::slice::from_ref(&client);
         let mut source = BatchSource::start(clients, requests, &Counters::at_start(1), &shutdown)?;
         let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
-            Next::Batch(served) => {
+            NextBatch::Ready(served) => {
                 // Read one byte of each cache line, so that all states have arrived.
                 let batch = &served.batch;
                 for plane in [batch.states_t(), batch.states_k(), batch.states_n()] {
@@ -153,14 +153,14 @@ impl Server {
                 }
                 Ok(())
             }
-            Next::NotYet(waiting) => {
+            NextBatch::NotYet(waiting) => {
                 bail!("no batch came within {} s: {waiting}", ANSWER_MAX.as_secs())
             }
-            Next::Finished => bail!("the replay server reports that the run is over"),
+            NextBatch::Finished => bail!("the replay server reports that the run is over"),
         });
         // A request in flight must get its reply before the session is closed.
         shutdown.set();
-        while matches!(source.next(ANSWER_MAX)?, Next::Batch(_)) {}
+        while matches!(source.next(ANSWER_MAX)?, NextBatch::Ready(_)) {}
         rate
     }
 

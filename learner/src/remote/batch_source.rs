@@ -9,28 +9,28 @@ use std::{
 
 use driml_protocol::{RunClient, Shutdown, Waiting, join_within};
 
-pub use super::fetcher::{Counters, Requests, Served};
+pub use super::fetcher::{Counters, Requests, ServedBatch};
 use super::{
     error::BatchError,
-    fetcher::{Fetched, Fetcher, Shared},
+    fetcher::{Fetcher, Message, SharedState},
 };
 
 /// How long the threads may take to end.
-const THREADS_END_MAX: Duration = Duration::from_secs(2);
+const JOIN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The queue of fetched batches.
 pub struct BatchSource {
-    fetched: mpsc::Receiver<Fetched>,
+    fetched: mpsc::Receiver<Message>,
     /// Number of threads that have not reported that they are finished.
-    fetching: u32,
+    running_threads: u32,
     threads: Vec<JoinHandle<()>>,
-    shared: Arc<Shared>,
+    shared: Arc<SharedState>,
 }
 
 /// The result of waiting for the next batch.
-pub enum Next {
+pub enum NextBatch {
     /// A batch to learn from.
-    Batch(Box<Served>),
+    Ready(Box<ServedBatch>),
     /// No batch arrived within the time-out; call again. The replay server reports which side waits for the other.
     NotYet(Waiting),
     /// The run is over: no further batch will come.
@@ -46,7 +46,7 @@ impl BatchSource {
         shutdown: &Shutdown,
     ) -> std::io::Result<Self> {
         let (sender, fetched) = mpsc::sync_channel(0);
-        let shared = Shared::new(clients, requests, counters, shutdown);
+        let shared = SharedState::new(clients, requests, counters, shutdown);
         let mut threads = Vec::new();
         for i in 0..requests.in_flight {
             let fetcher = Fetcher::new(&shared);
@@ -58,36 +58,36 @@ impl BatchSource {
         }
         Ok(Self {
             fetched,
-            fetching: requests.in_flight,
+            running_threads: requests.in_flight,
             threads,
             shared,
         })
     }
 
     /// Waits until the threads have ended, which the end of the session causes.
-    pub fn end(self) {
+    pub fn join_threads(self) {
         drop(self.fetched);
-        join_within(self.threads, THREADS_END_MAX);
+        join_within(self.threads, JOIN_TIMEOUT);
     }
 
     /// Returns the next batch. Batches in flight when the first thread learns that the run is over still arrive.
     ///
     /// # Errors
     /// The replay server was unreachable for too long, or rejects a request.
-    pub fn next(&mut self, timeout: Duration) -> Result<Next, BatchError> {
+    pub fn next(&mut self, timeout: Duration) -> Result<NextBatch, BatchError> {
         let deadline = Instant::now() + timeout;
-        while self.fetching > 0 {
+        while self.running_threads > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.fetched.recv_timeout(left) {
-                Ok(Fetched::Batch(served)) => return Ok(Next::Batch(served)),
-                Ok(Fetched::Finished) => self.fetching -= 1,
-                Ok(Fetched::Failed(e)) => return Err(e),
+                Ok(Message::Batch(served)) => return Ok(NextBatch::Ready(served)),
+                Ok(Message::Finished) => self.running_threads -= 1,
+                Ok(Message::Failed(e)) => return Err(e),
                 Err(mpsc::RecvTimeoutError::Disconnected) if !self.shared.shutdown.is_set() => {
                     return Err(BatchError::ThreadsEnded);
                 }
-                Err(_) => return Ok(Next::NotYet(self.shared.waiting())),
+                Err(_) => return Ok(NextBatch::NotYet(self.shared.waiting())),
             }
         }
-        Ok(Next::Finished)
+        Ok(NextBatch::Finished)
     }
 }

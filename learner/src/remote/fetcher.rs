@@ -20,7 +20,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     error::BatchError,
-    shards::{PartialBatch, Portion},
+    shards::{PartialBatch, ShardState},
 };
 use crate::run_counts::{BatchPart, RunCounts};
 
@@ -30,14 +30,14 @@ const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 
 /// Pause before empty shards are asked again.
-const LOOK_AGAIN: Duration = Duration::from_millis(50);
+const EMPTY_SHARDS_PAUSE: Duration = Duration::from_millis(50);
 /// How long to wait for the last batch once all transitions are stored and no shard refills its memory.
 const LAST_BATCH_MAX: Duration = Duration::from_secs(30);
 /// What the threads request, for which learner, and how.
 #[derive(Clone, Copy, Debug)]
 pub struct Requests {
     /// Identifier of the learner that has joined the run.
-    pub learner: u64,
+    pub learner_id: u64,
     /// Rows of a batch.
     pub rows: u32,
     /// Number of requests in flight, each with its own thread.
@@ -56,17 +56,17 @@ pub struct Counters {
     /// Updates in the newest checkpoint.
     pub saved_updates: AtomicU64,
     /// Rows received from each shard.
-    received: Vec<AtomicU64>,
+    rows_received: Vec<AtomicU64>,
 }
 
 impl Counters {
     /// The counters of a learner after `updates` updates, all of which are saved.
-    pub fn of(updates: u64, counts: &RunCounts) -> Arc<Self> {
+    pub fn new(updates: u64, counts: &RunCounts) -> Arc<Self> {
         let shards = counts.shards.iter();
         Arc::new(Self {
             updates: updates.into(),
             saved_updates: updates.into(),
-            received: shards.map(|it| it.rows_sampled.into()).collect(),
+            rows_received: shards.map(|it| it.rows_sampled.into()).collect(),
         })
     }
 
@@ -74,20 +74,20 @@ impl Counters {
     pub fn at_start(shards: usize) -> Arc<Self> {
         let mut counts = RunCounts::default();
         counts.spread_over(shards);
-        Self::of(0, &counts)
+        Self::new(0, &counts)
     }
 
     fn learned(&self, shard: usize) -> Learned {
         Learned {
             updates: self.updates.load(Ordering::Acquire),
             saved_updates: self.saved_updates.load(Ordering::Acquire),
-            rows_received: self.received[shard].load(Ordering::Acquire),
+            rows_received: self.rows_received[shard].load(Ordering::Acquire),
         }
     }
 }
 
 /// A batch, and the shards that its rows come from.
-pub struct Served {
+pub struct ServedBatch {
     /// The batch to learn from.
     pub batch: Batch,
     /// The batch's rows by shard.
@@ -95,13 +95,13 @@ pub struct Served {
 }
 
 /// A message from a fetching thread.
-pub(super) enum Fetched {
-    Batch(Box<Served>),
+pub(super) enum Message {
+    Batch(Box<ServedBatch>),
     Finished,
     Failed(BatchError),
 }
 
-pub(super) struct Shared {
+pub(super) struct SharedState {
     clients: Vec<RunClient>,
     requests: Requests,
     counters: Arc<Counters>,
@@ -111,7 +111,7 @@ pub(super) struct Shared {
     pub(super) shutdown: Shutdown,
 }
 
-impl Shared {
+impl SharedState {
     pub(super) fn new(
         clients: &[RunClient],
         requests: Requests,
@@ -137,29 +137,29 @@ impl Shared {
 }
 
 pub(super) struct Fetcher {
-    shared: Arc<Shared>,
+    shared: Arc<SharedState>,
     /// Identifier of the next request for a whole batch.
-    id: RequestId,
+    request_id: RequestId,
     rng: ChaCha8Rng,
     /// Whether batches may come through shared memory.
     trust: Trust,
-    said: LogLimiter,
+    log_limiter: LogLimiter,
 }
 
 impl Fetcher {
-    pub(super) fn new(shared: &Arc<Shared>) -> Self {
+    pub(super) fn new(shared: &Arc<SharedState>) -> Self {
         // The order of replies decides which rows come from which shard, so this need not be the run's generator.
         let mut rng = ChaCha8Rng::from_os_rng();
         Self {
             shared: shared.clone(),
-            id: RequestId::first(rng.random()),
+            request_id: RequestId::first(rng.random()),
             rng,
             trust: Trust::default(),
-            said: LogLimiter::default(),
+            log_limiter: LogLimiter::default(),
         }
     }
 
-    pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
+    pub(super) fn run(mut self, sender: &mpsc::SyncSender<Message>) {
         let mut silence = Silence::default();
         while !self.shared.shutdown.is_set() {
             fail_point::reach("batches");
@@ -177,20 +177,20 @@ impl Fetcher {
                     if silence.unanswered() <= unreachable_max {
                         // At a shutdown the server may be gone already.
                         if !self.shared.shutdown.is_set()
-                            && let Some(more) = self.said.due()
+                            && let Some(more) = self.log_limiter.due()
                         {
                             tracing::warn!("asking for a batch again: {e}{more}");
                         }
                         self.shared.shutdown.wait_timeout(RETRY_PAUSE);
                         continue;
                     }
-                    Fetched::Failed(BatchError::Unreachable {
+                    Message::Failed(BatchError::Unreachable {
                         unreachable_max,
                         source: Box::new(e),
                     })
                 }
             };
-            if let Fetched::Batch(served) = &fetched {
+            if let Message::Batch(served) = &fetched {
                 let header = &served.batch.header;
                 let (newest, oldest) = header.weights_versions;
                 tracing::debug!(
@@ -198,8 +198,8 @@ impl Fetcher {
                     header.rows
                 );
             }
-            let last = !matches!(fetched, Fetched::Batch(_));
-            if sender.send(fetched).is_err() || last {
+            let is_last = !matches!(fetched, Message::Batch(_));
+            if sender.send(fetched).is_err() || is_last {
                 return;
             }
             silence.answered();
@@ -207,29 +207,29 @@ impl Fetcher {
     }
 
     /// Fetches one batch; `None` if the replay has none yet.
-    fn fetch(&mut self) -> Result<Option<Fetched>, BatchError> {
+    fn fetch(&mut self) -> Result<Option<Message>, BatchError> {
         if self.shared.clients.len() > 1 {
             return self.fetch_from_shards();
         }
-        self.id = self.id.again();
-        let asked = self.ask(0, self.id, self.shared.requests.rows, None)?;
-        let answer = self.answer(asked)?;
-        self.id = self.id.next();
-        Ok(match answer {
+        self.request_id = self.request_id.again();
+        let pending = self.send_request(0, self.request_id, self.shared.requests.rows, None)?;
+        let reply = self.receive_reply(pending)?;
+        self.request_id = self.request_id.next();
+        Ok(match reply {
             Ok(batch) => {
-                let parts = vec![self.received(0, &batch)];
-                Some(Fetched::Batch(Box::new(Served { batch, parts })))
+                let parts = vec![self.count_received(0, &batch)];
+                Some(Message::Batch(Box::new(ServedBatch { batch, parts })))
             }
             Err(NotReady::Wait(_)) => None,
-            Err(NotReady::Finished) => Some(Fetched::Finished),
-            Err(NotReady::Refused { why }) => Some(Fetched::Failed(BatchError::Refused(why))),
+            Err(NotReady::Finished) => Some(Message::Finished),
+            Err(NotReady::Refused { why }) => Some(Message::Failed(BatchError::Refused(why))),
         })
     }
 
     /// Counts the rows received from a shard.
-    fn received(&self, shard: usize, part: &Batch) -> BatchPart {
+    fn count_received(&self, shard: usize, part: &Batch) -> BatchPart {
         let rows = part.header.rows;
-        self.shared.counters.received[shard].fetch_add(rows.into(), Ordering::AcqRel);
+        self.shared.counters.rows_received[shard].fetch_add(rows.into(), Ordering::AcqRel);
         BatchPart {
             shard,
             rows,
@@ -239,105 +239,105 @@ impl Fetcher {
 
     /// Assembles one batch from the parts of the shards. Only one batch is assembled at a time: each shard is told the counts of the
     /// others, so that their rate limiters decide as one.
-    fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
+    fn fetch_from_shards(&mut self) -> Result<Option<Message>, BatchError> {
         let shared = self.shared.clone();
         let mut partial = lock(&shared.partial);
-        if partial.parts.is_empty() && partial.is_whole() {
-            self.recount(&mut partial, Portion::is_old)?;
+        if partial.parts.is_empty() && partial.is_complete() {
+            self.fetch_counts(&mut partial, ShardState::is_stale)?;
             if !partial.begin(self.shared.requests.rows, &mut self.rng) {
                 // The run had all its updates when it was resumed: the shards stay empty.
-                if partial.all_in {
-                    return Ok(Some(Fetched::Finished));
+                if partial.all_stored {
+                    return Ok(Some(Message::Finished));
                 }
-                self.shared.shutdown.wait_timeout(LOOK_AGAIN);
+                self.shared.shutdown.wait_timeout(EMPTY_SHARDS_PAUSE);
                 return Ok(None);
             }
         }
-        let mut asked = Vec::new();
-        for shard in 0..partial.portions.len() {
-            let other_shards = partial.other_shards(shard);
-            let portion = &mut partial.portions[shard];
-            if portion.pending > 0 {
-                portion.id = portion.id.again();
-                let part = self.ask(shard, portion.id, portion.pending, Some(other_shards))?;
-                asked.push((shard, part));
+        let mut pending_replies = Vec::new();
+        for shard in 0..partial.shards.len() {
+            let others = partial.other_shards(shard);
+            let state = &mut partial.shards[shard];
+            if state.pending_rows > 0 {
+                state.id = state.id.again();
+                let reply = self.send_request(shard, state.id, state.pending_rows, Some(others))?;
+                pending_replies.push((shard, reply));
             }
         }
         let (mut finished, mut failed) = (false, None);
-        for (shard, asked) in asked {
+        for (shard, pending) in pending_replies {
             // Only the part that did not arrive is requested again.
-            let answer = match self.answer(asked) {
-                Ok(answer) => answer,
+            let reply = match self.receive_reply(pending) {
+                Ok(reply) => reply,
                 Err(e) => {
                     failed.get_or_insert(e);
                     continue;
                 }
             };
-            let portion = &mut partial.portions[shard];
-            portion.id = portion.id.next();
-            match answer {
+            let state = &mut partial.shards[shard];
+            state.id = state.id.next();
+            match reply {
                 Ok(mut part) => {
-                    portion.note(part.header.counts, part.header.held);
-                    portion.pending = 0;
+                    state.record_counts(part.header.counts, part.header.held);
+                    state.pending_rows = 0;
                     if part.header.origin.is_some() {
-                        part.scale_probabilities(portion.share as f32);
+                        part.scale_probabilities(state.share as f32);
                     }
-                    partial.from.push(self.received(shard, &part));
+                    partial.sources.push(self.count_received(shard, &part));
                     partial.parts.push(part);
                 }
-                Err(NotReady::Wait(waiting)) => partial.note_waiting(waiting),
+                Err(NotReady::Wait(waiting)) => partial.record_waiting(waiting),
                 Err(NotReady::Finished) => finished = true,
                 Err(NotReady::Refused { why }) => {
-                    return Ok(Some(Fetched::Failed(BatchError::Refused(why))));
+                    return Ok(Some(Message::Failed(BatchError::Refused(why))));
                 }
             }
         }
         if let Some(e) = failed {
             return Err(e);
         }
-        if partial.is_whole() {
+        if partial.is_complete() {
             let header = Batch::merged_header(&partial.parts);
             let header = header.ok_or(BatchError::DifferentShards)?;
             let memory = self.shared.pool.take_own(header.payload_bytes());
             let batch = Batch::merge(&partial.parts, memory);
             partial.parts.clear();
-            let parts = std::mem::take(&mut partial.from);
-            partial.since_whole.answered();
-            return Ok(Some(Fetched::Batch(Box::new(Served { batch, parts }))));
+            let parts = std::mem::take(&mut partial.sources);
+            partial.since_last_batch.answered();
+            return Ok(Some(Message::Batch(Box::new(ServedBatch { batch, parts }))));
         }
-        self.recount(&mut partial, |_, _| true)?;
+        self.fetch_counts(&mut partial, |_, _| true)?;
         // Once a part has come, a shard that reports the end may have been told outdated counts of the other shards.
         let is_over = finished && partial.parts.is_empty();
-        let waited = partial.since_whole.unanswered();
-        if !is_over && partial.all_in && waited > LAST_BATCH_MAX {
-            let left = partial.portions.iter().enumerate();
-            let left = left.filter(|(_, portion)| portion.pending > 0);
+        let waited = partial.since_last_batch.unanswered();
+        if !is_over && partial.all_stored && waited > LAST_BATCH_MAX {
+            let left = partial.shards.iter().enumerate();
+            let left = left.filter(|(_, state)| state.pending_rows > 0);
             let left: Vec<_> = left
-                .map(|(shard, portion)| format!("{} rows of shard {shard}", portion.pending))
+                .map(|(shard, state)| format!("{} rows of shard {shard}", state.pending_rows))
                 .collect();
             tracing::warn!(
                 "all transitions are in, and the last batch lacks {} since {} s: it is left out",
                 left.join(" and "),
                 LAST_BATCH_MAX.as_secs()
             );
-            return Ok(Some(Fetched::Finished));
+            return Ok(Some(Message::Finished));
         }
         if partial.parts.is_empty() {
             // No part came, so draw anew: a shard that was not asked may hold back inserts until a request tells it how far the run is.
-            partial.withdraw();
+            partial.abandon();
         }
-        Ok(is_over.then_some(Fetched::Finished))
+        Ok(is_over.then_some(Message::Finished))
     }
 
     /// Fetches the counts of the shards for which `is_due` is true.
-    fn recount(
+    fn fetch_counts(
         &self,
         partial: &mut PartialBatch,
-        is_due: impl Fn(&Portion, Instant) -> bool,
+        is_due: impl Fn(&ShardState, Instant) -> bool,
     ) -> Result<(), BatchError> {
-        let (now, mut all_in) = (Instant::now(), false);
-        for (client, portion) in self.shared.clients.iter().zip(&mut partial.portions) {
-            if !is_due(portion, now) {
+        let (now, mut all_stored) = (Instant::now(), false);
+        for (client, state) in self.shared.clients.iter().zip(&mut partial.shards) {
+            if !is_due(state, now) {
                 continue;
             }
             let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
@@ -345,14 +345,14 @@ impl Fetcher {
                 inserted: status.transitions_inserted,
                 rows_sampled: status.rows_sampled,
             };
-            portion.note(counts, status.transitions_held);
-            all_in |= status.finished;
+            state.record_counts(counts, status.transitions_held);
+            all_stored |= status.finished;
         }
-        partial.note_all_in(all_in);
+        partial.set_stored(all_stored);
         Ok(())
     }
 
-    fn ask(
+    fn send_request(
         &mut self,
         shard: usize,
         id: RequestId,
@@ -360,7 +360,7 @@ impl Fetcher {
         other_shards: Option<ShardCounts>,
     ) -> Result<(PendingReply<BatchReply>, bool), BatchError> {
         let request = BatchRequest {
-            learner: self.shared.requests.learner,
+            learner: self.shared.requests.learner_id,
             id,
             rows,
             shared_memory: self.shared.requests.shared_memory && self.trust.ask(),
@@ -368,22 +368,22 @@ impl Fetcher {
             other_shards,
         };
         let client = &self.shared.clients[shard];
-        let asked = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;
-        Ok((asked, request.shared_memory))
+        let pending = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;
+        Ok((pending, request.shared_memory))
     }
 
     /// Receives a shard's reply: a batch, or why there is none.
-    fn answer(
+    fn receive_reply(
         &mut self,
-        (asked, shared_memory): (PendingReply<BatchReply>, bool),
+        (pending, shared_memory): (PendingReply<BatchReply>, bool),
     ) -> Result<Result<Batch, NotReady>, BatchError> {
         // A process that may not map shared memory never receives the reply: the request looks unanswered.
-        let (reply, payload) = asked.receive(&self.shared.pool).inspect_err(|e| {
-            let unheard = matches!(
+        let (reply, payload) = pending.receive(&self.shared.pool).inspect_err(|e| {
+            let is_lost = matches!(
                 e,
                 SessionError::NoReply { .. } | SessionError::NoAnswerer { .. }
             );
-            if shared_memory && unheard {
+            if shared_memory && is_lost {
                 self.trust.lost();
             }
         })?;

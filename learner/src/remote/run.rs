@@ -15,7 +15,7 @@ use driml_protocol::{
 };
 
 use super::{
-    batch_source::{BatchSource, Counters, Next, Requests, Served},
+    batch_source::{BatchSource, Counters, NextBatch, Requests, ServedBatch},
     publish::Publisher,
     shards::Shards,
 };
@@ -26,11 +26,11 @@ use crate::{
 };
 
 /// Time-out of the last request for the number of transitions that a replay server has stored.
-const LAST_COUNT_MAX: Duration = Duration::from_secs(1);
+const LAST_COUNT_TIMEOUT: Duration = Duration::from_secs(1);
 /// How long a learner stays at the end, until its last weights have arrived and its last status was requested.
-const LAST_WORD_MAX: Duration = Duration::from_secs(3);
+const LAST_FETCH_MAX: Duration = Duration::from_secs(3);
 /// How long a batch may take before the wait is logged.
-const SILENT_MAX: Duration = Duration::from_secs(10);
+const WAIT_LOG_AFTER: Duration = Duration::from_secs(10);
 /// How often a waiting learner checks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
 
@@ -61,7 +61,7 @@ pub struct RunArgs {
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let credentials = args.credentials.as_ref();
-    let Some(shards) = Shards::join(&args.connect, &keys, credentials, shutdown)? else {
+    let Some(shards) = Shards::connect(&args.connect, &keys, credentials, shutdown)? else {
         return Ok(false);
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)
@@ -70,17 +70,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
     let rows = config.learner.batch_size;
+    let learner_id = rand::random();
     let mut requests = Requests {
-        learner: rand::random(),
+        learner_id,
         rows,
         in_flight: config.learner.batches_in_flight,
         shared_memory: config.transport.shared_memory,
         unreachable_max: Duration::from_millis(config.learner.unreachable_max_ms),
     };
     let batch = BatchHeader::of(&config.spec, rows).sampled_by(&config.sampling);
-    let each = shared_memory::process_bytes(batch.pool_bytes());
+    let session_bytes = shared_memory::process_bytes(batch.pool_bytes());
     if requests.shared_memory
-        && let Err(why) = shared_memory::check_lockable(each * shards.sessions.len())
+        && let Err(why) = shared_memory::check_lockable(session_bytes * shards.sessions.len())
     {
         tracing::warn!("batches come through sockets, which is slower: {why}");
         requests.shared_memory = false;
@@ -105,28 +106,28 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         counts.run = rand::random();
     }
     let counts = (updates, &*counts);
-    let joined = shards.take_part(&clients, requests.learner, counts, args.restart, shutdown)?;
+    let joined = shards.join_run(&clients, learner_id, counts, args.restart, shutdown)?;
     let Some(membership) = joined else {
         return Ok(false);
     };
     learner.raise_weights_version(membership.weights_version);
-    keep_settings(&args.run_dir, &shards.config_toml)?;
-    let publisher = Publisher::open(&clients, spec_hash, requests.learner, &sampling, shutdown)?;
+    write_settings(&args.run_dir, &shards.config_toml)?;
+    let publisher = Publisher::start(&clients, spec_hash, learner_id, &sampling, shutdown)?;
     publisher.publish(learner.export_weights()?);
     if updates > 0 {
-        publisher.with_status(|status| status.updates = updates);
-        if let Some(affinity) = learner.affinity_update(publisher.learner) {
-            publisher.affinity.put(affinity);
+        publisher.update_status(|status| status.updates = updates);
+        if let Some(affinity) = learner.affinity_update(learner_id) {
+            publisher.affinity.push(affinity);
         }
     }
     let activity = Activity::new("waits for its first batch");
     reporter::start(
         clients.clone(),
-        Participant::Learner(requests.learner),
+        Participant::Learner(learner_id),
         activity.clone(),
         shutdown.clone(),
     )?;
-    let counters = Counters::of(updates, learner.run_counts());
+    let counters = Counters::new(updates, learner.run_counts());
     let mut batches = BatchSource::start(&clients, requests, &counters, shutdown)?;
     let device = args.device;
     tracing::info!("learning on {device} from batches of {rows} rows, run {spec_hash:016x}");
@@ -134,8 +135,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let mut checkpointer = Checkpointer {
         folder,
         counters,
-        saved: None,
-        failed: None,
+        saved_counts: None,
+        first_failure: None,
     };
     let learned = learn(
         &mut learner,
@@ -151,38 +152,38 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     activity.begin("saves its last checkpoint");
     // Transitions stored since the last batch count too.
     for (shard, client) in clients.iter().enumerate() {
-        match client.fetch::<ReplayStatus>(LAST_COUNT_MAX) {
+        match client.fetch::<ReplayStatus>(LAST_COUNT_TIMEOUT) {
             Ok(status) => learner
                 .run_counts_mut()
                 .record_inserted(shard, status.transitions_inserted),
             Err(e) => tracing::debug!("the last count of shard {shard}: {e}"),
         }
     }
-    let saved = checkpointer.finish(&learner);
+    let saved = checkpointer.save_last(&learner);
     if learned.is_ok() && !learner.publication_is_due() {
         publisher.publish(learner.export_weights()?);
     }
-    let is_over = learned?;
+    let is_run_over = learned?;
     saved?;
-    publisher.with_status(|status| status.finished = true);
+    publisher.update_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
     if args.keep_alive {
         activity.begin("has finished and stays to be asked");
         shutdown.wait();
     }
-    publisher.wait_until_heard(LAST_WORD_MAX, shutdown);
+    publisher.wait_until_fetched(LAST_FETCH_MAX, shutdown);
     if sampling.is_prioritised() {
-        let arrived = publisher.priorities.arrived.load(Ordering::Relaxed);
+        let arrived = publisher.priorities.acknowledged.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
     }
-    if is_over {
-        let (updates, who) = (learner.updates(), Participant::Learner(requests.learner));
+    if is_run_over {
+        let (updates, who) = (learner.updates(), Participant::Learner(learner_id));
         reporter::say_finished(&clients, who, updates, shutdown);
     }
     drop(membership);
     let closed = shards.close();
-    batches.end();
-    closed.map(|()| is_over)
+    batches.join_threads();
+    closed.map(|()| is_run_over)
 }
 
 /// Learns from batch after batch until there are no more, which returns true, or until `shutdown`.
@@ -195,42 +196,42 @@ fn learn(
     shutdown: &Shutdown,
 ) -> anyhow::Result<bool> {
     // A wait is logged after some seconds, then ever more seldom.
-    let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
+    let (mut waiting_since, mut log_after) = (Instant::now(), WAIT_LOG_AFTER);
     while !shutdown.is_set() {
-        let Served { batch, parts } = match batches.next(TICK)? {
-            Next::Batch(served) => *served,
-            Next::NotYet(waiting) => {
+        let ServedBatch { batch, parts } = match batches.next(TICK)? {
+            NextBatch::Ready(served) => *served,
+            NextBatch::NotYet(waiting) => {
                 activity.begin("waits for a batch");
                 let since = waiting_since.elapsed();
-                if since > said_next {
+                if since > log_after {
                     let since = since.as_secs();
                     tracing::info!("waiting for a batch since {since} s: {waiting}");
-                    said_next *= 2;
+                    log_after *= 2;
                 }
                 continue;
             }
-            Next::Finished => return Ok(true),
+            NextBatch::Finished => return Ok(true),
         };
         activity.begin("learns");
-        said_next = SILENT_MAX;
+        log_after = WAIT_LOG_AFTER;
         let started = Instant::now();
         let report = learner.update(&batch)?;
         learner.run_counts_mut().add_batch(&parts);
         let counters = &checkpointer.counters;
         counters.updates.store(learner.updates(), Ordering::Release);
         // Numbered by updates, which only increase within one learner process.
-        let (by, number) = (publisher.learner, learner.updates());
-        if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
-            publisher.priorities.put(priorities);
+        let (learner_id, number) = (publisher.learner_id, learner.updates());
+        if let Some(priorities) = batch.priority_update(learner_id, number, &report.row_kls) {
+            publisher.priorities.push(priorities);
         }
-        if let Some(affinity) = learner.affinity_update(by) {
-            publisher.affinity.put(affinity);
+        if let Some(affinity) = learner.affinity_update(learner_id) {
+            publisher.affinity.push(affinity);
         }
         if learner.publication_is_due() {
             publisher.publish(learner.export_weights()?);
         }
         let ended = Instant::now();
-        publisher.with_status(|status| {
+        publisher.update_status(|status| {
             learner.write_status(&report, status);
             status.waiting_s += (started - waiting_since).as_secs_f64();
             status.computing_s += (ended - started).as_secs_f64();
@@ -249,26 +250,26 @@ struct Checkpointer {
     folder: PathBuf,
     counters: Arc<Counters>,
     /// Updates and frames in the newest checkpoint that this process saved.
-    saved: Option<(u64, u64)>,
+    saved_counts: Option<(u64, u64)>,
     /// The first failure since that checkpoint.
-    failed: Option<LearnerError>,
+    first_failure: Option<LearnerError>,
 }
 
 impl Checkpointer {
     fn save(&mut self, learner: &Learner) {
         match learner.save(&self.folder) {
             Ok(()) => {
-                self.saved = Some(Self::counts(learner));
-                let saved = &self.counters.saved_updates;
-                saved.store(learner.updates(), Ordering::Release);
-                self.failed = None;
+                self.saved_counts = Some(Self::counts(learner));
+                let saved_updates = &self.counters.saved_updates;
+                saved_updates.store(learner.updates(), Ordering::Release);
+                self.first_failure = None;
             }
             Err(e) => {
                 tracing::warn!(
                     "no checkpoint after {} updates, trying again at the next period: {e:#}",
                     learner.updates()
                 );
-                self.failed.get_or_insert(e);
+                self.first_failure.get_or_insert(e);
             }
         }
     }
@@ -278,20 +279,20 @@ impl Checkpointer {
     }
 
     /// Saves a last checkpoint, if updates were made or frames stored since the newest one.
-    fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
-        if self.saved != Some(Self::counts(learner)) {
+    fn save_last(mut self, learner: &Learner) -> Result<(), LearnerError> {
+        if self.saved_counts != Some(Self::counts(learner)) {
             self.save(learner);
         }
-        self.failed.map_or(Ok(()), Err)
+        self.first_failure.map_or(Ok(()), Err)
     }
 }
 
 /// Writes the run's settings beside the checkpoints, for `driml evaluate`, and replaces those of an earlier start. A file that begins
 /// with a comment is the launcher's and stays unchanged.
-fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
+fn write_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
     let path = run_dir.join("config.toml");
-    let there = std::fs::read_to_string(&path).unwrap_or_default();
-    if there.starts_with('#') || there == config_toml {
+    let existing = std::fs::read_to_string(&path).unwrap_or_default();
+    if existing.starts_with('#') || existing == config_toml {
         return Ok(());
     }
     std::fs::create_dir_all(run_dir)
@@ -309,7 +310,7 @@ mod tests {
         let path = folder.path().join("config.toml");
         for (there, kept) in [("a", "b"), ("# a", "# a")] {
             std::fs::write(&path, there).unwrap();
-            keep_settings(folder.path(), "b").unwrap();
+            write_settings(folder.path(), "b").unwrap();
             assert_eq!(std::fs::read_to_string(&path).unwrap(), kept);
         }
     }

@@ -19,8 +19,8 @@ use zenoh::{Session, Wait, liveliness::LivelinessToken};
 use crate::run_counts::{BatchPart, RunCounts};
 
 /// Largest age at which a shard's counts are used, and the same for an empty shard.
-const AGE_MAX: Duration = Duration::from_millis(500);
-const EMPTY_AGE_MAX: Duration = Duration::from_millis(50);
+const COUNTS_AGE_MAX: Duration = Duration::from_millis(500);
+const EMPTY_COUNTS_AGE_MAX: Duration = Duration::from_millis(50);
 
 /// Sessions with all shards of a run, in the order of their numbers, and the run's settings.
 pub(crate) struct Shards {
@@ -32,12 +32,12 @@ pub(crate) struct Shards {
 pub(crate) struct Membership {
     /// Version of the newest weights that any shard has; 0 if none has any.
     pub(crate) weights_version: u64,
-    _alive: Vec<LivelinessToken>,
+    _liveliness: Vec<LivelinessToken>,
 }
 
 impl Shards {
-    /// Joins the shard at each endpoint; `None` if the shutdown comes first.
-    pub(crate) fn join(
+    /// Connects to the shard at each endpoint; `None` if the shutdown comes first.
+    pub(crate) fn connect(
         connect: &[String],
         keys: &Keys,
         credentials: Option<&Arc<Credentials>>,
@@ -58,7 +58,7 @@ impl Shards {
             sessions.push(session);
             run_infos.push(run_info);
         }
-        let config_toml = one_run(connect, &run_infos)?.config_toml.clone();
+        let config_toml = single_run(connect, &run_infos)?.config_toml.clone();
         // When a learner joins again, its endpoints may have another order.
         let mut shards: Vec<_> = run_infos.iter().zip(sessions).collect();
         shards.sort_by_key(|(run_info, _)| run_info.shard.0);
@@ -77,7 +77,7 @@ impl Shards {
 
     /// Joins the run as its one learner, `learner`, after `updates` updates and with the counts `counts`. `restart` restarts the run
     /// from its first update. `None` if the shutdown comes first.
-    pub(crate) fn take_part(
+    pub(crate) fn join_run(
         &self,
         clients: &[RunClient],
         learner: u64,
@@ -87,13 +87,13 @@ impl Shards {
     ) -> anyhow::Result<Option<Membership>> {
         let mut membership = Membership {
             weights_version: 0,
-            _alive: Vec::new(),
+            _liveliness: Vec::new(),
         };
         for (shard, client) in clients.iter().enumerate() {
             // Declared before the learner joins, so that no other learner can take its place from then on.
             let alive = client.declare_alive(Alive::learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
-            membership._alive.push(alive);
+            membership._liveliness.push(alive);
             let join = LearnerJoin {
                 learner,
                 run: counts.run,
@@ -114,17 +114,17 @@ impl Shards {
 
     /// Closes all sessions; returns the first error, if there is one.
     pub(crate) fn close(&self) -> anyhow::Result<()> {
-        let mut all = Ok(());
+        let mut result = Ok(());
         for session in &self.sessions {
             let closed = session.close().wait();
-            all = all.and(closed.map_err(|e| anyhow::anyhow!("closing the session: {e}")));
+            result = result.and(closed.map_err(|e| anyhow::anyhow!("closing the session: {e}")));
         }
-        all
+        result
     }
 }
 
 /// Checks that the endpoints are all shards of one run, and returns the run's information.
-fn one_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&'a RunInfo> {
+fn single_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&'a RunInfo> {
     let first = run_infos
         .first()
         .context("no endpoint of a replay server was given")?;
@@ -153,32 +153,32 @@ fn one_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&
 
 /// One shard's counts, and its part of the current batch.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Portion {
+pub(super) struct ShardState {
     counts: ShardCounts,
     held: u64,
     /// When the counts arrived; `None` before the first time.
     last_seen: Option<Instant>,
     /// Rows of the batch that the shard has not sent yet.
-    pub(super) pending: u32,
+    pub(super) pending_rows: u32,
     /// The probability with which each row was assigned to the shard.
     pub(super) share: f64,
     /// Identifier of the next request for a part.
     pub(super) id: RequestId,
 }
 
-impl Portion {
+impl ShardState {
     /// Stores what the shard has counted by now, and how many transitions it holds.
-    pub(super) fn note(&mut self, counts: ShardCounts, held: u64) {
+    pub(super) fn record_counts(&mut self, counts: ShardCounts, held: u64) {
         (self.counts, self.held) = (counts, held);
         self.last_seen = Some(Instant::now());
     }
 
     /// Whether to fetch the counts again: other shards must not decide by old counts, and an empty shard may have received transitions.
-    pub(super) fn is_old(&self, now: Instant) -> bool {
+    pub(super) fn is_stale(&self, now: Instant) -> bool {
         let age_max = if self.held == 0 {
-            EMPTY_AGE_MAX
+            EMPTY_COUNTS_AGE_MAX
         } else {
-            AGE_MAX
+            COUNTS_AGE_MAX
         };
         self.last_seen
             .is_none_or(|last_seen| now - last_seen > age_max)
@@ -188,88 +188,88 @@ impl Portion {
 /// The one batch that is assembled from the parts of several shards. It survives a failed try, because a shard counts a part that it
 /// has sent as sampled.
 pub(super) struct PartialBatch {
-    pub(super) portions: Vec<Portion>,
+    pub(super) shards: Vec<ShardState>,
     pub(super) parts: Vec<Batch>,
-    pub(super) from: Vec<BatchPart>,
+    pub(super) sources: Vec<BatchPart>,
     /// Whether all transitions of the run are stored.
-    pub(super) all_in: bool,
+    pub(super) all_stored: bool,
     /// Time since the last whole batch, or since the transitions that this batch may wait for were stored.
-    pub(super) since_whole: Silence,
+    pub(super) since_last_batch: Silence,
 }
 
 impl PartialBatch {
-    pub(super) fn new(shards: usize) -> Self {
-        let portion = Portion {
+    pub(super) fn new(shard_count: usize) -> Self {
+        let state = ShardState {
             id: RequestId::first(rand::random()),
-            ..Portion::default()
+            ..ShardState::default()
         };
         Self {
-            portions: vec![portion; shards],
+            shards: vec![state; shard_count],
             parts: Vec::new(),
-            from: Vec::new(),
-            all_in: false,
-            since_whole: Silence::default(),
+            sources: Vec::new(),
+            all_stored: false,
+            since_last_batch: Silence::default(),
         }
     }
 
     /// Records whether the shards report that all transitions of the run are stored.
-    pub(super) fn note_all_in(&mut self, all_in: bool) {
-        if all_in && !self.all_in {
-            self.all_in = true;
-            self.since_whole.answered();
+    pub(super) fn set_stored(&mut self, all_stored: bool) {
+        if all_stored && !self.all_stored {
+            self.all_stored = true;
+            self.since_last_batch.answered();
         }
     }
 
     /// Records why a shard does not send its part yet. It knows the others' counts: if it warms up, it lost its replay and refills it.
-    pub(super) fn note_waiting(&mut self, waiting: Waiting) {
+    pub(super) fn record_waiting(&mut self, waiting: Waiting) {
         if matches!(waiting, Waiting::WarmUp { .. }) {
-            self.since_whole.answered();
+            self.since_last_batch.answered();
         }
     }
 
     /// Whether all rows have arrived.
-    pub(super) fn is_whole(&self) -> bool {
-        self.portions.iter().all(|it| it.pending == 0)
+    pub(super) fn is_complete(&self) -> bool {
+        self.shards.iter().all(|it| it.pending_rows == 0)
     }
 
     /// Begins a batch of `rows` rows. Each row's shard is drawn in proportion to the transitions that the shards hold, so that all
     /// transitions of the replay are equally likely. Returns false and begins no batch if the shards are empty.
     pub(super) fn begin(&mut self, rows: u32, rng: &mut impl Rng) -> bool {
-        let total: u64 = self.portions.iter().map(|it| it.held).sum();
+        let total: u64 = self.shards.iter().map(|it| it.held).sum();
         if total == 0 {
             return false;
         }
-        for portion in &mut self.portions {
-            portion.share = portion.held as f64 / total as f64;
+        for shard in &mut self.shards {
+            shard.share = shard.held as f64 / total as f64;
         }
         for _ in 0..rows {
-            let mut at = rng.random_range(0..total);
-            for portion in &mut self.portions {
-                if at < portion.held {
-                    portion.pending += 1;
+            let mut transition = rng.random_range(0..total);
+            for shard in &mut self.shards {
+                if transition < shard.held {
+                    shard.pending_rows += 1;
                     break;
                 }
-                at -= portion.held;
+                transition -= shard.held;
             }
         }
         true
     }
 
     /// Abandons a batch of which no part has arrived, so that the next one is drawn anew.
-    pub(super) fn withdraw(&mut self) {
-        self.portions.iter_mut().for_each(|it| it.pending = 0);
+    pub(super) fn abandon(&mut self) {
+        self.shards.iter_mut().for_each(|it| it.pending_rows = 0);
     }
 
     /// The sum of the counts of all shards except `this`, as if each had already sent its pending rows.
     pub(super) fn other_shards(&self, this: usize) -> ShardCounts {
-        let others = self.portions.iter().enumerate();
+        let others = self.shards.iter().enumerate();
         let others = others.filter(|(shard, _)| *shard != this);
-        others.fold(ShardCounts::default(), |sum, (_, portion)| {
+        others.fold(ShardCounts::default(), |sum, (_, state)| {
             let pending = ShardCounts {
                 inserted: 0,
-                rows_sampled: portion.pending.into(),
+                rows_sampled: state.pending_rows.into(),
             };
-            sum + portion.counts + pending
+            sum + state.counts + pending
         })
     }
 }
@@ -281,21 +281,21 @@ mod tests {
 
     use super::*;
 
-    fn portion(held: u64, inserted: u64, rows_sampled: u64, pending: u32) -> Portion {
-        Portion {
+    fn shard_state(held: u64, inserted: u64, rows_sampled: u64, pending_rows: u32) -> ShardState {
+        ShardState {
             counts: ShardCounts {
                 inserted,
                 rows_sampled,
             },
             held,
-            pending,
-            ..Portion::default()
+            pending_rows,
+            ..ShardState::default()
         }
     }
 
-    fn batch_of(portions: &[Portion]) -> PartialBatch {
+    fn batch_of(shards: &[ShardState]) -> PartialBatch {
         PartialBatch {
-            portions: portions.to_vec(),
+            shards: shards.to_vec(),
             ..PartialBatch::new(0)
         }
     }
@@ -307,10 +307,10 @@ mod tests {
         let held = [1_000_000, 10, 0, 250_000, 499_990];
         let mut drawn = [0u64; 5];
         for _ in 0..4_000 {
-            let mut batch = batch_of(&held.map(|held| portion(held, 0, 0, 0)));
-            assert!(batch.begin(256, &mut rng) && !batch.is_whole());
-            for (sum, portion) in drawn.iter_mut().zip(&batch.portions) {
-                *sum += u64::from(portion.pending);
+            let mut batch = batch_of(&held.map(|held| shard_state(held, 0, 0, 0)));
+            assert!(batch.begin(256, &mut rng) && !batch.is_complete());
+            for (sum, state) in drawn.iter_mut().zip(&batch.shards) {
+                *sum += u64::from(state.pending_rows);
             }
         }
         assert_eq!(drawn[2], 0, "nothing is drawn from an empty shard");
@@ -327,51 +327,51 @@ mod tests {
             })
             .sum();
         assert!(chi_square < 16.27, "3 degrees of freedom: {chi_square}");
-        let mut nothing = batch_of(&[portion(0, 0, 0, 0)]);
-        assert!(!nothing.begin(8, &mut rng) && nothing.is_whole());
+        let mut nothing = batch_of(&[shard_state(0, 0, 0, 0)]);
+        assert!(!nothing.begin(8, &mut rng) && nothing.is_complete());
     }
 
     #[test]
     fn a_shard_is_asked_again_and_sooner_if_it_held_nothing() {
         let now = Instant::now();
-        let is_old = |held, age_ms| {
+        let is_stale = |held, age_ms| {
             let last_seen = now.checked_sub(Duration::from_millis(age_ms));
-            Portion {
+            ShardState {
                 last_seen,
-                ..portion(held, 0, 0, 0)
+                ..shard_state(held, 0, 0, 0)
             }
-            .is_old(now)
+            .is_stale(now)
         };
-        assert!(portion(9, 0, 0, 0).is_old(now), "it was never asked");
-        assert!(!is_old(9, 400) && is_old(9, 600));
-        assert!(!is_old(0, 40) && is_old(0, 60));
+        assert!(shard_state(9, 0, 0, 0).is_stale(now), "it was never asked");
+        assert!(!is_stale(9, 400) && is_stale(9, 600));
+        assert!(!is_stale(0, 40) && is_stale(0, 60));
     }
 
     #[test]
     fn the_last_batch_is_waited_for_from_when_it_can_come() {
         let mut batch = batch_of(&[]);
-        let mut restarts = |note: fn(&mut PartialBatch)| {
-            while batch.since_whole.unanswered().is_zero() {}
-            note(&mut batch);
-            batch.since_whole.length().is_zero()
+        let mut restarts = |record: fn(&mut PartialBatch)| {
+            while batch.since_last_batch.unanswered().is_zero() {}
+            record(&mut batch);
+            batch.since_last_batch.length().is_zero()
         };
-        assert!(!restarts(|batch| batch.note_all_in(false)));
-        assert!(restarts(|batch| batch.note_all_in(true)));
-        assert!(!restarts(|batch| batch.note_all_in(true)), "they were in");
+        assert!(!restarts(|batch| batch.set_stored(false)));
+        assert!(restarts(|batch| batch.set_stored(true)));
+        assert!(!restarts(|batch| batch.set_stored(true)), "they were in");
         assert!(!restarts(
-            |batch| batch.note_waiting(Waiting::LearnerWaitsForActors)
+            |batch| batch.record_waiting(Waiting::LearnerWaitsForActors)
         ));
         assert!(restarts(
-            |batch| batch.note_waiting(Waiting::WarmUp { have: 1, need: 2 })
+            |batch| batch.record_waiting(Waiting::WarmUp { have: 1, need: 2 })
         ));
     }
 
     #[test]
     fn a_shard_is_told_of_all_others_and_of_the_rest_of_its_batch() {
         let batch = batch_of(&[
-            portion(1, 10, 100, 5),
-            portion(2, 20, 200, 6),
-            portion(3, 30, 300, 7),
+            shard_state(1, 10, 100, 5),
+            shard_state(2, 20, 200, 6),
+            shard_state(3, 30, 300, 7),
         ]);
         let told = |this| {
             let others = batch.other_shards(this);
@@ -391,7 +391,7 @@ mod tests {
             shared_memory: true,
         };
         let connect = ["a".to_owned(), "b".to_owned()];
-        let said = |run_infos: &[RunInfo]| one_run(&connect, run_infos).unwrap_err().to_string();
+        let said = |run_infos: &[RunInfo]| single_run(&connect, run_infos).unwrap_err().to_string();
         assert!(
             said(&[run_info("x", (0, 2)), run_info("y", (1, 2))]).contains("different settings")
         );
@@ -399,6 +399,6 @@ mod tests {
         assert!(said(&[run_info("x", (0, 3)), run_info("x", (1, 3))]).contains("has 3 shards"));
         assert!(said(&[run_info("x", (0, 2))]).contains("has 2 shards"));
         let whole = [run_info("x", (1, 2)), run_info("x", (0, 2))];
-        assert_eq!(one_run(&connect, &whole).unwrap().config_toml, "x");
+        assert_eq!(single_run(&connect, &whole).unwrap().config_toml, "x");
     }
 }
