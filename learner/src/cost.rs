@@ -21,7 +21,7 @@ pub struct UpdateShape {
 impl UpdateShape {
     /// The shape for a learner with these settings, if the replay server serves `positives` later states per row. An auxiliary loss with
     /// invalid settings counts as no passes.
-    pub fn of(learner: &Config, positives: usize) -> Self {
+    pub fn for_learner(learner: &Config, positives: usize) -> Self {
         let passes = learner.update.auxiliary().map_or_else(
             |_| Passes::default(),
             |loss| loss.passes(positives, learner.augment.is_some()),
@@ -58,7 +58,7 @@ pub struct UpdateCost {
 
 impl UpdateCost {
     /// The cost of an update of `shape` with the network `model`.
-    pub fn of(model: &ModelConfig, shape: &UpdateShape) -> Self {
+    pub fn compute(model: &ModelConfig, shape: &UpdateShape) -> Self {
         let layers = model.layer_costs();
         let sum = |parts: &[&str], cost: fn(&LayerCost) -> u64| -> u64 {
             let of_parts = |layer: &&LayerCost| parts.iter().any(|part| layer.is_of(part));
@@ -150,10 +150,10 @@ mod tests {
             target: 10 * value,
             ..UpdateCost::default()
         };
-        assert_eq!(UpdateCost::of(&model(DimHeads::NONE), &c51), plain);
+        assert_eq!(UpdateCost::compute(&model(DimHeads::NONE), &c51), plain);
 
-        let lambda = Lambda::of([1.0, 0.0, 0.0, 1.0]);
-        let passes = Passes::of_pairs(lambda, 2, true);
+        let lambda = Lambda::from_values([1.0, 0.0, 0.0, 1.0]);
+        let passes = Passes::for_pairs(lambda, 2, true);
         let dim = UpdateShape {
             every_action: true,
             double_dqn: true,
@@ -176,7 +176,7 @@ mod tests {
             scores: 3 * 2 * 2 * (4 + 1) * 10 * 10 * 4,
             ..plain
         };
-        let found = UpdateCost::of(&model(lambda.dim_heads(true)), &dim);
+        let found = UpdateCost::compute(&model(lambda.dim_heads(true)), &dim);
         assert_eq!(found, expected);
         let c51 = found.online + found.head + found.target + found.double_dqn;
         assert_eq!(
@@ -204,7 +204,7 @@ mod tests {
             },
         };
         let psi4 = 2 * (2 * 5 * 4 + 4 * 4);
-        let found = UpdateCost::of(&model(heads), &shape);
+        let found = UpdateCost::compute(&model(heads), &shape);
         assert_eq!(found.keys, 10 * (2 * 4 * 3 * 16 + 2 * 12 * 5 + psi4));
         assert_eq!(found.heads, 10 * 3 * psi4);
         assert_eq!(found.scores, 2 * 2 * 10 * 10 * 4);

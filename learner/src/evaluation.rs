@@ -128,7 +128,7 @@ impl Networks {
             total = (total + loss.affine(*weight, 0.0)?)?;
         }
         // Before any number is read: reading waits for a GPU, which should have all of its work queued by then.
-        let gradients = Gradients::of(&self.parameters, &total)?;
+        let gradients = Gradients::compute(&self.parameters, &total)?;
         let c51_kl = read_finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
         for WeightedLoss { name, loss, .. } in &auxiliary {

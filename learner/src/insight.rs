@@ -47,7 +47,7 @@ impl Insight {
         compute: Compute,
     ) -> Result<Self, UpdateError> {
         let is_local = settings.auxiliary_loss.name() == DIM.name
-            && settings.lambda.wanted()[0]
+            && settings.lambda.active_pairs()[0]
             && model.dim.psi3
             && model.dim.phi3;
         Ok(Self {

@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use crate::error::UpdateError;
 
 /// Range of tau, the share of the online network in a move of a slow copy, whose parameters are f32.
-pub(crate) const TAU: RangeInclusive<f64> = 1e-5..=1.0;
+pub(crate) const TAU_RANGE: RangeInclusive<f64> = 1e-5..=1.0;
 
 /// Checks that a setting is in its range. NaN is outside every range.
 pub(crate) fn check_range(
@@ -14,11 +14,11 @@ pub(crate) fn check_range(
     value: f64,
     range: RangeInclusive<f64>,
 ) -> Result<(), UpdateError> {
-    outside(name, value, &range).map_or(Ok(()), |why| Err(UpdateError::Settings(why)))
+    range_error(name, value, &range).map_or(Ok(()), |why| Err(UpdateError::Settings(why)))
 }
 
 /// The error message for a setting that is outside its range.
-pub(crate) fn outside(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
+pub(crate) fn range_error(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
     let (least, most) = (range.start(), range.end());
     let is_inside = range.contains(&value);
     (!is_inside).then(|| format!("{name} = {value:?} is not from {least:?} to {most:?}"))

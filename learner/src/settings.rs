@@ -14,14 +14,14 @@ use crate::{
     },
     error::UpdateError,
     optimiser::adam::AdamSettings,
-    ranges::{TAU, check_range},
+    ranges::{TAU_RANGE, check_range},
 };
 
 /// Range of the soft clip's bound: other devices than the CPU clip in f32, which must hold a score and its ratio to the bound.
-const TANH_CLIP: RangeInclusive<f64> = 1e-30..=1e30;
+const TANH_CLIP_RANGE: RangeInclusive<f64> = 1e-30..=1e30;
 /// Below this range, the 1e-6 that clipping adds to the norm is too large. Above it, the square of a clipped gradient comes near
 /// to the largest f32.
-const MAX_GRAD_NORM: RangeInclusive<f64> = 1e-6..=1e15;
+const MAX_GRAD_NORM_RANGE: RangeInclusive<f64> = 1e-6..=1e15;
 
 /// All settings of an update except the network's sizes. Only `average_tau` and the auxiliary loss's own table may be absent.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -51,12 +51,12 @@ pub struct UpdateSettings {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub average_tau: Option<f64>,
     /// The auxiliary loss's own settings, in a table of its name such as `[learner.update.curl]`; empty if the loss has none.
-    #[serde(flatten, deserialize_with = "own_tables")]
+    #[serde(flatten, deserialize_with = "deserialize_loss_tables")]
     pub own: toml::Table,
 }
 
 /// Reads the remaining keys, each of which must be the name of an auxiliary loss.
-fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Error> {
+fn deserialize_loss_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Error> {
     let own = toml::Table::deserialize(from)?;
     let mut names = own.keys();
     let unknown = names.find(|&name| AuxiliaryKind::try_from(name.clone()).is_err());
@@ -69,11 +69,11 @@ fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Erro
 impl UpdateSettings {
     /// Checks the ranges.
     pub fn validate(&self) -> Result<(), UpdateError> {
-        check_range("tanh_clip", self.tanh_clip, TANH_CLIP)?;
-        check_range("max_grad_norm", self.max_grad_norm, MAX_GRAD_NORM)?;
-        check_range("target_tau", self.target_tau, TAU)?;
+        check_range("tanh_clip", self.tanh_clip, TANH_CLIP_RANGE)?;
+        check_range("max_grad_norm", self.max_grad_norm, MAX_GRAD_NORM_RANGE)?;
+        check_range("target_tau", self.target_tau, TAU_RANGE)?;
         if let Some(tau) = self.average_tau {
-            check_range("average_tau", tau, TAU)?;
+            check_range("average_tau", tau, TAU_RANGE)?;
         }
         if self.target_period_updates == 0 {
             return Err(UpdateError::Settings("target_period_updates = 0".into()));

@@ -136,8 +136,8 @@ pub(super) fn counted_updates(
     compute: &Compute,
 ) -> anyhow::Result<(Work<'static>, f64)> {
     let config = settings::of_run(WORLD, agent, "paper", sets)?.with_whole_frames()?;
-    let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
-    let gflop = UpdateCost::of(&config.model, &shape).total() as f64 / 1e9;
+    let shape = UpdateShape::for_learner(&config.learner, config.run.horizon.positives());
+    let gflop = UpdateCost::compute(&config.model, &shape).total() as f64 / 1e9;
     Ok((updates(&config, compute, 0.0)?, gflop))
 }
 

@@ -27,8 +27,8 @@ pub const INDENT: usize = 12;
 
 /// Estimates how long the run takes on `cores` cores: its updates, and one forward pass per frame.
 pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
-    let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
-    let update = UpdateCost::of(&config.model, &shape).total() as f64;
+    let shape = UpdateShape::for_learner(&config.learner, config.run.horizon.positives());
+    let update = UpdateCost::compute(&config.model, &shape).total() as f64;
     let layers = config.model.without_dim().layer_costs();
     let forward: u64 = layers.iter().map(|layer| layer.forward).sum();
     let flops = config.updates() as f64 * update + config.frames() as f64 * forward as f64;

@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use crate::ranges::outside;
+use crate::ranges::range_error;
 
 /// What is wrong with the settings, the pairs of actions or the saved state of an affinity estimate.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -12,7 +12,7 @@ pub struct AffinityError(pub(super) String);
 /// Checks that each setting is in its range.
 pub(super) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(), AffinityError> {
     let mut all = all.iter();
-    let why = all.find_map(|(name, value, range)| outside(name, *value, range));
+    let why = all.find_map(|(name, value, range)| range_error(name, *value, range));
     why.map_or(Ok(()), |why| Err(AffinityError(why)))
 }
 

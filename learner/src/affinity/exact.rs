@@ -26,7 +26,7 @@ pub struct ExactSettings {
 pub const ENTRY_ERROR: f64 = 6.1e-8;
 
 /// Range of the smoothing, far inside the range of f64, so that ratios of counts are finite and above 0.
-const SMOOTHING: RangeInclusive<f64> = 1e-100..=1e100;
+const SMOOTHING_RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
 /// Decayed pair counts c and A = row softmax of `ln p(j | i) / p(j)`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -41,7 +41,7 @@ impl ExactSettings {
     pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
         check_ranges(&[
             ("decay", self.decay, 1e-300..=1.0),
-            ("smoothing", self.smoothing, SMOOTHING),
+            ("smoothing", self.smoothing, SMOOTHING_RANGE),
         ])
     }
 }

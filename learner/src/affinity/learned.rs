@@ -135,14 +135,14 @@ impl LearnedAffinity {
         shuffled.shuffle(rng);
         let m = self.alphabet.len();
         let q = self.q();
-        let each = 1.0 / pairs.len() as f64;
+        let pair_weight = 1.0 / pairs.len() as f64;
         // Derivative of the loss (the bound, negated) by q.
         let mut by_q = vec![0.0; m * m];
         for (&(i, j), &other) in pairs.iter().zip(&shuffled) {
             let joint = usize::from(i) * m + usize::from(j);
             let marginal = usize::from(i) * m + usize::from(other);
-            by_q[joint] -= each * sigmoid(-q[joint]);
-            by_q[marginal] += each * sigmoid(q[marginal]);
+            by_q[joint] -= pair_weight * sigmoid(-q[joint]);
+            by_q[marginal] += pair_weight * sigmoid(q[marginal]);
         }
         let gradient = self.gradient(&by_q);
         self.step(&gradient);
@@ -166,7 +166,7 @@ impl LearnedAffinity {
     }
 
     /// Hidden unit `h` of the pair (i, j) before its ReLU.
-    fn unit(&self, i: usize, j: usize, h: usize) -> f64 {
+    fn pre_activation(&self, i: usize, j: usize, h: usize) -> f64 {
         let ([to, b, ..], hidden) = (self.offsets(), self.settings.hidden);
         let p = &self.parameters;
         p[i * hidden + h] + p[to + j * hidden + h] + p[b + h]
@@ -178,7 +178,7 @@ impl LearnedAffinity {
         let weights = &self.parameters[out..c];
         let q = |i: usize, j: usize| {
             let units = weights.iter().enumerate();
-            let units = units.map(|(h, w)| w * self.unit(i, j, h).max(0.0));
+            let units = units.map(|(h, w)| w * self.pre_activation(i, j, h).max(0.0));
             units.sum::<f64>() + self.parameters[c]
         };
         (0..m * m).map(|at| q(at / m, at % m)).collect()
@@ -193,7 +193,7 @@ impl LearnedAffinity {
             let (i, j) = (at / m, at % m);
             gradient[c] += slope;
             for h in 0..hidden {
-                let unit = self.unit(i, j, h);
+                let unit = self.pre_activation(i, j, h);
                 if unit > 0.0 {
                     gradient[out + h] += slope * unit;
                     let by_unit = slope * self.parameters[out + h];
@@ -216,12 +216,12 @@ impl LearnedAffinity {
         } = self.settings;
         self.updates += 1;
         let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
-        let (rest1, rest2) = (1.0 - beta1.powi(t), 1.0 - beta2.powi(t));
+        let (correction1, correction2) = (1.0 - beta1.powi(t), 1.0 - beta2.powi(t));
         let moments = self.first_moments.iter_mut().zip(&mut self.second_moments);
         for ((p, &g), (m, v)) in self.parameters.iter_mut().zip(gradient).zip(moments) {
             *m = beta1 * *m + (1.0 - beta1) * g;
             *v = beta2 * *v + (1.0 - beta2) * g * g;
-            *p -= lr * (*m / rest1) / ((*v / rest2).sqrt() + eps);
+            *p -= lr * (*m / correction1) / ((*v / correction2).sqrt() + eps);
         }
     }
 }

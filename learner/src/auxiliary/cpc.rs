@@ -47,7 +47,7 @@ impl AuxiliaryLoss for Cpc {
     }
 
     fn passes(&self, positives: usize, augmented: bool) -> Passes {
-        Passes::of_pairs(self.pairs.lambda, positives, augmented)
+        Passes::for_pairs(self.pairs.lambda, positives, augmented)
     }
 
     /// The positives that exist, offset by offset; nothing is computed for missing ones.
@@ -97,9 +97,9 @@ impl Cpc {
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());
         };
-        let (batch, wanted) = (inputs.batch, self.pairs.lambda.wanted());
+        let (batch, active) = (inputs.batch, self.pairs.lambda.active_pairs());
         let (anchors, action) = (&inputs.features.anchors, inputs.action()?);
-        let vectors = Vectors::new(inputs.online, anchors, later, &action, wanted)?;
+        let vectors = Vectors::new(inputs.online, anchors, later, &action, active)?;
         let (mut offsets, mut first) = (Vec::new(), 0);
         for valid in batch.positive_valid.chunks_exact(batch.rows) {
             let there = (0..).zip(valid).filter(|(_, valid)| **valid != 0);
@@ -108,7 +108,7 @@ impl Cpc {
             first = candidates.end;
             if rows.len() >= 2 {
                 let here = of_offset(&vectors, batch.rows, &rows, candidates)?;
-                offsets.push(here.dots(wanted)?);
+                offsets.push(here.dots(active)?);
             }
         }
         Ok(offsets)

@@ -19,7 +19,7 @@ use super::{
 use crate::{
     error::UpdateError,
     losses::info_nce::info_nce_loss,
-    ranges::{TAU, check_range},
+    ranges::{TAU_RANGE, check_range},
 };
 
 /// The menu item of CURL.
@@ -43,7 +43,7 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
     settings.check_weighted()?;
     let said = |what: &str| format!("auxiliary_loss = curl {what}");
     let fault = |what: &str| Err(UpdateError::AuxiliaryLoss(said(what)));
-    if settings.lambda.wanted() != [false, false, false, true] {
+    if settings.lambda.active_pairs() != [false, false, false, true] {
         return fault("compares whole states, so lambda.4t4 alone may be above 0");
     }
     if settings.condition_on_action {
@@ -56,7 +56,7 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
             "encodes its keys by a moving average of the network, whose pace is missing (earlier versions had none): take the agent curl, or --set learner.update.curl.key_tau=0.001",
         );
     };
-    check_range("curl.key_tau", key_tau, TAU)?;
+    check_range("curl.key_tau", key_tau, TAU_RANGE)?;
     Ok(Box::new(Curl {
         weight: settings.lambda.l4t4,
         tanh_clip: settings.tanh_clip,

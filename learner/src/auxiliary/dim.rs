@@ -61,11 +61,11 @@ impl Dim {
         action: &Tensor,
         valid: &[u8],
     ) -> Result<Vec<WeightedLoss>, UpdateError> {
-        let wanted = self.lambda.wanted();
-        let vectors = Vectors::new(network, features_t, features_k, action, wanted)?;
+        let active = self.lambda.active_pairs();
+        let vectors = Vectors::new(network, features_t, features_k, action, active)?;
         let pairs = NAMES.into_iter().zip(self.lambda.values());
         let mut losses = Vec::new();
-        for ((name, weight), dots) in pairs.zip(vectors.dots(wanted)?) {
+        for ((name, weight), dots) in pairs.zip(vectors.dots(active)?) {
             if let Some(dots) = dots {
                 losses.push(WeightedLoss {
                     name,
@@ -85,7 +85,7 @@ impl AuxiliaryLoss for Dim {
     }
 
     fn passes(&self, positives: usize, augmented: bool) -> Passes {
-        Passes::of_pairs(self.lambda, positives, augmented)
+        Passes::for_pairs(self.lambda, positives, augmented)
     }
 
     /// A row without a positive keeps its place with a blank state, so that anchors and candidates stay aligned. Its results are masked.
@@ -120,15 +120,15 @@ pub struct Vectors {
 }
 
 impl Vectors {
-    /// Computes the vectors that the `wanted` pairs need; `network` has their heads.
+    /// Computes the vectors that the `active` pairs need; `network` has their heads.
     pub fn new(
         network: &Network,
         features_t: &Features,
         features_k: &Features,
         action: &Tensor,
-        wanted: [bool; 4],
+        active: [bool; 4],
     ) -> Result<Self, UpdateError> {
-        let heads = Lambda::heads_of(wanted, true);
+        let heads = Lambda::heads_for_pairs(active, true);
         let psi3 = heads
             .psi3
             .then(|| network.psi3(features_t.local()?, action));
@@ -142,12 +142,12 @@ impl Vectors {
         })
     }
 
-    /// Dot products for the `wanted` pairs whose vectors exist, in the order of `settings::PAIRS`. Anchors and candidates are equally many.
+    /// Dot products for the `active` pairs whose vectors exist, in the order of `settings::PAIRS`. Anchors and candidates are equally many.
     ///
     /// Local features are compared with local features of the same location, a global feature with every location.
-    pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
+    pub fn dots(&self, active: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
         let mut dots = [const { None }; 4];
-        for pair in (0..4).filter(|&pair| wanted[pair]) {
+        for pair in (0..4).filter(|&pair| active[pair]) {
             if let (Some(psi), Some(phi)) = (&self.psi[pair / 2], &self.phi[pair % 2]) {
                 dots[pair] = Some(dots_of(self.kernels, psi, phi)?);
             }

@@ -82,8 +82,8 @@ pub struct Passes {
 
 impl Passes {
     /// The passes of InfoNCE between levels of (s_t, a_t) and of each of `positives` later states; all states pass forward and backward.
-    pub fn of_pairs(lambda: Lambda, positives: usize, augmented: bool) -> Self {
-        let [local @ .., global] = lambda.wanted();
+    pub fn for_pairs(lambda: Lambda, positives: usize, augmented: bool) -> Self {
+        let [local @ .., global] = lambda.active_pairs();
         let positives = positives as u64;
         Self {
             states: positives + u64::from(augmented),

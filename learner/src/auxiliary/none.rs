@@ -22,8 +22,8 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
             "auxiliary_loss = none has no Psi that could be given the action: set condition_on_action to false, or take another agent".into(),
         ));
     }
-    let wanted = settings.lambda.wanted();
-    match PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted) {
+    let active = settings.lambda.active_pairs();
+    match PAIRS.iter().zip(active).find(|(_, active)| *active) {
         Some((pair, _)) => Err(UpdateError::AuxiliaryLoss(format!(
             "auxiliary_loss = none computes no auxiliary loss, but lambda.{pair} is above 0: set it to 0, or take another agent"
         ))),

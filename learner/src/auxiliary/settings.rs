@@ -29,13 +29,13 @@ pub struct Lambda {
 
 impl Lambda {
     /// Every pair with a weight of 1.
-    pub const EVERY: Self = Self::of([1.0; 4]);
+    pub const ONES: Self = Self::from_values([1.0; 4]);
 
     /// No pair: every weight is 0.
-    pub const NONE: Self = Self::of([0.0; 4]);
+    pub const NONE: Self = Self::from_values([0.0; 4]);
 
     /// Creates weights from values in the order of [`PAIRS`].
-    pub const fn of([l3t3, l3t4, l4t3, l4t4]: [f64; 4]) -> Self {
+    pub const fn from_values([l3t3, l3t4, l4t3, l4t4]: [f64; 4]) -> Self {
         Self {
             l3t3,
             l3t4,
@@ -50,18 +50,18 @@ impl Lambda {
     }
 
     /// The pairs with a weight above 0.
-    pub fn wanted(&self) -> [bool; 4] {
+    pub fn active_pairs(&self) -> [bool; 4] {
         self.values().map(|lambda| lambda > 0.0)
     }
 
     /// The heads that the pairs with a weight above 0 need; `action` says whether psi is given a_t.
     pub fn dim_heads(&self, action: bool) -> DimHeads {
-        Self::heads_of(self.wanted(), action)
+        Self::heads_for_pairs(self.active_pairs(), action)
     }
 
-    /// The heads that the `wanted` pairs need.
-    pub(super) fn heads_of(wanted: [bool; 4], action: bool) -> DimHeads {
-        let [local_local, local_global, global_local, global_global] = wanted;
+    /// The heads that the `active` pairs need.
+    pub(super) fn heads_for_pairs(active: [bool; 4], action: bool) -> DimHeads {
+        let [local_local, local_global, global_local, global_global] = active;
         let psi3 = local_local || local_global;
         let psi4 = global_local || global_global;
         DimHeads {
@@ -125,7 +125,7 @@ impl AuxiliarySettings<'_> {
 
     /// Checks that at least one lambda is above 0, for a loss that lambda weights.
     pub fn check_weighted(&self) -> Result<(), UpdateError> {
-        if self.lambda.wanted().contains(&true) {
+        if self.lambda.active_pairs().contains(&true) {
             return Ok(());
         }
         let name = self.auxiliary_loss;
@@ -147,7 +147,7 @@ mod tests {
             ([0.0, 0.5, 0.0, 0.0], [true, false, false, true, true]),
             ([1.0, 0.0, 0.0, 1.0], [true; 5]),
         ] {
-            let it = Lambda::of(weights).dim_heads(true);
+            let it = Lambda::from_values(weights).dim_heads(true);
             let parts = [it.psi3, it.phi3, it.psi4, it.phi4, it.action];
             assert_eq!(parts, needed, "{weights:?}");
         }

@@ -20,11 +20,11 @@ const CHUNK: usize = 1 << 14;
 /// Steps from one flush of subnormal moments to the next. A flush in every step would cost a quarter of the step's time.
 const FLUSH_PERIOD: u64 = 32;
 
-const LR: RangeInclusive<f64> = 1e-30..=1e38;
+const LR_RANGE: RangeInclusive<f64> = 1e-30..=1e38;
 /// Range of a moment's decay. Above it, `1 - beta` is off by more than 0.2% in f32.
-const BETA: RangeInclusive<f64> = 0.0..=0.99999;
+const BETA_RANGE: RangeInclusive<f64> = 0.0..=0.99999;
 /// Range of `eps`. Its start is 10,000 times the root of the least second moment that f32 holds.
-const EPS: RangeInclusive<f64> = 1e-15..=1e30;
+const EPS_RANGE: RangeInclusive<f64> = 1e-15..=1e30;
 
 /// Largest error of a parameter compared with the same steps in f64, relative to the distance it moved, in addition to [`step_floor`].
 pub const STEP_ERROR: f64 = 0.004;
@@ -64,10 +64,10 @@ pub struct AdamSettings {
 impl AdamSettings {
     /// Checks each number against its range.
     pub fn validate(&self) -> Result<(), UpdateError> {
-        check_range("adam.lr", self.lr, LR)?;
-        check_range("adam.beta1", self.beta1, BETA)?;
-        check_range("adam.beta2", self.beta2, BETA)?;
-        check_range("adam.eps", self.eps, EPS)
+        check_range("adam.lr", self.lr, LR_RANGE)?;
+        check_range("adam.beta1", self.beta1, BETA_RANGE)?;
+        check_range("adam.beta2", self.beta2, BETA_RANGE)?;
+        check_range("adam.eps", self.eps, EPS_RANGE)
     }
 }
 
@@ -135,8 +135,8 @@ impl Adam {
         let mut moments = BTreeMap::new();
         for (name, var) in parameters.iter() {
             let zeros = var.zeros_like()?;
-            let both = Moments::new(&zeros, &zeros, kernels)?;
-            moments.insert(name.to_owned(), (var.dims().to_vec(), both));
+            let zero_moments = Moments::new(&zeros, &zeros, kernels)?;
+            moments.insert(name.to_owned(), (var.dims().to_vec(), zero_moments));
         }
         Ok(Self {
             settings,
@@ -170,8 +170,8 @@ impl Adam {
     ) -> Result<(), UpdateError> {
         let step = self.step + 1;
         let lr = self.settings.lr;
-        let rule = Rule::new(self.settings, step, factor);
-        if !rule.step_size.is_finite() {
+        let coefficients = StepCoefficients::new(self.settings, step, factor);
+        if !coefficients.step_size.is_finite() {
             let what = format!("a step of Adam with lr = {lr:e}");
             return Err(UpdateError::NonFinite(what));
         }
@@ -188,7 +188,7 @@ impl Adam {
                         let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
                         let finite = chunks
                             .zip(moments)
-                            .map(|((p, g), (m, v))| rule.apply(p, g, m, v));
+                            .map(|((p, g), (m, v))| coefficients.apply(p, g, m, v));
                         all_finite = finite.reduce(|| true, |one, other| one & other);
                     })?;
                     if !all_finite {
@@ -197,7 +197,7 @@ impl Adam {
                         return Err(UpdateError::Diverged { name, update, lr });
                     }
                 }
-                Moments::Tensors { m, v } => rule.apply_to_tensors(var, gradient, m, v)?,
+                Moments::Tensors { m, v } => coefficients.apply_to_tensors(var, gradient, m, v)?,
             }
         }
         Ok(())
@@ -279,20 +279,20 @@ impl Adam {
 
 /// The coefficients of one step of [`Adam::step`], which are the same for every element of every parameter.
 #[derive(Clone, Copy, Debug)]
-pub struct Rule {
+pub struct StepCoefficients {
     factor: f32,
     beta1: f32,
-    rest1: f32,
+    one_minus_beta1: f32,
     beta2: f32,
-    rest2: f32,
+    one_minus_beta2: f32,
     step_size: f32,
     root_scale: f32,
     eps: f32,
     /// Whether this step begins with flushing the moments.
-    flushes: bool,
+    flushes_moments: bool,
 }
 
-impl Rule {
+impl StepCoefficients {
     /// Computes the coefficients of step number `step`, counted from 1, for gradients times `factor`.
     pub fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
         let AdamSettings {
@@ -305,13 +305,13 @@ impl Rule {
         Self {
             factor: factor as f32,
             beta1: beta1 as f32,
-            rest1: (1.0 - beta1) as f32,
+            one_minus_beta1: (1.0 - beta1) as f32,
             beta2: beta2 as f32,
-            rest2: (1.0 - beta2) as f32,
+            one_minus_beta2: (1.0 - beta2) as f32,
             step_size: (lr / (1.0 - beta1.powi(t))) as f32,
             root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
             eps: eps as f32,
-            flushes: step.is_multiple_of(FLUSH_PERIOD),
+            flushes_moments: step.is_multiple_of(FLUSH_PERIOD),
         }
     }
 
@@ -322,16 +322,16 @@ impl Rule {
     /// as 0.9 times the smallest numbers rounds back to them, and would make each later step several times as slow.
     #[allow(clippy::eq_op, reason = "x - x tells finite numbers from others")]
     pub fn apply(&self, p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32]) -> bool {
-        if self.flushes {
-            flush(m);
-            flush(v);
+        if self.flushes_moments {
+            flush_subnormals(m);
+            flush_subnormals(v);
         }
         // x - x is 0 for a finite x, else NaN. Collecting bits, unlike a test in the loop, costs nothing measurable.
         let mut not_finite = 0;
         for (((p, &g), m), v) in p.iter_mut().zip(g).zip(m).zip(v) {
             let g = g * self.factor;
-            *m = self.beta1 * *m + self.rest1 * g;
-            *v = self.beta2 * *v + self.rest2 * g * g;
+            *m = self.beta1 * *m + self.one_minus_beta1 * g;
+            *v = self.beta2 * *v + self.one_minus_beta2 * g * g;
             *p -= self.step_size * *m / (v.sqrt() * self.root_scale + self.eps);
             not_finite |= ((*p - *p) + (*v - *v)).to_bits();
         }
@@ -347,15 +347,15 @@ impl Rule {
     ) -> candle_core::Result<()> {
         let by = |tensor: &Tensor, factor: f32| tensor.affine(factor.into(), 0.0);
         let g = by(g, self.factor)?;
-        *m = (by(m, self.beta1)? + by(&g, self.rest1)?)?;
-        *v = (by(v, self.beta2)? + by(&g.sqr()?, self.rest2)?)?;
+        *m = (by(m, self.beta1)? + by(&g, self.one_minus_beta1)?)?;
+        *v = (by(v, self.beta2)? + by(&g.sqr()?, self.one_minus_beta2)?)?;
         let root = v.sqrt()?.affine(self.root_scale.into(), self.eps.into())?;
         p.set(&(p.as_detached_tensor() - (by(m, self.step_size)? / root)?)?)
     }
 }
 
 /// Replaces subnormal numbers by 0; all others, including NaN, are unchanged.
-fn flush(values: &mut [f32]) {
+fn flush_subnormals(values: &mut [f32]) {
     for value in values {
         *value = if value.abs() < f32::MIN_POSITIVE {
             0.0

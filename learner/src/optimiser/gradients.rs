@@ -24,7 +24,7 @@ pub struct Gradients {
 
 impl Gradients {
     /// Computes the gradients of the scalar `loss` by `parameters`.
-    pub fn of(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
+    pub fn compute(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
         let mut backward = Backward::of(loss)?;
         let mut by_name = BTreeMap::new();
         for (name, var) in parameters.iter() {

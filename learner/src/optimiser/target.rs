@@ -49,8 +49,8 @@ pub fn follow(
             })?,
             Kernels::Candle if tau >= 1.0 => var.set(source)?,
             Kernels::Candle => {
-                let way = (source.as_tensor() - var.as_tensor())?.affine(tau, 0.0)?;
-                var.set(&(var.as_tensor() + way)?)?;
+                let step = (source.as_tensor() - var.as_tensor())?.affine(tau, 0.0)?;
+                var.set(&(var.as_tensor() + step)?)?;
             }
         }
     }

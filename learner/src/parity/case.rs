@@ -221,7 +221,7 @@ impl Case {
 
 impl Config {
     fn settings(&self) -> UpdateSettings {
-        let by_lambda = if self.lambda.wanted().contains(&true) {
+        let by_lambda = if self.lambda.active_pairs().contains(&true) {
             AuxiliaryKind::of(&DIM)
         } else {
             AuxiliaryKind::NONE

@@ -294,7 +294,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     };
     let every = AuxiliarySettings {
         auxiliary_loss: kind.name(),
-        lambda: Lambda::EVERY,
+        lambda: Lambda::ONES,
         ..settings.auxiliary_settings()
     };
     // A loss that rejects some of the pairs keeps the case's settings.

@@ -50,7 +50,7 @@ impl DimLearner {
         let losses = self.dim.pair_losses(network, now, next, &action, &valid)?;
         let loss = losses.into_iter().next();
         let loss = loss.context("no pair of DIM has a weight")?.loss;
-        let gradients = Gradients::of(&self.parameters, &loss)?;
+        let gradients = Gradients::compute(&self.parameters, &loss)?;
         let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
         self.adam.step(&self.parameters, &gradients, factor)?;
         Ok(loss.to_scalar()?)
@@ -59,9 +59,9 @@ impl DimLearner {
     /// Returns the clipped scores [L, B, B] of every anchor with every candidate at each location, for the only pair with a weight.
     pub(super) fn scores(&self, now: &Features, next: &Features) -> anyhow::Result<Vec<f64>> {
         let action = Tensor::zeros(now.f4.dim(0)?, DType::U8, &Device::Cpu)?;
-        let wanted = self.dim.lambda.wanted();
-        let vectors = Vectors::new(&self.network, now, next, &action, wanted)?;
-        let found = vectors.dots(wanted)?.into_iter().flatten().next();
+        let active = self.dim.lambda.active_pairs();
+        let vectors = Vectors::new(&self.network, now, next, &action, active)?;
+        let found = vectors.dots(active)?.into_iter().flatten().next();
         let found = found.expect("a pair has a weight");
         let scores = Scores::new(found.width, self.dim.tanh_clip);
         let values = found.dots.flatten_all()?.to_vec1::<f32>()?;

@@ -41,7 +41,7 @@ impl<'a> Counted<'a> {
         Ok(Self {
             config,
             model: config.model.clone(),
-            shape: UpdateShape::of(&config.learner, config.run.horizon.positives()),
+            shape: UpdateShape::for_learner(&config.learner, config.run.horizon.positives()),
             run: config.run.clone(),
             broadcast: config.weights_bytes()?,
         })
@@ -75,7 +75,7 @@ impl<'a> Counted<'a> {
             double_dqn: true,
             passes: Passes {
                 keys: 1,
-                ..Passes::of_pairs(Lambda::EVERY, EVERY_POSITIVES, true)
+                ..Passes::for_pairs(Lambda::ONES, EVERY_POSITIVES, true)
             },
         };
         Ok(Self {
@@ -113,7 +113,7 @@ impl<'a> Counted<'a> {
     }
 
     pub(super) fn update_flops(&self) -> Counts {
-        let cost = UpdateCost::of(&self.model, &self.shape);
+        let cost = UpdateCost::compute(&self.model, &self.shape);
         named([
             ("s_t, torso", cost.online),
             ("s_t, C51 head", cost.head),

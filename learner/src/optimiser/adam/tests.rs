@@ -20,8 +20,8 @@ fn moments_of_a_gradient_that_is_gone_end_at_zero() {
         let mut run = |g: &[f32], count: u64| {
             for _ in 0..count {
                 updates += 1;
-                let rule = Rule::new(SETTINGS, updates, 1.0);
-                assert!(rule.apply(&mut p, g, &mut m, &mut v));
+                let coefficients = StepCoefficients::new(SETTINGS, updates, 1.0);
+                assert!(coefficients.apply(&mut p, g, &mut m, &mut v));
             }
             (m.clone(), v.clone())
         };
@@ -40,30 +40,30 @@ fn moments_of_a_gradient_that_is_gone_end_at_zero() {
 }
 
 /// Whether a step is finite for this parameter and gradient, which are the last of `elements` elements.
-fn fine(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
-    let rule = Rule::new(settings, 1, 1.0);
+fn is_step_finite(settings: AdamSettings, elements: usize, parameter: f32, gradient: f32) -> bool {
+    let coefficients = StepCoefficients::new(settings, 1, 1.0);
     let (mut p, mut g) = (vec![0.5; elements], vec![0.1; elements]);
     (p[elements - 1], g[elements - 1]) = (parameter, gradient);
     let (mut m, mut v) = (vec![0.0; elements], vec![0.0; elements]);
-    rule.apply(&mut p, &g, &mut m, &mut v)
+    coefficients.apply(&mut p, &g, &mut m, &mut v)
 }
 
 #[test]
 fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
     for elements in [1, 2, 7, 16, 33] {
-        assert!(fine(SETTINGS, elements, 3e38, 1.0));
+        assert!(is_step_finite(SETTINGS, elements, 3e38, 1.0));
         let far = AdamSettings {
             lr: 1e37,
             ..SETTINGS
         };
-        assert!(fine(far, elements, 3e38, 1.0), "towards 0");
+        assert!(is_step_finite(far, elements, 3e38, 1.0), "towards 0");
         assert!(
-            !fine(far, elements, 3.4e38, -1.0),
+            !is_step_finite(far, elements, 3.4e38, -1.0),
             "past the largest number"
         );
-        assert!(!fine(SETTINGS, elements, f32::NAN, 1.0));
-        assert!(!fine(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
+        assert!(!is_step_finite(SETTINGS, elements, f32::NAN, 1.0));
+        assert!(!is_step_finite(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
         // The square of the gradient is not finite: the parameter would stand still for good.
-        assert!(!fine(SETTINGS, elements, 0.0, 1e30));
+        assert!(!is_step_finite(SETTINGS, elements, 0.0, 1e30));
     }
 }

@@ -2,7 +2,7 @@
 
 use driml_learner::{
     AdamSettings,
-    optimiser::adam::{Rule, STEP_ERROR, moment_error, step_floor},
+    optimiser::adam::{STEP_ERROR, StepCoefficients, moment_error, step_floor},
 };
 
 use crate::stability::property::*;
@@ -78,7 +78,7 @@ impl Stepped {
 
 /// Makes step number `t` for each parameter with its gradient.
 fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) {
-    let rule = Rule::new(settings, t, 1.0);
+    let coefficients = StepCoefficients::new(settings, t, 1.0);
     let (lr, eps) = (settings.lr, settings.eps);
     let (beta1, beta2) = (settings.beta1, settings.beta2);
     // 1 - beta^t, computed without cancellation near beta = 1 and near t = 0.
@@ -86,7 +86,7 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
     // The rule steps all of them together, like the parameters of a tensor.
     let [mut p, mut m, mut v] =
         [0, 1, 2].map(|i| all.iter().map(|it| it.found[i]).collect::<Vec<_>>());
-    let is_finite = rule.apply(&mut p, gradients, &mut m, &mut v);
+    let is_finite = coefficients.apply(&mut p, gradients, &mut m, &mut v);
     for (i, (it, &g)) in all.iter_mut().zip(gradients).enumerate() {
         it.found = [p[i], m[i], v[i]];
         let g = f64::from(g);

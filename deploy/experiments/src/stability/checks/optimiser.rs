@@ -51,7 +51,7 @@ fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> 
             sum = (sum + (var.as_tensor() * slope)?.sum_all()?)?;
         }
     }
-    Ok(Gradients::of(&parameters, &sum)?)
+    Ok(Gradients::compute(&parameters, &sum)?)
 }
 
 fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {

@@ -223,7 +223,7 @@ mod tests {
             let task = task(&settings).unwrap();
             // From the paper's table of parameters.
             let local = [true, false, false, false];
-            assert_eq!(task.learner.lambda.wanted(), local);
+            assert_eq!(task.learner.lambda.active_pairs(), local);
             assert_eq!((task.world.lattice_size, task.world.patch_size), (84, 42));
             assert!(!task.model.dim.action);
         }
