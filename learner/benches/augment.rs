@@ -6,7 +6,7 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use driml_learner::{Augment, AugmentSettings};
+use driml_learner::{AugmentSettings, Augmenter};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -32,7 +32,7 @@ fn augmentation(criterion: &mut Criterion) {
             saturation: jitter,
             hue: jitter,
         };
-        let augment = Augment::new(settings, (64, 64, 3), 3);
+        let augment = Augmenter::new(settings, (64, 64, 3), 3);
         group.bench_function(name, |bencher| {
             bencher.iter(|| augment.apply(black_box(&states), &mut seen, &mut rng));
         });

@@ -32,7 +32,7 @@ pub struct NetworkParameters {
     /// C51's target network: torso and head.
     pub target: Parameters,
     /// The key encoder, torso and Psi_4; `None` unless the auxiliary loss has one, as CURL does.
-    pub key: Option<Parameters>,
+    pub key_encoder: Option<Parameters>,
 }
 
 /// An agent: online and target network, key encoder, optimiser, count of updates.
@@ -40,7 +40,7 @@ pub struct NetworkParameters {
 pub struct Agent {
     networks: Networks,
     target: Parameters,
-    key: Option<Parameters>,
+    key_encoder: Option<Parameters>,
     /// Torso and head of the averaged network; `None` before the first update, and without `average_tau`.
     average: Option<Parameters>,
     noise_seed: [u8; 32],
@@ -60,11 +60,11 @@ impl Agent {
         rng: &mut ChaCha8Rng,
     ) -> Result<Self, UpdateError> {
         let online = Parameters::init(&model, rng, &compute.device)?;
-        let key = settings.auxiliary()?.key_tau();
+        let key = settings.make_auxiliary_loss()?.key_tau();
         let key = key.map(|_| online.copy_part(Encoder::has));
         let parameters = NetworkParameters {
             target: online.without_dim()?,
-            key: key.transpose()?,
+            key_encoder: key.transpose()?,
             online,
         };
         Self::from_parameters(model, settings, compute, parameters)
@@ -84,7 +84,7 @@ impl Agent {
         let NetworkParameters {
             online,
             target,
-            key,
+            key_encoder,
         } = parameters;
         let built = DimHeads {
             action: model.dim.embeds_action(),
@@ -97,21 +97,21 @@ impl Agent {
             )));
         }
         let kernels = compute.kernels;
-        let auxiliary = settings.auxiliary()?;
+        let auxiliary = settings.make_auxiliary_loss()?;
         let (needed, built) = (auxiliary.layers(&model), &model.loss_layers);
         if needed != *built {
             return Err(UpdateError::Settings(format!(
                 "the auxiliary_loss uses the layers {needed:?}, the model builds {built:?}"
             )));
         }
-        let encoder = match (auxiliary.key_tau(), &key) {
+        let encoder = match (auxiliary.key_tau(), &key_encoder) {
             (None, None) => None,
             (Some(_), Some(key)) => Some(Encoder::new(&model, key, kernels)?),
             (wanted, _) => {
-                let there = if wanted.is_some() { "missing" } else { "there" };
+                let presence = if wanted.is_some() { "missing" } else { "there" };
                 let auxiliary_loss = settings.auxiliary_loss.name();
                 return Err(UpdateError::State(format!(
-                    "a key encoder is {there}, with auxiliary_loss = {auxiliary_loss}"
+                    "a key encoder is {presence}, with auxiliary_loss = {auxiliary_loss}"
                 )));
             }
         };
@@ -127,12 +127,12 @@ impl Agent {
                 deduplicate: false,
                 auxiliary,
                 parameters: online,
-                key: encoder,
+                key_encoder: encoder,
                 model,
                 settings,
             },
             target,
-            key,
+            key_encoder,
         })
     }
 
@@ -178,8 +178,8 @@ impl Agent {
     }
 
     /// The parameters of the key encoder, if the auxiliary loss has one.
-    pub const fn key(&self) -> Option<&Parameters> {
-        self.key.as_ref()
+    pub const fn key_encoder(&self) -> Option<&Parameters> {
+        self.key_encoder.as_ref()
     }
 
     /// The averaged network's parameters, torso and head; `None` before the first update, and without `average_tau`. They start as a copy
@@ -189,7 +189,7 @@ impl Agent {
     }
 
     /// Copies the averaged weights, if any, into torso and head of the online network, for evaluation. Returns whether there were any.
-    pub fn take_average(&mut self) -> Result<bool, UpdateError> {
+    pub fn copy_average_to_online(&mut self) -> Result<bool, UpdateError> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online().get(name) {
                 online.set(var)?;
@@ -241,7 +241,7 @@ impl Agent {
     }
 
     /// Checks that `batch` fits this network and this auxiliary loss.
-    pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
+    pub(crate) fn check_batch(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
         batch.validate(self.model(), self.settings().auxiliary_loss.positives())
     }
 
@@ -267,7 +267,7 @@ impl Agent {
         batch: &Batch<'_>,
         noise: &UpdateNoise,
     ) -> Result<Evaluation, UpdateError> {
-        self.check(batch)?;
+        self.check_batch(batch)?;
         self.networks.evaluate(batch, noise)
     }
 
@@ -295,7 +295,7 @@ impl Agent {
         let factor = clip_factor(norm, settings.max_grad_norm);
         self.adam.step(online, gradients, factor)?;
         self.updates += 1;
-        if let (Some(key), Some(tau)) = (&self.key, auxiliary.key_tau()) {
+        if let (Some(key), Some(tau)) = (&self.key_encoder, auxiliary.key_tau()) {
             target::follow(key, online, tau, kernels)?;
         }
         match (&self.average, settings.average_tau) {
@@ -317,7 +317,7 @@ impl Agent {
     }
 
     /// Restores the optimiser's state and the count of updates from a checkpoint.
-    pub(crate) fn restore_progress(
+    pub(crate) fn restore_optimiser(
         &mut self,
         updates: u64,
         adam_step: u64,

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// Colour coefficients are whole multiples of 2^-12.
 const COLOUR_BITS: u32 = 12;
 /// Weights of neighbouring pixels are whole multiples of 1/256.
-const WHOLE: u16 = 256;
+const FULL_WEIGHT: u16 = 256;
 
 /// Largest error of a byte of a resized crop: 1/2 from rounding, and up to 1/512 in each of two weights.
 pub const CROP_ERROR: f64 = 0.5 + 2.0 * 255.0 / 512.0;
@@ -85,7 +85,7 @@ struct Tap {
 
 /// Augments states at random.
 #[derive(Debug)]
-pub struct Augment {
+pub struct Augmenter {
     settings: AugmentSettings,
     /// Height, width and channels of a state.
     size: (usize, usize, usize),
@@ -93,10 +93,10 @@ pub struct Augment {
     /// Height and width of the crop, pixels.
     crop: (usize, usize),
     rows: Vec<Tap>,
-    cols: Vec<Tap>,
+    columns: Vec<Tap>,
 }
 
-impl Augment {
+impl Augmenter {
     /// Creates the augmentation of states [height, width, stack * `frame_channels`]. `settings` are in their ranges, and no size is 0.
     ///
     /// A crop has `crop_side` of each side, rounded, and at least one pixel.
@@ -105,18 +105,18 @@ impl Augment {
         (height, width, channels): (usize, usize, usize),
         frame_channels: usize,
     ) -> Self {
-        let side = |whole: usize| {
+        let crop_length = |whole: usize| {
             let kept = (whole as f64 * settings.crop_side).round() as usize;
             kept.clamp(1, whole)
         };
-        let crop = (side(height), side(width));
+        let crop = (crop_length(height), crop_length(width));
         Self {
             settings,
             size: (height, width, channels),
             frame_channels,
             crop,
             rows: taps(crop.0, height),
-            cols: taps(crop.1, width),
+            columns: taps(crop.1, width),
         }
     }
 
@@ -148,38 +148,38 @@ impl Augment {
         }
     }
 
-    /// Augments each of `states` [n, H, W, C] with a separate draw. Writes the results to `seen`, resized to the length of `states`.
+    /// Augments each of `states` [n, H, W, C] with a separate draw. Writes the results to `out`, resized to the length of `states`.
     ///
     /// All draws are made in order before the parallel part, so that the bytes depend on `rng` alone.
-    pub fn apply(&self, states: &[u8], seen: &mut Vec<u8>, rng: &mut impl Rng) {
+    pub fn apply(&self, states: &[u8], out: &mut Vec<u8>, rng: &mut impl Rng) {
         let (height, width, channels) = self.size;
         let state_bytes = height * width * channels;
         let count = states.len() / state_bytes;
         let views: Vec<View> = (0..count).map(|_| self.draw(rng)).collect();
-        seen.resize(states.len(), 0);
-        seen.par_chunks_exact_mut(state_bytes)
+        out.resize(states.len(), 0);
+        out.par_chunks_exact_mut(state_bytes)
             .zip(states.par_chunks_exact(state_bytes))
             .zip(&views)
             .for_each_init(
-                || self.line(),
-                |line, ((seen, state), view)| self.change(state, view, seen, line),
+                || self.new_line(),
+                |line, ((out, state), view)| self.apply_view_using(state, view, out, line),
             );
     }
 
     /// Allocates a buffer for a line of the crop.
-    fn line(&self) -> Vec<u16> {
+    fn new_line(&self) -> Vec<u16> {
         vec![0; self.crop.1 * self.size.2]
     }
 
-    /// Applies `view` to one state and writes the result to `seen`.
-    pub fn apply_view(&self, state: &[u8], view: &View, seen: &mut [u8]) {
-        self.change(state, view, seen, &mut self.line());
+    /// Applies `view` to one state and writes the result to `out`.
+    pub fn apply_view(&self, state: &[u8], view: &View, out: &mut [u8]) {
+        self.apply_view_using(state, view, out, &mut self.new_line());
     }
 
-    fn change(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
+    fn apply_view_using(&self, state: &[u8], view: &View, out: &mut [u8], line: &mut [u16]) {
         let (height, width, channels) = self.size;
         if self.crop == (height, width) {
-            seen.copy_from_slice(state);
+            out.copy_from_slice(state);
         } else {
             let resize = match channels {
                 1 => Self::resize::<1>,
@@ -188,18 +188,18 @@ impl Augment {
                 12 => Self::resize::<12>,
                 _ => Self::resize_any,
             };
-            resize(self, state, view, seen, line);
+            resize(self, state, view, out, line);
         }
-        recolour(seen, view, self.frame_channels);
+        recolour(out, view, self.frame_channels);
     }
 
-    /// [`Augment::resize_any`] specialised at compile time for states of `C` channels.
-    fn resize<const C: usize>(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
-        let (outputs, _) = seen.as_chunks_mut::<C>();
+    /// [`Augmenter::resize_any`] specialised at compile time for states of `C` channels.
+    fn resize<const C: usize>(&self, state: &[u8], view: &View, out: &mut [u8], line: &mut [u16]) {
+        let (outputs, _) = out.as_chunks_mut::<C>();
         for (tap, outputs) in self.rows.iter().zip(outputs.chunks_exact_mut(self.size.1)) {
             self.blend_rows(state, view, tap, line);
             let (pixels, _) = line.as_chunks::<C>();
-            for (output, tap) in outputs.iter_mut().zip(&self.cols) {
+            for (output, tap) in outputs.iter_mut().zip(&self.columns) {
                 let (near, far) = (&pixels[tap.near], &pixels[tap.far]);
                 for c in 0..C {
                     output[c] = blend(near[c], far[c], tap.far_weight);
@@ -213,12 +213,12 @@ impl Augment {
     /// Output pixel d lies at (d + 1/2) * crop / whole - 1/2 of the crop. It mixes the two pixels beside it, with weights in 1/256 and
     /// one rounding, as PyTorch's `interpolate(mode = "bilinear", align_corners = False)` does. Nearest neighbours would double every
     /// fourth pixel, and with it the thin objects of a 64 x 64 frame.
-    fn resize_any(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {
+    fn resize_any(&self, state: &[u8], view: &View, out: &mut [u8], line: &mut [u16]) {
         let (_, width, channels) = self.size;
-        let outputs = seen.chunks_exact_mut(width * channels);
+        let outputs = out.chunks_exact_mut(width * channels);
         for (tap, outputs) in self.rows.iter().zip(outputs) {
             self.blend_rows(state, view, tap, line);
-            for (output, tap) in outputs.chunks_exact_mut(channels).zip(&self.cols) {
+            for (output, tap) in outputs.chunks_exact_mut(channels).zip(&self.columns) {
                 let (near, far) = (tap.near * channels, tap.far * channels);
                 for (c, output) in output.iter_mut().enumerate() {
                     *output = blend(line[near + c], line[far + c], tap.far_weight);
@@ -235,7 +235,7 @@ impl Augment {
             &state[start..start + line.len()]
         };
         let (near, far) = (row(tap.near), row(tap.far));
-        let (near_weight, far_weight) = (WHOLE - tap.far_weight, tap.far_weight);
+        let (near_weight, far_weight) = (FULL_WEIGHT - tap.far_weight, tap.far_weight);
         for ((out, &near), &far) in line.iter_mut().zip(near).zip(far) {
             *out = u16::from(near) * near_weight + u16::from(far) * far_weight;
         }
@@ -244,21 +244,21 @@ impl Augment {
 
 /// Mixes two values in units of 1/256 of a byte, and rounds to a byte.
 fn blend(near: u16, far: u16, far_weight: u16) -> u8 {
-    let sum =
-        u32::from(near) * u32::from(WHOLE - far_weight) + u32::from(far) * u32::from(far_weight);
+    let sum = u32::from(near) * u32::from(FULL_WEIGHT - far_weight)
+        + u32::from(far) * u32::from(far_weight);
     ((sum + (1 << 15)) >> 16) as u8
 }
 
 /// The position of each of `to` output pixels among `from` source pixels, clamped at the ends.
 fn taps(from: usize, to: usize) -> Vec<Tap> {
     let tap = |at: usize| {
-        let place = (at as f64 + 0.5) * from as f64 / to as f64 - 0.5;
-        let place = place.clamp(0.0, (from - 1) as f64);
-        let near = place.floor() as usize;
+        let position = (at as f64 + 0.5) * from as f64 / to as f64 - 0.5;
+        let position = position.clamp(0.0, (from - 1) as f64);
+        let near = position.floor() as usize;
         Tap {
             near,
             far: (near + 1).min(from - 1),
-            far_weight: ((place - place.floor()) * f64::from(WHOLE)).round() as u16,
+            far_weight: ((position - position.floor()) * f64::from(FULL_WEIGHT)).round() as u16,
         }
     };
     (0..to).map(tap).collect()
@@ -278,14 +278,14 @@ fn recolour(state: &mut [u8], view: &View, frame_channels: usize) {
     let gain = view.brightness * view.contrast;
     let half = 1 << (COLOUR_BITS - 1);
     let add = (view.brightness * (1.0 - view.contrast) * mean * unit).round() as i32 + half;
-    let whole = |coefficient: f64| (gain * coefficient * unit).round() as i32;
-    let byte = |sum: i32| (sum >> COLOUR_BITS).clamp(0, 255) as u8;
+    let to_fixed_point = |coefficient: f64| (gain * coefficient * unit).round() as i32;
+    let to_byte = |sum: i32| (sum >> COLOUR_BITS).clamp(0, 255) as u8;
     if frame_channels == 3 {
         let (sin, cos) = (view.hue * std::f64::consts::TAU).sin_cos();
         let (along, across) = (view.saturation * cos, view.saturation * sin / 3f64.sqrt());
-        let own = whole(1.0 / 3.0 + along * 2.0 / 3.0);
-        let next = whole(1.0 / 3.0 - along / 3.0 - across);
-        let last = whole(1.0 / 3.0 - along / 3.0 + across);
+        let own = to_fixed_point(1.0 / 3.0 + along * 2.0 / 3.0);
+        let next = to_fixed_point(1.0 / 3.0 - along / 3.0 - across);
+        let last = to_fixed_point(1.0 / 3.0 - along / 3.0 + across);
         if (own, next, last, add) == (1 << COLOUR_BITS, 0, 0, half) {
             return;
         }
@@ -293,17 +293,17 @@ fn recolour(state: &mut [u8], view: &View, frame_channels: usize) {
         for pixel in pixels {
             let [r, g, b] = pixel.map(i32::from);
             *pixel = [
-                byte(own * r + next * g + last * b + add),
-                byte(last * r + own * g + next * b + add),
-                byte(next * r + last * g + own * b + add),
+                to_byte(own * r + next * g + last * b + add),
+                to_byte(last * r + own * g + next * b + add),
+                to_byte(next * r + last * g + own * b + add),
             ];
         }
     } else {
-        let own = whole(1.0);
+        let own = to_fixed_point(1.0);
         if (own, add) == (1 << COLOUR_BITS, half) {
             return;
         }
-        let changed: [u8; 256] = std::array::from_fn(|value| byte(own * value as i32 + add));
+        let changed: [u8; 256] = std::array::from_fn(|value| to_byte(own * value as i32 + add));
         state
             .iter_mut()
             .for_each(|value| *value = changed[usize::from(*value)]);

@@ -76,19 +76,19 @@ impl OwnedBatch {
 }
 
 impl<'a> Batch<'a> {
-    /// Checks lengths against `model`, positives against what the auxiliary loss `wants`, actions, returns and discounts.
-    pub fn validate(&self, model: &ModelConfig, wants: Positives) -> Result<(), UpdateError> {
-        let fault = |what: String| Err(UpdateError::Batch(what));
+    /// Checks lengths against `model`, positives against what the auxiliary loss requires, actions, returns and discounts.
+    pub fn validate(&self, model: &ModelConfig, required: Positives) -> Result<(), UpdateError> {
+        let invalid = |what: String| Err(UpdateError::Batch(what));
         let rows = self.rows;
         if rows == 0 {
-            return fault("it has no rows".to_owned());
+            return invalid("it has no rows".to_owned());
         }
         let state_bytes = model.frame_len();
         let positives = self.positives;
-        if !wants.fit(positives, self.anchors.is_some()) {
-            return fault(format!(
+        if !required.accepts(positives, self.anchors.is_some()) {
+            return invalid(format!(
                 "it has {positives} positives a row; this agent needs {}",
-                wants.describe_wanted()
+                required.describe_accepted()
             ));
         }
         let anchors = self.anchors.unwrap_or(self.states_t);
@@ -107,14 +107,14 @@ impl<'a> Batch<'a> {
             ),
         ] {
             if length != rows * row_length {
-                return fault(format!(
+                return invalid(format!(
                     "{name} has {length} values, not {rows} rows of {row_length}"
                 ));
             }
         }
-        let bootstraps = self.bootstraps().count();
+        let bootstraps = self.bootstrapping_rows().count();
         let valid = self.positive_valid.iter().filter(|valid| **valid != 0);
-        for (name, length, all, there) in [
+        for (name, length, all, present) in [
             (
                 "states_k",
                 self.states_k.len(),
@@ -123,29 +123,29 @@ impl<'a> Batch<'a> {
             ),
             ("states_n", self.states_n.len(), rows, bootstraps),
         ] {
-            if length != all * state_bytes && length != there * state_bytes {
-                return fault(format!(
-                    "{name} has {length} values, not {all} states of {state_bytes}, nor the {there} that its rows have"
+            if length != all * state_bytes && length != present * state_bytes {
+                return invalid(format!(
+                    "{name} has {length} values, not {all} states of {state_bytes}, nor the {present} that its rows have"
                 ));
             }
         }
-        let bad = |weight: &f32| !(weight.is_finite() && *weight >= 0.0);
+        let is_invalid = |weight: &f32| !(weight.is_finite() && *weight >= 0.0);
         let weights = self.importance_weight.unwrap_or_default();
-        if let Some(row) = weights.iter().position(bad) {
-            return fault(format!("row {row} has the weight {}", weights[row]));
+        if let Some(row) = weights.iter().position(is_invalid) {
+            return invalid(format!("row {row} has the weight {}", weights[row]));
         }
-        let known = |action: u8| usize::from(action) < model.num_actions;
+        let is_known = |action: u8| usize::from(action) < model.num_actions;
         for row in 0..rows {
             let (action, next) = (self.action[row], self.next_action[row]);
-            if !known(action) || !(known(next) || next == NO_ACTION) {
+            if !is_known(action) || !(is_known(next) || next == NO_ACTION) {
                 let count = model.num_actions;
-                return fault(format!(
+                return invalid(format!(
                     "row {row} has actions {action}, {next}; there are {count}"
                 ));
             }
             let (reward, discount) = (self.n_step_return[row], self.bootstrap_discount[row]);
             if !reward.is_finite() || !(0.0..=1.0).contains(&discount) {
-                return fault(format!(
+                return invalid(format!(
                     "row {row} has return {reward} and discount {discount}"
                 ));
             }
@@ -153,7 +153,7 @@ impl<'a> Batch<'a> {
         Ok(())
     }
 
-    pub(crate) fn bootstraps(&self) -> impl Iterator<Item = usize> {
+    pub(crate) fn bootstrapping_rows(&self) -> impl Iterator<Item = usize> {
         let discounts = self.bootstrap_discount.iter().enumerate();
         discounts.filter_map(|(row, &discount)| (discount != 0.0).then_some(row))
     }
@@ -161,14 +161,14 @@ impl<'a> Batch<'a> {
     /// s_{t+n} of the rows that bootstrap, each `Some`. The batch must be valid for states of `state_bytes` bytes.
     pub(crate) fn next_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
         let bootstraps = self.bootstrap_discount.iter().map(|&it| it != 0.0);
-        let states = in_places(self.states_n, state_bytes, bootstraps);
+        let states = place_states(self.states_n, state_bytes, bootstraps);
         states.filter(Option::is_some).collect()
     }
 
     /// s_{t+k} [P, B]; `None` if the row lacks this positive. The batch must be valid for states of `state_bytes` bytes.
     pub fn positive_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
         let valid = self.positive_valid.iter().map(|&it| it != 0);
-        in_places(self.states_k, state_bytes, valid).collect()
+        place_states(self.states_k, state_bytes, valid).collect()
     }
 
     /// The pairs (a_t, a_{t+1}) of `rows`, which may contain a row twice. Rows without a_{t+1} are skipped.
@@ -180,16 +180,16 @@ impl<'a> Batch<'a> {
     }
 }
 
-/// Yields a state for each true entry of `there` and `None` for the others. `states` holds one state per entry or per true entry.
-fn in_places(
+/// Yields a state for each true entry of `present` and `None` for the others. `states` holds one state per entry or per true entry.
+fn place_states(
     states: &[u8],
     state_bytes: usize,
-    there: impl ExactSizeIterator<Item = bool>,
+    present: impl ExactSizeIterator<Item = bool>,
 ) -> impl Iterator<Item = Option<&[u8]>> {
-    let whole = states.len() == there.len() * state_bytes;
+    let full = states.len() == present.len() * state_bytes;
     let mut states = states.chunks_exact(state_bytes);
-    there.map(move |there| {
-        let state = if there || whole { states.next() } else { None };
-        state.filter(|_| there)
+    present.map(move |present| {
+        let state = if present || full { states.next() } else { None };
+        state.filter(|_| present)
     })
 }

@@ -93,7 +93,7 @@ impl AffinityConfig {
     ///
     /// # Errors
     /// A setting or table that is missing or out of range.
-    pub fn estimator(
+    pub fn make_estimator(
         &self,
         num_actions: usize,
         rng: &mut ChaCha8Rng,
@@ -242,7 +242,7 @@ impl LearnerConfig {
         this.learner.validate()?;
         this.learner.update.validate()?;
         let (height, width) = this.input.whole_input();
-        let sent = (
+        let frame_size = (
             this.spec.frame_height as usize,
             this.spec.frame_width as usize,
         );
@@ -253,11 +253,11 @@ impl LearnerConfig {
             ..this.model.clone()
         };
         // The model's input may lack the border pixels that no layer reads, so that both inputs give the same local shape.
-        let follows = this.model.input_channels == states
+        let sizes_follow = this.model.input_channels == states
             && this.model.num_actions == this.spec.num_actions as usize
             && this.model.local_shape() == whole.local_shape()
-            && this.input.enlarge(sent, &this.model).is_ok();
-        if !follows {
+            && this.input.enlarge(frame_size, &this.model).is_ok();
+        if !sizes_follow {
             return Err(LearnerConfigError::Sizes);
         }
         Ok(this)

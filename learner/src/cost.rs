@@ -22,7 +22,7 @@ impl UpdateShape {
     /// The shape for a learner with these settings, if the replay server serves `positives` later states per row. An auxiliary loss with
     /// invalid settings counts as no passes.
     pub fn for_learner(learner: &Config, positives: usize) -> Self {
-        let passes = learner.update.auxiliary().map_or_else(
+        let passes = learner.update.make_auxiliary_loss().map_or_else(
             |_| Passes::default(),
             |loss| loss.passes(positives, learner.augment.is_some()),
         );

@@ -72,7 +72,7 @@ pub(crate) struct Networks {
     pub(crate) online: Network,
     pub(crate) target: Network,
     /// The key encoder of a loss that has one.
-    pub(crate) key: Option<Encoder>,
+    pub(crate) key_encoder: Option<Encoder>,
 }
 
 /// The target of the C51 loss.
@@ -120,7 +120,7 @@ impl Networks {
             model: &self.model,
             batch,
             features: &features,
-            key: self.key.as_ref(),
+            key_encoder: self.key_encoder.as_ref(),
             device: &self.compute.device,
         })?;
         let mut total = kl.clone();
@@ -169,7 +169,7 @@ impl Networks {
         for probs in probs.chunks_exact_mut(atoms) {
             probs[0] = 1.0;
         }
-        let bootstraps: Vec<usize> = batch.bootstraps().collect();
+        let bootstraps: Vec<usize> = batch.bootstrapping_rows().collect();
         if !bootstraps.is_empty() {
             let (actions, logits) = self.next_greedy_actions(batch, noise)?;
             let rows = bootstraps.iter().zip(actions);

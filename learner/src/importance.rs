@@ -21,7 +21,7 @@ pub fn importance_weights(probabilities: &[f32], beta: f64) -> Vec<f32> {
 /// up to an error of the order of 1 / B.
 ///
 /// `probabilities` [B], from 1.2e-38 to 1, B at least 1. Result [B], in 0..B. Source: Rubin 1987, sampling importance resampling.
-pub fn drawn_evenly(probabilities: &[f32], rng: &mut impl Rng) -> Vec<usize> {
+pub fn resample_evenly(probabilities: &[f32], rng: &mut impl Rng) -> Vec<usize> {
     let weights = probabilities.iter().map(|&p| 1.0 / f64::from(p));
     let rows = WeightedIndex::new(weights).expect("chances are above 0, of one row at least");
     (0..probabilities.len()).map(|_| rows.sample(rng)).collect()
@@ -49,7 +49,7 @@ mod tests {
             let chances: Vec<f32> = kinds.iter().map(chance).collect();
             // One row of each batch, as rows of the same batch depend on each other.
             drawn[kinds[0]] += 1.0;
-            even[kinds[drawn_evenly(&chances, &mut rng)[0]]] += 1.0;
+            even[kinds[resample_evenly(&chances, &mut rng)[0]]] += 1.0;
         }
         let chi_square = |counts: [f64; 8]| {
             let expected = f64::from(batches) / 8.0;

@@ -6,9 +6,9 @@ use driml_model::{Compute, Features, ModelConfig, Network, Parameters};
 
 use crate::{
     agent::Agent,
-    auxiliary::dim::{DIM, Vectors},
+    auxiliary::dim::{DIM, HeadVectors},
     error::UpdateError,
-    losses::{c51::softmax, scores::Scores},
+    losses::{c51::softmax, scores::ScoreClip},
     settings::UpdateSettings,
     tensors::{states_tensor, to_vec_f32},
 };
@@ -105,20 +105,18 @@ impl Insight {
         let actions = Tensor::from_slice(actions, actions.len(), &self.compute.device)?;
         let only_local = [true, false, false, false];
         let (now, later) = (&now.features, &later.features);
-        let vectors = Vectors::new(&self.network, now, later, &actions, only_local)?;
-        let [Some(dots), ..] = vectors.dots(only_local)? else {
+        let vectors = HeadVectors::new(&self.network, now, later, &actions, only_local)?;
+        let [Some(dots), ..] = vectors.dot_products(only_local)? else {
             return Ok(None);
         };
-        let scores = Scores::new(dots.width, tanh_clip);
-        let (locations, rows, _) = dots.dots.dims3()?;
-        let dots = to_vec_f32(&dots.dots)?;
+        let clip = ScoreClip::new(dots.width, tanh_clip);
+        let (locations, rows, _) = dots.values.dims3()?;
+        let dots = to_vec_f32(&dots.values)?;
         let mut matches = vec![0.0; rows * locations];
         for (index, candidates) in dots.chunks_exact(rows).enumerate() {
             let (location, row) = (index / rows, index % rows);
-            let own = scores.score(candidates[row]);
-            let others = candidates
-                .iter()
-                .map(|&dot| (scores.score(dot) - own).exp());
+            let own = clip.score(candidates[row]);
+            let others = candidates.iter().map(|&dot| (clip.score(dot) - own).exp());
             matches[row * locations + location] = 1.0 / others.sum::<f64>();
         }
         Ok(Some(matches))

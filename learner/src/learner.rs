@@ -15,7 +15,7 @@ use crate::{
     config::LearnerConfig,
     error::UpdateError,
     evaluation::UpdateReport,
-    importance::drawn_evenly,
+    importance::resample_evenly,
     prepare::{Columns, Preparation},
     run_counts::RunCounts,
 };
@@ -68,7 +68,7 @@ impl Learner {
         let (model, update) = (config.model.clone(), config.learner.update.clone());
         let agent = Agent::new(model, update, compute, &mut init)?;
         let affinity = &config.learner.affinity;
-        let affinity = affinity.estimator(config.model.num_actions, &mut rng)?;
+        let affinity = affinity.make_estimator(config.model.num_actions, &mut rng)?;
         Ok(Self {
             spec_hash: spec.hash(),
             state: LearnerState {
@@ -103,11 +103,11 @@ impl Learner {
         let Some(restored) = restored else {
             return Ok(this);
         };
-        let [fresh, found] = [&this.state, &restored].map(|it| {
+        let [configured, saved] = [&this.state, &restored].map(|it| {
             let affinity = it.affinity.as_ref();
             affinity.map(AffinityEstimator::settings)
         });
-        if fresh != found {
+        if configured != saved {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.state = LearnerState {
@@ -149,18 +149,18 @@ impl Learner {
     /// [`UpdateError::Diverged`](crate::UpdateError::Diverged): the learner can then neither publish weights nor save a checkpoint.
     pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
         let beta = self.config.sampling.beta(self.updates());
-        let columns = Columns::of(batch, beta);
+        let columns = Columns::new(batch, beta);
         // A copy, which replaces the generator only if the update succeeds.
         let mut rng = self.state.rng.clone();
         let batch = self.preparation.prepare(&columns, &mut rng);
         // The affinity estimate must not see the actions of an invalid batch.
-        self.state.agent.check(&batch)?;
+        self.state.agent.check_batch(&batch)?;
         let mut affinity = self.state.affinity.clone();
         if let Some(affinity) = &mut affinity {
             // Without the resampling, rows drawn by priority would give the affinity of surprising transitions.
             let pairs = match &columns.probabilities {
                 None => batch.action_pairs(0..batch.rows),
-                Some(it) => batch.action_pairs(drawn_evenly(it, &mut rng)),
+                Some(it) => batch.action_pairs(resample_evenly(it, &mut rng)),
             };
             affinity.observe(&pairs, &mut rng)?;
         }

@@ -76,7 +76,7 @@ pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
 pub use agent::{Agent, NetworkParameters};
-pub use augment::{Augment, AugmentSettings};
+pub use augment::{AugmentSettings, Augmenter};
 pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
 pub use batch::{Batch, OwnedBatch};
 pub use config::{

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::{
-    augment::Augment, auxiliary::positives::Positives, batch::Batch, config::LearnerConfig,
+    augment::Augmenter, auxiliary::positives::Positives, batch::Batch, config::LearnerConfig,
     deduplicate::concatenate, importance::importance_weights,
 };
 
@@ -29,7 +29,7 @@ pub(crate) struct Columns<'a> {
 
 impl<'a> Columns<'a> {
     /// Converts the columns of `batch`; `beta` is the exponent of importance weights.
-    pub(crate) fn of(batch: &'a WireBatch, beta: f64) -> Self {
+    pub(crate) fn new(batch: &'a WireBatch, beta: f64) -> Self {
         let probabilities = batch.probabilities();
         let weights = probabilities.as_ref();
         Self {
@@ -51,25 +51,25 @@ pub(crate) struct Preparation {
     enlarge: Option<Enlarge>,
     /// States at the network's input size, if they have to be enlarged.
     enlarged: [Vec<u8>; 3],
-    augment: Option<Augment>,
+    augment: Option<Augmenter>,
     /// Augmented states for the auxiliary loss.
-    seen: [Vec<u8>; 2],
+    augmented: [Vec<u8>; 2],
 }
 
 impl Preparation {
     pub(crate) fn new(config: &LearnerConfig) -> Result<Self, ModelError> {
         let (spec, model) = (&config.spec, &config.model);
-        let sent = (spec.frame_height as usize, spec.frame_width as usize);
+        let frame_size = (spec.frame_height as usize, spec.frame_width as usize);
         let size = (model.height, model.width, model.input_channels);
         let channels = spec.frame_channels as usize;
         let augment = config.learner.augment;
         Ok(Self {
             positives: config.learner.update.auxiliary_loss.positives(),
             state_bytes: model.frame_len(),
-            enlarge: config.input.enlarge(sent, model)?,
+            enlarge: config.input.enlarge(frame_size, model)?,
             enlarged: Default::default(),
-            augment: augment.map(|settings| Augment::new(settings, size, channels)),
-            seen: Default::default(),
+            augment: augment.map(|settings| Augmenter::new(settings, size, channels)),
+            augmented: Default::default(),
         })
     }
 
@@ -87,19 +87,19 @@ impl Preparation {
             }
         }
         let [states_t, states_k, states_n] = frames;
-        let served = columns.batch;
+        let received = columns.batch;
         let mut batch = Batch {
-            rows: served.rows(),
+            rows: received.rows(),
             states_t,
             anchors: None,
-            positives: served.positives(),
+            positives: received.positives(),
             states_k,
             states_n,
-            action: served.actions(),
-            next_action: served.next_actions(),
+            action: received.actions(),
+            next_action: received.next_actions(),
             n_step_return: &columns.returns,
             bootstrap_discount: &columns.discounts,
-            positive_valid: served.positive_valid(),
+            positive_valid: received.positive_valid(),
             importance_weight: columns.weights.as_deref(),
         };
         if let Some(augment) = &self.augment {
@@ -109,17 +109,17 @@ impl Preparation {
                 batch.positives = 1;
                 batch.positive_valid = &columns.all_valid;
             }
-            let [seen_t, seen_k] = &mut self.seen;
-            augment.apply(states_t, seen_t, rng);
+            let [augmented_t, augmented_k] = &mut self.augmented;
+            augment.apply(states_t, augmented_t, rng);
             // Draws for missing positives too, so that a run's augmentations do not depend on which positives are missing.
             if batch.states_k.len() < batch.positive_valid.len() * self.state_bytes {
                 let each = batch.positive_states(self.state_bytes).into_iter();
-                augment.apply(&concatenate(each, self.state_bytes), seen_k, rng);
+                augment.apply(&concatenate(each, self.state_bytes), augmented_k, rng);
             } else {
-                augment.apply(batch.states_k, seen_k, rng);
+                augment.apply(batch.states_k, augmented_k, rng);
             }
-            batch.anchors = Some(seen_t);
-            batch.states_k = seen_k;
+            batch.anchors = Some(augmented_t);
+            batch.states_k = augmented_k;
         }
         batch
     }

@@ -79,7 +79,7 @@ impl UpdateSettings {
             return Err(UpdateError::Settings("target_period_updates = 0".into()));
         }
         self.lambda.validate()?;
-        self.auxiliary()?;
+        self.make_auxiliary_loss()?;
         self.adam.validate()
     }
 
@@ -98,15 +98,15 @@ impl UpdateSettings {
     ///
     /// # Errors
     /// Invalid settings of the loss.
-    pub fn auxiliary(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-        self.auxiliary_loss.loss(&self.auxiliary_settings())
+    pub fn make_auxiliary_loss(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+        self.auxiliary_loss.make_loss(&self.auxiliary_settings())
     }
 
     /// The heads that the online network needs in an environment of `num_actions` actions; none if the settings are invalid, which
     /// [`UpdateSettings::validate`] reports.
     pub fn dim_heads(&self, num_actions: usize) -> DimHeads {
         let action = self.condition_on_action && num_actions > 1;
-        let loss = self.auxiliary();
+        let loss = self.make_auxiliary_loss();
         loss.map_or(DimHeads::NONE, |loss| loss.heads(action))
     }
 }

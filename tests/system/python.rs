@@ -79,7 +79,7 @@ fn trained(system: &TestSystem, flags: &str) -> (Agent, NetworkOutputs) {
     ChaCha8Rng::seed_from_u64(1).fill_bytes(&mut states);
     fs::write(system.path("states"), &states).unwrap();
     let mut agent = restored.unwrap().unwrap().agent;
-    agent.take_average().unwrap();
+    agent.copy_average_to_online().unwrap();
     let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
     let ours = insight.evaluate(&states).unwrap();
     (agent, ours)

@@ -34,7 +34,7 @@ struct PredictionSettings {
 }
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-    match settings.own()? {
+    match settings.own_table()? {
         Some(PredictionSettings { weight }) if weight > 0.0 && weight.is_finite() => {
             Ok(Box::new(Prediction { weight }))
         }
@@ -88,7 +88,7 @@ impl AuxiliaryLoss for Prediction {
             name: NAME,
             weight: self.weight,
             loss,
-            dots: Vec::new(),
+            dot_products: Vec::new(),
         }])
     }
 }

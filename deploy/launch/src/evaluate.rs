@@ -80,7 +80,7 @@ impl Player {
         let hash = config.run.hash();
         let loaded = checkpoint::load(checkpoint, model, update, &Compute::CPU, hash)?;
         let mut agent = loaded.agent;
-        let is_averaged = weights == Weights::Average && agent.take_average()?;
+        let is_averaged = weights == Weights::Average && agent.copy_average_to_online()?;
         Ok(Self {
             network: agent.online().clone(),
             updates: agent.updates(),

@@ -208,7 +208,7 @@ impl RunConfig {
         device.map_err(said)?;
         self.check_auxiliary_loss()?;
         let rng = &mut ChaCha8Rng::seed_from_u64(0);
-        let affinity = learner.affinity.estimator(self.model.num_actions, rng);
+        let affinity = learner.affinity.make_estimator(self.model.num_actions, rng);
         affinity.map_err(said)?;
         let needs_affinity = matches!(self.run.horizon, Horizon::Nhg { .. });
         let learns_affinity = learner.affinity.estimator != EstimatorKind::None;
@@ -228,7 +228,7 @@ impl RunConfig {
         let auxiliary_loss = self.learner.update.auxiliary_loss;
         let positives = auxiliary_loss.positives();
         let served = self.run.horizon.positives();
-        if positives.served().contains(&served) {
+        if positives.served_counts().contains(&served) {
             return Ok(());
         }
         let later = match served {
@@ -241,7 +241,7 @@ impl RunConfig {
             later,
             auxiliary_loss.name(),
             positives.describe_served(),
-            positives.horizon()
+            positives.example_horizon()
         ))
     }
 }

@@ -145,7 +145,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
 /// Fills in the layers of the auxiliary loss, if it has any. If the model or the loss is invalid, later checks report why.
 fn loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
     if let Ok(model) = table_at::<ModelConfig>(table, "model")
-        && let Ok(loss) = update.auxiliary()
+        && let Ok(loss) = update.make_auxiliary_loss()
     {
         let layers = loss.layers(&model).into_iter().map(as_toml);
         let layers = layers.collect::<Result<Vec<_>, _>>()?;

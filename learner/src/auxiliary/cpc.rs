@@ -7,7 +7,7 @@ use candle_core::Tensor;
 use driml_model::DimHeads;
 
 use super::{
-    dim::{Dim, Vectors},
+    dim::{Dim, HeadVectors},
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
     positives::Positives,
 };
@@ -15,7 +15,7 @@ use crate::{
     batch::Batch,
     deduplicate::StateBytes,
     error::UpdateError,
-    losses::{info_nce::info_nce_loss, scores::Dots},
+    losses::{info_nce::info_nce_loss, scores::DotProducts},
 };
 
 /// The menu item of CPC.
@@ -24,10 +24,10 @@ pub const CPC: MenuItem = MenuItem {
     positives: Positives::Several,
     loss_names: &NAMES,
     make: |settings| {
-        settings.check_no_own()?;
-        settings.check_weighted()?;
-        let pairs = Dim::new(settings);
-        Ok(Box::new(Cpc { pairs }))
+        settings.check_no_own_table()?;
+        settings.check_any_pair_active()?;
+        let dim = Dim::new(settings);
+        Ok(Box::new(Cpc { dim }))
     },
 };
 
@@ -38,16 +38,16 @@ const NAMES: [&str; 4] = ["cpc_3t3", "cpc_3t4", "cpc_4t3", "cpc_4t4"];
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Cpc {
     /// Weights of the pairs, and the clip of their scores.
-    pairs: Dim,
+    dim: Dim,
 }
 
 impl AuxiliaryLoss for Cpc {
     fn heads(&self, action: bool) -> DimHeads {
-        self.pairs.heads(action)
+        self.dim.heads(action)
     }
 
     fn passes(&self, positives: usize, augmented: bool) -> Passes {
-        Passes::for_pairs(self.pairs.lambda, positives, augmented)
+        Passes::for_pairs(self.dim.lambda, positives, augmented)
     }
 
     /// The positives that exist, offset by offset; nothing is computed for missing ones.
@@ -62,15 +62,15 @@ impl AuxiliaryLoss for Cpc {
     /// Source: van den Oord et al. 2018, section 2.3, with the heads of Mazoure et al. 2020 ("exactly the same networks
     /// for measuring similarity").
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
-        let mut offsets = self.dots_of_offsets(inputs)?;
-        let (kernels, tanh_clip) = (inputs.online.kernels(), self.pairs.tanh_clip);
-        let pairs = NAMES.into_iter().zip(self.pairs.lambda.values());
+        let mut offsets = self.dot_products_by_offset(inputs)?;
+        let (kernels, tanh_clip) = (inputs.online.kernels(), self.dim.tanh_clip);
+        let pairs = NAMES.into_iter().zip(self.dim.lambda.values());
         let mut losses = Vec::new();
         for (pair, (name, weight)) in pairs.enumerate().filter(|(_, (_, weight))| *weight > 0.0) {
             let dots = offsets.iter_mut().filter_map(|offset| offset[pair].take());
-            let dots: Vec<Dots> = dots.collect();
+            let dots: Vec<DotProducts> = dots.collect();
             let each = dots.iter().map(|dots| {
-                let all = vec![1; dots.dots.dim(1)?];
+                let all = vec![1; dots.values.dim(1)?];
                 info_nce_loss(dots, &all, tanh_clip, kernels)
             });
             let loss = match each.reduce(|sum, loss| sum? + loss?) {
@@ -81,7 +81,7 @@ impl AuxiliaryLoss for Cpc {
                 name,
                 weight,
                 loss,
-                dots,
+                dot_products: dots,
             });
         }
         Ok(losses)
@@ -90,25 +90,25 @@ impl AuxiliaryLoss for Cpc {
 
 impl Cpc {
     /// The dot products, by pair of levels, for each offset at which two rows or more have a positive; only these rows take part.
-    fn dots_of_offsets(
+    fn dot_products_by_offset(
         &self,
         inputs: &LossInputs<'_>,
-    ) -> Result<Vec<[Option<Dots>; 4]>, UpdateError> {
+    ) -> Result<Vec<[Option<DotProducts>; 4]>, UpdateError> {
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());
         };
-        let (batch, active) = (inputs.batch, self.pairs.lambda.active_pairs());
+        let (batch, active) = (inputs.batch, self.dim.lambda.active_pairs());
         let (anchors, action) = (&inputs.features.anchors, inputs.action()?);
-        let vectors = Vectors::new(inputs.online, anchors, later, &action, active)?;
+        let vectors = HeadVectors::new(inputs.online, anchors, later, &action, active)?;
         let (mut offsets, mut first) = (Vec::new(), 0);
         for valid in batch.positive_valid.chunks_exact(batch.rows) {
-            let there = (0..).zip(valid).filter(|(_, valid)| **valid != 0);
-            let rows: Vec<u32> = there.map(|(row, _)| row).collect();
+            let present = (0..).zip(valid).filter(|(_, valid)| **valid != 0);
+            let rows: Vec<u32> = present.map(|(row, _)| row).collect();
             let candidates = first..first + rows.len();
             first = candidates.end;
             if rows.len() >= 2 {
-                let here = of_offset(&vectors, batch.rows, &rows, candidates)?;
-                offsets.push(here.dots(active)?);
+                let selected = vectors_at_offset(&vectors, batch.rows, &rows, candidates)?;
+                offsets.push(selected.dot_products(active)?);
             }
         }
         Ok(offsets)
@@ -116,21 +116,21 @@ impl Cpc {
 }
 
 /// The vectors of one offset: psi of the rows in `anchors`, phi of the positives in `candidates`.
-fn of_offset(
-    vectors: &Vectors,
+fn vectors_at_offset(
+    vectors: &HeadVectors,
     rows: usize,
     anchors: &[u32],
     candidates: Range<usize>,
-) -> candle_core::Result<Vectors> {
-    let mut here = vectors.clone();
-    for psi in here.psi.iter_mut().flatten() {
+) -> candle_core::Result<HeadVectors> {
+    let mut selected = vectors.clone();
+    for psi in selected.psi.iter_mut().flatten() {
         if anchors.len() < rows {
             let indices = Tensor::from_slice(anchors, anchors.len(), psi.device())?;
             *psi = psi.index_select(&indices, 0)?;
         }
     }
-    for phi in here.phi.iter_mut().flatten() {
+    for phi in selected.phi.iter_mut().flatten() {
         *phi = phi.narrow(0, candidates.start, candidates.len())?;
     }
-    Ok(here)
+    Ok(selected)
 }

@@ -40,7 +40,7 @@ pub struct CurlSettings {
 }
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-    settings.check_weighted()?;
+    settings.check_any_pair_active()?;
     let said = |what: &str| format!("auxiliary_loss = curl {what}");
     let fault = |what: &str| Err(UpdateError::AuxiliaryLoss(said(what)));
     if settings.lambda.active_pairs() != [false, false, false, true] {
@@ -51,7 +51,7 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
             "compares views of one state, which no action parts: set condition_on_action to false",
         );
     }
-    let Some(CurlSettings { key_tau }) = settings.own()? else {
+    let Some(CurlSettings { key_tau }) = settings.own_table()? else {
         return fault(
             "encodes its keys by a moving average of the network, whose pace is missing (earlier versions had none): take the agent curl, or --set learner.update.curl.key_tau=0.001",
         );
@@ -98,18 +98,18 @@ impl AuxiliaryLoss for Curl {
     /// Computes the InfoNCE of the online network's vectors of one view with the key encoder's vectors of the other view. All rows take
     /// part, as no later state is needed.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
-        let keys = inputs.keys()?;
+        let keys = inputs.key_vectors()?;
         let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
         let kernels = inputs.online.kernels();
-        let dots = dim::dots_of(kernels, &query, &keys)?;
+        let dots = dim::dot_products(kernels, &query, &keys)?;
         let all = vec![1; inputs.batch.rows];
         let loss = info_nce_loss(&dots, &all, self.tanh_clip, kernels)?;
         Ok(vec![WeightedLoss {
             name: "curl",
             weight: self.weight,
             loss,
-            dots: vec![dots],
+            dot_products: vec![dots],
         }])
     }
 }

@@ -13,7 +13,7 @@ use crate::{
     batch::Batch,
     deduplicate::StateBytes,
     error::UpdateError,
-    losses::{info_nce::info_nce_loss, scores::Dots},
+    losses::{info_nce::info_nce_loss, scores::DotProducts},
 };
 
 /// The menu item of DIM.
@@ -22,8 +22,8 @@ pub const DIM: MenuItem = MenuItem {
     positives: Positives::One,
     loss_names: &NAMES,
     make: |settings| {
-        settings.check_no_own()?;
-        settings.check_weighted()?;
+        settings.check_no_own_table()?;
+        settings.check_any_pair_active()?;
         Ok(Box::new(Dim::new(settings)))
     },
 };
@@ -62,16 +62,16 @@ impl Dim {
         valid: &[u8],
     ) -> Result<Vec<WeightedLoss>, UpdateError> {
         let active = self.lambda.active_pairs();
-        let vectors = Vectors::new(network, features_t, features_k, action, active)?;
+        let vectors = HeadVectors::new(network, features_t, features_k, action, active)?;
         let pairs = NAMES.into_iter().zip(self.lambda.values());
         let mut losses = Vec::new();
-        for ((name, weight), dots) in pairs.zip(vectors.dots(active)?) {
+        for ((name, weight), dots) in pairs.zip(vectors.dot_products(active)?) {
             if let Some(dots) = dots {
                 losses.push(WeightedLoss {
                     name,
                     weight,
                     loss: info_nce_loss(&dots, valid, self.tanh_clip, network.kernels())?,
-                    dots: vec![dots],
+                    dot_products: vec![dots],
                 });
             }
         }
@@ -110,7 +110,7 @@ impl AuxiliaryLoss for Dim {
 /// The heads' vectors of anchors (psi) and candidates (phi), from local features [B, L, R] and from global features [B, R]; `None` if
 /// they are not compared.
 #[derive(Clone, Debug)]
-pub struct Vectors {
+pub struct HeadVectors {
     /// The kernels that multiply the vectors.
     pub kernels: Kernels,
     /// Psi_3 and Psi_4 of the anchors.
@@ -119,7 +119,7 @@ pub struct Vectors {
     pub phi: [Option<Tensor>; 2],
 }
 
-impl Vectors {
+impl HeadVectors {
     /// Computes the vectors that the `active` pairs need; `network` has their heads.
     pub fn new(
         network: &Network,
@@ -145,11 +145,11 @@ impl Vectors {
     /// Dot products for the `active` pairs whose vectors exist, in the order of `settings::PAIRS`. Anchors and candidates are equally many.
     ///
     /// Local features are compared with local features of the same location, a global feature with every location.
-    pub fn dots(&self, active: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
+    pub fn dot_products(&self, active: [bool; 4]) -> candle_core::Result<[Option<DotProducts>; 4]> {
         let mut dots = [const { None }; 4];
         for pair in (0..4).filter(|&pair| active[pair]) {
             if let (Some(psi), Some(phi)) = (&self.psi[pair / 2], &self.phi[pair % 2]) {
-                dots[pair] = Some(dots_of(self.kernels, psi, phi)?);
+                dots[pair] = Some(dot_products(self.kernels, psi, phi)?);
             }
         }
         Ok(dots)
@@ -157,9 +157,13 @@ impl Vectors {
 }
 
 /// Computes the dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
-pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
-    Ok(Dots {
-        dots: kernels.dot_products(psi, phi)?,
+pub fn dot_products(
+    kernels: Kernels,
+    psi: &Tensor,
+    phi: &Tensor,
+) -> candle_core::Result<DotProducts> {
+    Ok(DotProducts {
+        values: kernels.dot_products(psi, phi)?,
         width: psi.dims()[psi.rank() - 1],
     })
 }

@@ -14,7 +14,7 @@ use crate::{
     batch::Batch,
     deduplicate::{PassInput, StateBytes},
     error::UpdateError,
-    losses::scores::Dots,
+    losses::scores::DotProducts,
     tensors::states_tensor,
 };
 
@@ -106,7 +106,7 @@ pub struct WeightedLoss {
     /// The loss as a scalar, before its weight.
     pub loss: Tensor,
     /// The dot products of an InfoNCE loss, else empty. The parity check tests whether their scores saturate.
-    pub dots: Vec<Dots>,
+    pub dot_products: Vec<DotProducts>,
 }
 
 /// The online network's features of all states that an update needs with a graph, from one pass through the network.
@@ -169,7 +169,7 @@ pub struct LossInputs<'a> {
     /// The online network's features of the batch's states.
     pub features: &'a OnlineFeatures,
     /// The key encoder of a loss with a [`AuxiliaryLoss::key_tau`].
-    pub key: Option<&'a Encoder>,
+    pub key_encoder: Option<&'a Encoder>,
     /// The device of the networks, to which states are copied.
     pub device: &'a Device,
 }
@@ -180,12 +180,13 @@ impl LossInputs<'_> {
     ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
-    pub fn keys(&self) -> Result<Tensor, UpdateError> {
-        let key = self.key.expect("a loss with key_tau is given its encoder");
+    pub fn key_vectors(&self) -> Result<Tensor, UpdateError> {
+        let encoder = self.key_encoder;
+        let encoder = encoder.expect("a loss with key_tau is given its encoder");
         let (batch, len) = (self.batch, self.model.frame_len());
         let positives = batch.positive_states(len);
         let PassInput { bytes, .. } = PassInput::new(&positives, batch.states_k, len, false);
-        Ok(key.encode(&states_tensor(self.model, bytes, self.device)?)?)
+        Ok(encoder.encode(&states_tensor(self.model, bytes, self.device)?)?)
     }
 
     /// a_t [B], on the CPU, where the network reads it.

@@ -32,10 +32,10 @@ static CUSTOM: OnceLock<Vec<&'static MenuItem>> = OnceLock::new();
 /// # Panics
 /// If the function was called before, or two losses of the menu would have the same name.
 pub fn register(items: Vec<&'static MenuItem>) {
-    for (at, MenuItem { name, .. }) in items.iter().enumerate() {
+    for (index, MenuItem { name, .. }) in items.iter().enumerate() {
         let is_known = |known: &&MenuItem| known.name == *name;
         assert!(
-            !MENU.iter().chain(&items[..at]).any(is_known),
+            !MENU.iter().chain(&items[..index]).any(is_known),
             "two auxiliary losses are named {name}: choose another name"
         );
     }
@@ -60,7 +60,7 @@ impl AuxiliaryKind {
     pub const NONE: Self = Self(&none::NONE);
 
     /// The auxiliary loss of this item of the menu.
-    pub const fn of(item: &'static MenuItem) -> Self {
+    pub const fn from_item(item: &'static MenuItem) -> Self {
         Self(item)
     }
 
@@ -80,7 +80,7 @@ impl AuxiliaryKind {
     }
 
     /// Creates the loss from settings.
-    pub fn loss(
+    pub fn make_loss(
         self,
         settings: &AuxiliarySettings<'_>,
     ) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {

@@ -16,7 +16,7 @@ pub const NONE: MenuItem = MenuItem {
 };
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-    settings.check_no_own()?;
+    settings.check_no_own_table()?;
     if settings.condition_on_action {
         return Err(UpdateError::AuxiliaryLoss(
             "auxiliary_loss = none has no Psi that could be given the action: set condition_on_action to false, or take another agent".into(),
@@ -27,14 +27,14 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
         Some((pair, _)) => Err(UpdateError::AuxiliaryLoss(format!(
             "auxiliary_loss = none computes no auxiliary loss, but lambda.{pair} is above 0: set it to 0, or take another agent"
         ))),
-        None => Ok(Box::new(ReturnAlone)),
+        None => Ok(Box::new(NoAuxiliaryLoss)),
     }
 }
 
 #[derive(Debug)]
-struct ReturnAlone;
+struct NoAuxiliaryLoss;
 
-impl AuxiliaryLoss for ReturnAlone {
+impl AuxiliaryLoss for NoAuxiliaryLoss {
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
         Passes::default()
     }

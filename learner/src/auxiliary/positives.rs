@@ -18,7 +18,7 @@ pub enum Positives {
 
 impl Positives {
     /// The numbers of later states per row that the replay server may serve.
-    pub const fn served(self) -> RangeInclusive<usize> {
+    pub const fn served_counts(self) -> RangeInclusive<usize> {
         match self {
             Self::None | Self::OtherView => 0..=0,
             Self::One => 1..=1,
@@ -26,7 +26,7 @@ impl Positives {
         }
     }
 
-    /// [`Positives::served`] in words.
+    /// [`Positives::served_counts`] in words.
     pub const fn describe_served(self) -> &'static str {
         match self {
             Self::None | Self::OtherView => "no later state",
@@ -36,7 +36,7 @@ impl Positives {
     }
 
     /// A value of `run.horizon` that serves such a number, as TOML.
-    pub const fn horizon(self) -> &'static str {
+    pub const fn example_horizon(self) -> &'static str {
         match self {
             Self::None | Self::OtherView => r#"{rule="none"}"#,
             Self::One => r#"{rule="fixed",k=1}"#,
@@ -44,18 +44,18 @@ impl Positives {
         }
     }
 
-    /// Whether a batch with `count` positives per row fits; `views` says whether the batch contains augmented s_t.
-    pub const fn fit(self, count: usize, views: bool) -> bool {
+    /// Whether a batch with `count` positives per row fits; `has_views` says whether the batch contains augmented s_t.
+    pub const fn accepts(self, count: usize, has_views: bool) -> bool {
         match self {
             Self::None => true,
             Self::One => count == 1,
             Self::Several => count >= 1,
-            Self::OtherView => count == 1 && views,
+            Self::OtherView => count == 1 && has_views,
         }
     }
 
-    /// The requirement of [`Positives::fit`] in words.
-    pub const fn describe_wanted(self) -> &'static str {
+    /// The requirement of [`Positives::accepts`] in words.
+    pub const fn describe_accepted(self) -> &'static str {
         match self {
             Self::None => "any number",
             Self::One => "one",

@@ -101,7 +101,7 @@ pub struct AuxiliarySettings<'a> {
 
 impl AuxiliarySettings<'_> {
     /// Reads the loss's own table; `None` if it is absent.
-    pub fn own<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
+    pub fn own_table<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
         let Some(table) = self.own.get(self.auxiliary_loss) else {
             return Ok(None);
         };
@@ -113,7 +113,7 @@ impl AuxiliarySettings<'_> {
     }
 
     /// Rejects a table for a loss that has no own settings.
-    pub fn check_no_own(&self) -> Result<(), UpdateError> {
+    pub fn check_no_own_table(&self) -> Result<(), UpdateError> {
         let name = self.auxiliary_loss;
         if !self.own.contains_key(name) {
             return Ok(());
@@ -124,7 +124,7 @@ impl AuxiliarySettings<'_> {
     }
 
     /// Checks that at least one lambda is above 0, for a loss that lambda weights.
-    pub fn check_weighted(&self) -> Result<(), UpdateError> {
+    pub fn check_any_pair_active(&self) -> Result<(), UpdateError> {
         if self.lambda.active_pairs().contains(&true) {
             return Ok(());
         }

@@ -57,7 +57,7 @@ pub fn load(
             expected,
         });
     }
-    let has_key = settings.auxiliary()?.key_tau().is_some();
+    let has_key = settings.make_auxiliary_loss()?.key_tau().is_some();
     let tensors = |name: &str| read_file(path, &state, name);
     let online = tensors(ONLINE)?;
     check_model(path, &online, model)?;
@@ -72,7 +72,7 @@ pub fn load(
     let networks = NetworkParameters {
         online: parameters(model, |_| true, ONLINE, &online)?,
         target: parameters(&model.without_dim(), |_| true, TARGET, &tensors(TARGET)?)?,
-        key: key.transpose()?,
+        key_encoder: key.transpose()?,
     };
     let average = average.transpose()?;
     let moments = candle_core::safetensors::load_buffer(&tensors(OPTIMIZER)?, &Device::Cpu)
@@ -84,7 +84,7 @@ pub fn load(
         agent.restore_average(average);
     }
     agent
-        .restore_progress(state.updates, state.adam_step, moments)
+        .restore_optimiser(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     Ok(LearnerState {
         agent,

@@ -117,7 +117,7 @@ fn tensor_files(
         (TARGET, described(agent.target(), label.without_heads)?),
         (OPTIMIZER, moments),
     ];
-    if let Some(key) = agent.key() {
+    if let Some(key) = agent.key_encoder() {
         files.push((KEY, described(key, label.description)?));
     }
     if let Some(average) = agent.average() {

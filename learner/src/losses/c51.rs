@@ -58,7 +58,7 @@ pub fn kl(
         .enumerate()
     {
         let weight = weights.map_or(1.0, |it| f64::from(it[row]));
-        let log_p = LogSoftmax::of(logits);
+        let log_p = LogSoftmax::new(logits);
         let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
         for ((&logit, &t), gradient) in logits.iter().zip(target).zip(gradient) {
             let (log_p, t) = (log_p.at(logit), f64::from(t));
@@ -93,7 +93,7 @@ struct LogSoftmax {
 }
 
 impl LogSoftmax {
-    fn of(row: &[f32]) -> Self {
+    fn new(row: &[f32]) -> Self {
         let max = f64::from(row.iter().copied().fold(f32::NEG_INFINITY, f32::max));
         let sum: f64 = row.iter().map(|&x| (f64::from(x) - max).exp()).sum();
         Self {
@@ -111,7 +111,7 @@ impl LogSoftmax {
 /// Writes the softmax of `row` to `out`, which has the same length. For any finite logits, the probabilities are accurate to
 /// [`ENTRY_ERROR`].
 pub fn softmax(row: &[f32], out: &mut [f32]) {
-    let log_p = LogSoftmax::of(row);
+    let log_p = LogSoftmax::new(row);
     for (out, &x) in out.iter_mut().zip(row) {
         *out = log_p.at(x).exp() as f32;
     }

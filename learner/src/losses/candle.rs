@@ -4,7 +4,7 @@
 use candle_core::{D, DType, Result, Tensor};
 use candle_nn::ops::log_softmax;
 
-use super::scores::Scores;
+use super::scores::ScoreClip;
 
 pub(super) fn kl_loss(
     logits: &Tensor,
@@ -16,8 +16,8 @@ pub(super) fn kl_loss(
     let ln = |&p: &f32| if p > 0.0 { p.ln() } else { 0.0 };
     let ln_target = Tensor::from_vec(target.iter().map(ln).collect(), (rows, atoms), device)?;
     let target = Tensor::from_vec(target, (rows, atoms), device)?;
-    let surprise = (ln_target - log_softmax(logits, D::Minus1)?)?;
-    let mut entries = (target * surprise)?;
+    let log_ratio = (ln_target - log_softmax(logits, D::Minus1)?)?;
+    let mut entries = (target * log_ratio)?;
     if let Some(weights) = weights {
         entries = entries.broadcast_mul(&Tensor::from_vec(weights, (rows, 1), device)?)?;
     }
@@ -25,7 +25,7 @@ pub(super) fn kl_loss(
 }
 
 /// As [`super::info_nce::info_nce_loss`], but scores beyond about 8 times the clip have derivative 0, which is `1 - tanh^2` in f32.
-pub(super) fn info_nce_loss(dots: &Tensor, valid: &[u8], scores: Scores) -> Result<Tensor> {
+pub(super) fn info_nce_loss(dots: &Tensor, valid: &[u8], clip: ScoreClip) -> Result<Tensor> {
     let device = dots.device();
     let rows = (0..).zip(valid);
     let rows = rows.filter_map(|(row, &valid)| (valid != 0).then_some(row));
@@ -42,9 +42,9 @@ pub(super) fn info_nce_loss(dots: &Tensor, valid: &[u8], scores: Scores) -> Resu
         let anchors = dots.contiguous()?.index_select(&rows, 1)?;
         anchors.index_select(&rows, 2)?
     };
-    let clip = scores.tanh_clip;
-    let scores = dots.affine(scores.scale / clip, 0.0)?.tanh()?;
-    let log_p = log_softmax(&scores.affine(clip, 0.0)?, D::Minus1)?;
+    let bound = clip.tanh_clip;
+    let scores = dots.affine(clip.scale / bound, 0.0)?.tanh()?;
+    let log_p = log_softmax(&scores.affine(bound, 0.0)?, D::Minus1)?;
     let positive = Tensor::eye(count, DType::F32, device)?;
     log_p
         .broadcast_mul(&positive)?

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::{
     candle,
     scalar_op::scalar_op,
-    scores::{Dots, Scores},
+    scores::{DotProducts, ScoreClip},
 };
 
 /// Largest error of the loss in nats, relative to 10 plus the largest score.
@@ -16,8 +16,8 @@ pub const LOSS_ERROR: f64 = 2e-14;
 
 /// Largest error of a derivative: 1e-7 of it, about a unit in the last place of an f32, plus the error of a probability from the
 /// rounding of scores up to `largest`. `weight` is 1 / (L valid rows).
-pub fn slope_error(slope: f64, weight: f64, scores: Scores, largest: f64) -> f64 {
-    1e-7 * slope.abs() + weight * scores.scale * (1e-14 * largest).min(1.0) + 1e-15
+pub fn slope_error(slope: f64, weight: f64, clip: ScoreClip, largest: f64) -> f64 {
+    1e-7 * slope.abs() + weight * clip.scale * (1e-14 * largest).min(1.0) + 1e-15
 }
 
 /// Computes the InfoNCE of every valid row against all valid rows of the batch, at each location, and its gradient.
@@ -32,7 +32,7 @@ pub fn slope_error(slope: f64, weight: f64, scores: Scores, largest: f64) -> f64
 ///
 /// # Panics
 /// If the lengths disagree: the caller has checked its batch by then.
-pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]) -> f64 {
+pub fn info_nce(dots: &[f32], valid: &[u8], clip: ScoreClip, gradient: &mut [f32]) -> f64 {
     let rows = valid.len();
     assert!(
         rows > 0 && dots.len().is_multiple_of(rows * rows),
@@ -62,7 +62,7 @@ pub fn info_nce(dots: &[f32], valid: &[u8], scores: Scores, gradient: &mut [f32]
                 if valid[anchor] == 0 {
                     return 0.0;
                 }
-                anchor_loss(dots, anchor, &candidates, scores, weight, scratch, gradient)
+                anchor_loss(dots, anchor, &candidates, clip, weight, scratch, gradient)
             },
         )
         .collect();
@@ -93,7 +93,7 @@ fn anchor_loss(
     dots: &[f32],
     anchor: usize,
     candidates: &[usize],
-    scores: Scores,
+    clip: ScoreClip,
     weight: f64,
     scratch: &mut Scratch,
     gradient: &mut [f32],
@@ -101,7 +101,7 @@ fn anchor_loss(
     for (dot, &j) in scratch.dots.iter_mut().zip(candidates) {
         *dot = dots[j];
     }
-    let Scores { scale, tanh_clip } = scores;
+    let ScoreClip { scale, tanh_clip } = clip;
     let (values, slopes) = (&mut scratch.scores[..], &mut scratch.slopes[..]);
     soft_clip(&scratch.dots, scale, tanh_clip, values, slopes);
     let positive = candidates
@@ -123,12 +123,13 @@ fn anchor_loss(
 /// # Errors
 /// Dots that are not [L, B, B] f32 with the B of `valid`.
 pub fn info_nce_loss(
-    Dots { dots, width }: &Dots,
+    dot_products: &DotProducts,
     valid: &[u8],
     tanh_clip: f64,
     kernels: Kernels,
 ) -> Result<Tensor> {
-    let scores = Scores::new(*width, tanh_clip);
+    let clip = ScoreClip::new(dot_products.width, tanh_clip);
+    let dots = &dot_products.values;
     let (_, anchors, candidates) = dots.dims3()?;
     if anchors != valid.len() || candidates != valid.len() {
         bail!(
@@ -137,11 +138,11 @@ pub fn info_nce_loss(
         );
     }
     if kernels == Kernels::Candle {
-        return candle::info_nce_loss(dots, valid, scores);
+        return candle::info_nce_loss(dots, valid, clip);
     }
     let valid = valid.to_vec();
     scalar_op("info-nce", dots, move |dots, gradient| {
-        info_nce(dots, &valid, scores, gradient)
+        info_nce(dots, &valid, clip, gradient)
     })
 }
 
@@ -163,17 +164,17 @@ mod tests {
         let cases = [[1, 1, 1], [1, 0, 1], [0, 1, 0], [0, 0, 0]].map(|valid| (valid, 20.0));
         let clips = [1e-30, 1e-6, 1e6, 1e15, 1e30].map(|tanh_clip| ([1; ROWS], tanh_clip));
         for (valid, tanh_clip) in cases.into_iter().chain(clips) {
-            let scores = Scores::new(WIDTH, tanh_clip);
+            let clip = ScoreClip::new(WIDTH, tanh_clip);
             let mut slopes = vec![f32::NAN; dots.len()];
-            let expected = info_nce(&dots, &valid, scores, &mut slopes);
+            let expected = info_nce(&dots, &valid, clip, &mut slopes);
             for kernels in [Kernels::FUSED, Kernels::Candle] {
                 let case = format!("{kernels:?} {valid:?} {tanh_clip}");
                 let var = Var::from_slice(&dots, (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
-                let of_var = Dots {
-                    dots: var.as_tensor().clone(),
+                let dot_products = DotProducts {
+                    values: var.as_tensor().clone(),
                     width: WIDTH,
                 };
-                let loss = info_nce_loss(&of_var, &valid, tanh_clip, kernels)?;
+                let loss = info_nce_loss(&dot_products, &valid, tanh_clip, kernels)?;
                 let grads = loss.affine(2.0, 0.0)?.backward()?;
                 let loss = loss.to_scalar::<f32>()?;
                 let error = f64::from(loss) - expected;

@@ -222,7 +222,7 @@ impl Case {
 impl Config {
     fn settings(&self) -> UpdateSettings {
         let by_lambda = if self.lambda.active_pairs().contains(&true) {
-            AuxiliaryKind::of(&DIM)
+            AuxiliaryKind::from_item(&DIM)
         } else {
             AuxiliaryKind::NONE
         };

@@ -27,7 +27,7 @@ use crate::{
         settings::{AuxiliarySettings, Lambda},
     },
     evaluation::Evaluation,
-    losses::scores::{Dots, Scores},
+    losses::scores::{DotProducts, ScoreClip},
     tensors::to_vec_f64,
 };
 
@@ -234,7 +234,7 @@ impl Check<'_> {
             let got = to_vec_f64(var.map_or(tensor, |var| var.as_tensor()))?;
             online.add("updated", name, largest(&got, &expected), tolerance);
         }
-        for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
+        for (name, var) in agent.key_encoder().iter().flat_map(|key| key.iter()) {
             let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
             let error = largest(&to_vec_f64(var)?, &expected);
             keys.add("updated_key", name, error, tolerance);
@@ -254,7 +254,7 @@ fn agent_of(case: &Case, compute: &Compute) -> Result<Agent, ParityError> {
     let parameters = NetworkParameters {
         online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
         target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
-        key: key_parameters(case, &model, compute)?,
+        key_encoder: key_parameters(case, &model, compute)?,
     };
     let settings = case.settings.clone();
     Ok(Agent::from_parameters(
@@ -268,7 +268,7 @@ fn key_parameters(
     model: &ModelConfig,
     compute: &Compute,
 ) -> Result<Option<Parameters>, ParityError> {
-    if case.settings.auxiliary()?.key_tau().is_none() {
+    if case.settings.make_auxiliary_loss()?.key_tau().is_none() {
         return Ok(None);
     }
     let named = case.parameters("key.", model);
@@ -288,17 +288,18 @@ struct Forward {
 fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, ParityError> {
     let settings = &case.settings;
     let kind = if settings.auxiliary_loss == AuxiliaryKind::NONE {
-        AuxiliaryKind::of(&DIM)
+        AuxiliaryKind::from_item(&DIM)
     } else {
         settings.auxiliary_loss
     };
-    let every = AuxiliarySettings {
+    let all_pairs = AuxiliarySettings {
         auxiliary_loss: kind.name(),
         lambda: Lambda::ONES,
         ..settings.auxiliary_settings()
     };
     // A loss that rejects some of the pairs keeps the case's settings.
-    let loss = kind.loss(&every).or_else(|_| settings.auxiliary())?;
+    let loss = kind.make_loss(&all_pairs);
+    let loss = loss.or_else(|_| settings.make_auxiliary_loss())?;
     // Read from the case's parameters: if the update is C51's alone, the settings do not say it.
     let gives_action = |(name, _): (&str, _)| name.starts_with("dim.action.");
     let model = case.model(loss.heads(case.online().any(gives_action)));
@@ -316,17 +317,17 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         model: &model,
         batch: &batch,
         features: &features,
-        key: key.as_ref(),
+        key_encoder: key.as_ref(),
         device,
     })?;
-    let saturates = |it: &Dots| -> Result<bool, ParityError> {
-        let scores = Scores::new(it.width, settings.tanh_clip);
-        let mut dots = to_vec_f64(&it.dots)?.into_iter();
-        Ok(dots.any(|dot| dot.abs() * scores.scale > scores.tanh_clip))
+    let saturates = |it: &DotProducts| -> Result<bool, ParityError> {
+        let clip = ScoreClip::new(it.width, settings.tanh_clip);
+        let mut dots = to_vec_f64(&it.values)?.into_iter();
+        Ok(dots.any(|dot| dot.abs() * clip.scale > clip.tanh_clip))
     };
     let mut forward = Vec::new();
     for it in &losses {
-        let saturating: Result<Vec<bool>, _> = it.dots.iter().map(saturates).collect();
+        let saturating: Result<Vec<bool>, _> = it.dot_products.iter().map(saturates).collect();
         forward.push(Forward {
             name: it.name,
             value: it.loss.to_scalar()?,

@@ -18,7 +18,7 @@ pub(crate) const GLOBAL: Lambda = Lambda {
 };
 const POSITIVES: usize = 3;
 /// A loss that a program adds, whose keys are later states.
-const KEYS_OF_LATER: AuxiliaryKind = AuxiliaryKind::of(&MenuItem {
+const KEYS_OF_LATER: AuxiliaryKind = AuxiliaryKind::from_item(&MenuItem {
     positives: Positives::One,
     ..CURL_ITEM
 });
@@ -210,7 +210,7 @@ fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
 fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     let rows = random_batch(6, 8);
     let mut agent = agent(CURL, GLOBAL);
-    let key = |agent: &Agent| values(agent.key().unwrap());
+    let key = |agent: &Agent| values(agent.key_encoder().unwrap());
     let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
     let start = part_of(&values(agent.online()), encoder);
     assert_eq!(key(&agent), start, "torso and psi_4, and nothing else");
@@ -245,7 +245,7 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
         (CURL, GLOBAL),
     ] {
         let mut agent = agent(kind, lambda);
-        assert_eq!(agent.key().is_some(), kind == CURL);
+        assert_eq!(agent.key_encoder().is_some(), kind == CURL);
         let online =
             |agent: &Agent| part_of(&values(agent.online()), |name| !name.starts_with("dim."));
         let start = online(&agent);

@@ -1,7 +1,7 @@
 //! Augmentation: its distribution, its bounds, and that it changes no byte at strength 0.
 //! `driml experiment stability` checks what a crop, factors and a turn make of each byte.
 
-use driml_learner::{Augment, AugmentSettings, augment::View};
+use driml_learner::{AugmentSettings, Augmenter, augment::View};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -49,7 +49,7 @@ fn at_no_strength_every_byte_stays() {
     ] {
         let states = noise(9 * size.0 * size.1 * size.2, 2);
         let mut seen = Vec::new();
-        let augment = Augment::new(NOTHING, size, frame_channels);
+        let augment = Augmenter::new(NOTHING, size, frame_channels);
         augment.apply(&states, &mut seen, &mut rng(3));
         assert!(seen == states, "{size:?}");
     }
@@ -69,14 +69,14 @@ fn crops_are_of_a_share_of_each_side() {
             crop_side,
             ..NOTHING
         };
-        assert_eq!(Augment::new(settings, size, 1).crop(), wanted);
+        assert_eq!(Augmenter::new(settings, size, 1).crop(), wanted);
     }
 }
 
 /// Every position of the crop is equally frequent.
 #[test]
 fn crops_are_anywhere_with_equal_chances() {
-    let augment = Augment::new(PAPER, (64, 64, 3), 3);
+    let augment = Augmenter::new(PAPER, (64, 64, 3), 3);
     assert_eq!(augment.crop(), (51, 51));
     let mut rng = rng(7);
     let places = 14;
@@ -103,7 +103,7 @@ fn jitter_is_uniform_within_its_strength() {
         hue: 0.4,
         ..PAPER
     };
-    let augment = Augment::new(settings, (64, 64, 3), 3);
+    let augment = Augmenter::new(settings, (64, 64, 3), 3);
     let mut rng = rng(8);
     let draws = 20_000;
     let mut bins = [[0u32; 10]; 4];
@@ -137,7 +137,7 @@ fn jitter_is_uniform_within_its_strength() {
 
 #[test]
 fn the_generator_alone_decides_and_rows_differ() {
-    let augment = Augment::new(PAPER, (16, 16, 3), 3);
+    let augment = Augmenter::new(PAPER, (16, 16, 3), 3);
     let state = noise(16 * 16 * 3, 9);
     let states = state.repeat(33);
     let applied = || {

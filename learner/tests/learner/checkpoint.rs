@@ -335,7 +335,7 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     };
     save(&run, folder.path(), 1);
     // Before the first update nothing is averaged.
-    assert!(!load(&settings).take_average().unwrap());
+    assert!(!load(&settings).copy_average_to_online().unwrap());
     let mut expected = values(run.agent.online());
     for t in 1..=6 {
         learn(&mut run, 1);
@@ -359,8 +359,8 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     assert_eq!(values(restored.average().unwrap()), average);
     assert_eq!(values(restored.online()), values(run.agent.online()));
     let mut played = restored;
-    assert!(played.take_average().unwrap());
+    assert!(played.copy_average_to_online().unwrap());
     assert_eq!(values(played.online()), average);
     settings.average_tau = None;
-    assert!(!load(&settings).take_average().unwrap());
+    assert!(!load(&settings).copy_average_to_online().unwrap());
 }

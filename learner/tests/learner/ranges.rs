@@ -66,7 +66,7 @@ fn numbers_of_an_affinity_are_refused_by_name() {
         let (numbers, said) = line.split_once(" : ").unwrap();
         let table = format!("estimator = 'none'\n{numbers}");
         let table: AffinityConfig = toml::from_str(&table).unwrap();
-        let estimator = table.estimator(2, &mut ChaCha8Rng::seed_from_u64(1));
+        let estimator = table.make_estimator(2, &mut ChaCha8Rng::seed_from_u64(1));
         check_says(estimator.unwrap_err(), &["learner.affinity", said]);
     }
 }

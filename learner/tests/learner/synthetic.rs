@@ -15,9 +15,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 pub(crate) const ACTIONS: usize = 4;
-pub(crate) const DIM: AuxiliaryKind = AuxiliaryKind::of(&dim::DIM);
-pub(crate) const CPC: AuxiliaryKind = AuxiliaryKind::of(&cpc::CPC);
-pub(crate) const CURL: AuxiliaryKind = AuxiliaryKind::of(&curl::CURL);
+pub(crate) const DIM: AuxiliaryKind = AuxiliaryKind::from_item(&dim::DIM);
+pub(crate) const CPC: AuxiliaryKind = AuxiliaryKind::from_item(&cpc::CPC);
+pub(crate) const CURL: AuxiliaryKind = AuxiliaryKind::from_item(&curl::CURL);
 pub(crate) const NO_DIM: Lambda = Lambda::NONE;
 pub(crate) const ALL_DIM: Lambda = Lambda {
     l3t3: 1.0,

@@ -5,8 +5,8 @@ use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
 use driml_learner::{
     AdamSettings,
-    auxiliary::dim::{Dim, Vectors},
-    losses::scores::Scores,
+    auxiliary::dim::{Dim, HeadVectors},
+    losses::scores::ScoreClip,
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -60,11 +60,11 @@ impl DimLearner {
     pub(super) fn scores(&self, now: &Features, next: &Features) -> anyhow::Result<Vec<f64>> {
         let action = Tensor::zeros(now.f4.dim(0)?, DType::U8, &Device::Cpu)?;
         let active = self.dim.lambda.active_pairs();
-        let vectors = Vectors::new(&self.network, now, next, &action, active)?;
-        let found = vectors.dots(active)?.into_iter().flatten().next();
+        let vectors = HeadVectors::new(&self.network, now, next, &action, active)?;
+        let found = vectors.dot_products(active)?.into_iter().flatten().next();
         let found = found.expect("a pair has a weight");
-        let scores = Scores::new(found.width, self.dim.tanh_clip);
-        let values = found.dots.flatten_all()?.to_vec1::<f32>()?;
-        Ok(values.iter().map(|&dot| scores.score(dot)).collect())
+        let clip = ScoreClip::new(found.width, self.dim.tanh_clip);
+        let values = found.values.flatten_all()?.to_vec1::<f32>()?;
+        Ok(values.iter().map(|&dot| clip.score(dot)).collect())
     }
 }

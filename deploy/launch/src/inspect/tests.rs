@@ -96,7 +96,7 @@ fn what_is_counted_is_what_is_built() {
             let scalars = |it: &driml_model::Parameters| -> usize {
                 it.iter().map(|(_, var)| var.elem_count()).sum()
             };
-            let key = networks.key().map_or(0, scalars);
+            let key = networks.key_encoder().map_or(0, scalars);
             let built = scalars(networks.online()) + scalars(networks.target()) + key;
             let said: u64 = inspection.parameters.iter().map(|line| line.is).sum();
             assert_eq!(said, built as u64, "{agent} on {world}");

@@ -50,7 +50,7 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
     ]
 }
 
-/// A parameter that starts at 0, and its moments: in f32 as the rule steps them, and in f64.
+/// A parameter that starts at 0, and its moments: in f32 as [`StepCoefficients`] steps them, and in f64.
 #[derive(Clone, Copy, Default)]
 struct Stepped {
     /// The parameter and its moments in f32.
@@ -83,7 +83,7 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
     let (beta1, beta2) = (settings.beta1, settings.beta2);
     // 1 - beta^t, computed without cancellation near beta = 1 and near t = 0.
     let [first, second] = [beta1, beta2].map(|beta| -(t as f64 * beta.ln()).exp_m1());
-    // The rule steps all of them together, like the parameters of a tensor.
+    // All of them step together, like the parameters of a tensor.
     let [mut p, mut m, mut v] =
         [0, 1, 2].map(|i| all.iter().map(|it| it.found[i]).collect::<Vec<_>>());
     let is_finite = coefficients.apply(&mut p, gradients, &mut m, &mut v);

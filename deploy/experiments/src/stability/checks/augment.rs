@@ -1,6 +1,6 @@
 //! Cropping and recolouring of states for an auxiliary loss, compared with values in f64.
 
-use driml_learner::augment::{Augment, AugmentSettings, COLOUR_ERROR, CROP_ERROR, View};
+use driml_learner::augment::{AugmentSettings, Augmenter, COLOUR_ERROR, CROP_ERROR, View};
 
 use crate::stability::property::*;
 
@@ -27,7 +27,7 @@ struct Picture {
 
 impl Picture {
     /// Creates the strongest augmentation, with crops of this side.
-    fn augment(&self, crop_side: f64) -> Augment {
+    fn augment(&self, crop_side: f64) -> Augmenter {
         let strongest = AugmentSettings {
             crop_side,
             brightness: 1.0,
@@ -35,18 +35,18 @@ impl Picture {
             saturation: 1.0,
             hue: 0.5,
         };
-        Augment::new(strongest, self.size, self.frame_channels)
+        Augmenter::new(strongest, self.size, self.frame_channels)
     }
 
     /// Returns the largest difference between the bytes of a view and their expected values.
-    fn error(&self, augment: &Augment, view: &View, expected: impl Fn(usize) -> f64) -> f64 {
+    fn error(&self, augment: &Augmenter, view: &View, expected: impl Fn(usize) -> f64) -> f64 {
         let mut seen = vec![0u8; self.state.len()];
         augment.apply_view(&self.state, view, &mut seen);
         let seen = seen.into_iter().enumerate();
         worst(seen.map(|(at, found)| (f64::from(found) - expected(at)).abs()))
     }
 
-    fn crop_error(&self, augment: &Augment, view: &View) -> f64 {
+    fn crop_error(&self, augment: &Augmenter, view: &View) -> f64 {
         let (height, width, channels) = self.size;
         let (rows, columns) = augment.crop();
         // The position of an output pixel in the crop: its two neighbours, and the weight of the second.

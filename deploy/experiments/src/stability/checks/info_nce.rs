@@ -2,7 +2,7 @@
 
 use driml_learner::losses::{
     info_nce::{LOSS_ERROR, info_nce, slope_error},
-    scores::{self, CLIP_ERROR, Scores},
+    scores::{self, CLIP_ERROR, ScoreClip},
 };
 
 use crate::stability::property::*;
@@ -37,7 +37,7 @@ fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let dots = [0.0, 1e-45, 1e-20, 3.7, 400.0, 7e3, 1e10, 1e30, f32::MAX];
     let dot = cases.of(&dots, finite) * cases.of(&[1.0, -1.0], |_| 1.0);
     let embedding_dim = cases.of(&[256usize], |rng| rng.random_range(1..4096));
-    let (score, slope) = Scores::new(embedding_dim, bound).clip(dot);
+    let (score, slope) = ScoreClip::new(embedding_dim, bound).score_and_slope(dot);
     let x = f64::from(dot) / (embedding_dim as f64).sqrt();
     let ratio = x / bound;
     let expected = bound * ratio.tanh();
@@ -63,8 +63,8 @@ struct Batch {
 impl Batch {
     fn loss(&self) -> (f64, Vec<f32>) {
         let mut slopes = vec![f32::NAN; self.dots.len()];
-        let scores = Scores::new(64, self.bound);
-        let loss = info_nce(&self.dots, &self.valid, scores, &mut slopes);
+        let clip = ScoreClip::new(64, self.bound);
+        let loss = info_nce(&self.dots, &self.valid, clip, &mut slopes);
         (loss, slopes)
     }
 
@@ -105,7 +105,7 @@ impl Batch {
             }
         }
         let of_slopes = slopes.iter().zip(expected).map(|(slope, expected)| {
-            let allowed = slope_error(expected, weight, Scores::new(64, bound), largest);
+            let allowed = slope_error(expected, weight, ScoreClip::new(64, bound), largest);
             (f64::from(*slope) - expected).abs() / allowed
         });
         let of_loss = (loss - exact_sum(losses) * weight) / (10.0 + largest);

@@ -97,7 +97,7 @@ impl Setting {
             let parameters = NetworkParameters {
                 online: small::parameters(&model, &online)?,
                 target: small::parameters(&model, &target)?.without_dim()?,
-                key: None,
+                key_encoder: None,
             };
             let (model, settings) = (model.clone(), settings.clone());
             let agent = Agent::from_parameters(model, settings, compute, parameters);

@@ -100,7 +100,7 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<M
     let parameters = NetworkParameters {
         online: reference.online().clone(),
         target: reference.target().clone(),
-        key: None,
+        key_encoder: None,
     };
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
         .with_deduplication(config.learner.deduplicate_states);
