@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     affinity::{AffinityError, AffinityEstimator},
     agent::Agent,
-    checkpoint::{self, CheckpointError, Label, LearnerState},
+    checkpoint::{self, CheckpointError, Extras, LearnerState},
     config::LearnerConfig,
     error::UpdateError,
     evaluation::UpdateReport,
@@ -233,14 +233,14 @@ impl Learner {
         let LearnerConfig {
             spec, model, input, ..
         } = &self.config;
-        let label = Label {
+        let extras = Extras {
             run_spec_hash: self.spec_hash,
             description: &checkpoint::describe(spec, model, input),
             without_heads: &checkpoint::describe(spec, &model.without_dim(), input),
             companion,
         };
         let keep = self.config.learner.checkpoints_kept as usize;
-        let path = checkpoint::save(folder, &self.state, label, keep)?;
+        let path = checkpoint::save(folder, &self.state, extras, keep)?;
         tracing::info!("saved {}", path.display());
         Ok(())
     }

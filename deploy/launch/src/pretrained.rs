@@ -6,7 +6,7 @@ use std::{fs, path::Path};
 use anyhow::{Context, bail};
 use driml_learner::{
     Compute,
-    checkpoint::{DESCRIPTION, describe, described},
+    checkpoint::{METADATA_KEY, describe, read_description},
 };
 use driml_machine::error::{nearest, usage};
 use driml_model::{Parameters, Precision, StoredAs, is_bf16_fast};
@@ -76,7 +76,7 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
 }
 
 fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
-    let described = described(bytes);
+    let described = read_description(bytes);
     let described =
         described.map_err(|e| usage!("{name} is damaged, or not a safetensors file: {e}"))?;
     let exported = described.and_then(|it| it.get(EXPORTED).cloned());
@@ -119,7 +119,7 @@ pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
         serde_json::from_str(&describe(&config.run, &model, &config.input))?;
     description[EXPORTED] = serde_json::to_value(exported)?;
     let network = player.network.without_dim()?;
-    Ok(network.to_described_safetensors(StoredAs::F16, DESCRIPTION, &description.to_string())?)
+    Ok(network.to_described_safetensors(StoredAs::F16, METADATA_KEY, &description.to_string())?)
 }
 
 #[cfg(test)]
@@ -204,7 +204,7 @@ mod tests {
             });
             let network = &mixed.network;
             let bytes = network
-                .to_described_safetensors(StoredAs::F16, DESCRIPTION, &description.to_string())
+                .to_described_safetensors(StoredAs::F16, METADATA_KEY, &description.to_string())
                 .unwrap();
             let text = said(&[("chain", &bytes[..])], "chain");
             let is_told = text.contains(why) && text.contains("pretrained:chain");

@@ -102,7 +102,7 @@ impl AuxiliaryLoss for Curl {
         let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
         let kernels = inputs.online.kernels();
-        let dots = dim::dot_products(kernels, &query, &keys)?;
+        let dots = dim::dot(kernels, &query, &keys)?;
         let all = vec![1; inputs.batch.rows];
         let loss = info_nce_loss(&dots, &all, self.tanh_clip, kernels)?;
         Ok(vec![WeightedLoss {

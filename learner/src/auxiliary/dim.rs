@@ -149,7 +149,7 @@ impl HeadVectors {
         let mut dots = [const { None }; 4];
         for pair in (0..4).filter(|&pair| active[pair]) {
             if let (Some(psi), Some(phi)) = (&self.psi[pair / 2], &self.phi[pair % 2]) {
-                dots[pair] = Some(dot_products(self.kernels, psi, phi)?);
+                dots[pair] = Some(dot(self.kernels, psi, phi)?);
             }
         }
         Ok(dots)
@@ -157,11 +157,7 @@ impl HeadVectors {
 }
 
 /// Computes the dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
-pub fn dot_products(
-    kernels: Kernels,
-    psi: &Tensor,
-    phi: &Tensor,
-) -> candle_core::Result<DotProducts> {
+pub fn dot(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<DotProducts> {
     Ok(DotProducts {
         values: kernels.dot_products(psi, phi)?,
         width: psi.dims()[psi.rank() - 1],

@@ -17,7 +17,7 @@ pub(super) const FORMAT: u32 = 4;
 pub(super) const ONLINE: &str = "online.safetensors";
 pub(super) const TARGET: &str = "target.safetensors";
 /// The key encoder; present only for an auxiliary loss that has one, as CURL does.
-pub(super) const KEY: &str = "key.safetensors";
+pub(super) const KEY_ENCODER: &str = "key.safetensors";
 /// The averaged network; present only with `average_tau`.
 pub const AVERAGE: &str = "average.safetensors";
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
@@ -25,7 +25,7 @@ pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
 pub(super) const COMPANION: &str = "lockstep.bin";
 pub(super) const STATE: &str = "state.json";
 /// The SHA-256 of [`STATE`], which contains the SHA-256 of the other files.
-pub(super) const STATE_SUM: &str = "state.json.sha256";
+pub(super) const STATE_SHA256: &str = "state.json.sha256";
 
 /// Everything that a learner changes while it learns.
 #[derive(Debug)]
@@ -108,10 +108,10 @@ impl StateFile {
     }
 }
 
-pub(super) fn sha256_of(bytes: &[u8]) -> String {
+pub(super) fn sha256_hex(bytes: &[u8]) -> String {
     format!("{:x}", Sha256::digest(bytes))
 }
 
-pub(super) fn hex_of(hash: u64) -> String {
+pub(super) fn format_hash(hash: u64) -> String {
     format!("{hash:016x}")
 }

@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 /// The only key in the metadata.
-pub const KEY: &str = "driml";
+pub const METADATA_KEY: &str = "driml";
 /// 1: the tables of the settings that a reader needs, under their names in the settings.
 const FORMAT: u32 = 1;
 /// For a reader who has nothing but the file. More: `deploy/docs/src/reference/weights.md`.
@@ -17,7 +17,7 @@ const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [mod
     Atoms: v_min to v_max, evenly. Value of an action: sum of softmax(logits) * atoms.";
 
 /// The text about the torso in [`CONVENTIONS`].
-fn torso(model: &ModelConfig) -> String {
+fn torso_convention(model: &ModelConfig) -> String {
     let read = match model.torso {
         TorsoName::Nature => {
             return " without padding, each followed by ReLU; torso.fc takes their output as channel, row, column".into();
@@ -32,7 +32,7 @@ fn torso(model: &ModelConfig) -> String {
 }
 
 /// The text about the C51 head in [`CONVENTIONS`].
-const fn head(model: &ModelConfig) -> &'static str {
+const fn head_convention(model: &ModelConfig) -> &'static str {
     match (model.head.dueling, model.head.noisy_sigma.is_some()) {
         (false, false) => "head takes ReLU of that and gives [actions, atoms] logits",
         (false, true) => {
@@ -62,8 +62,8 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
     let description = Description {
         format: FORMAT,
         conventions: CONVENTIONS
-            .replace("TORSO", &torso(model))
-            .replace("HEAD", head(model)),
+            .replace("TORSO", &torso_convention(model))
+            .replace("HEAD", head_convention(model)),
         model,
         input,
         run,
@@ -75,14 +75,15 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
 ///
 /// # Errors
 /// The bytes are not a whole safetensors file.
-pub fn described(safetensors: &[u8]) -> Result<Option<Value>, SafeTensorError> {
+pub fn read_description(safetensors: &[u8]) -> Result<Option<Value>, SafeTensorError> {
     let (_, header) = SafeTensors::read_metadata(safetensors)?;
-    let text = header.metadata().as_ref().and_then(|it| it.get(KEY));
+    let metadata = header.metadata().as_ref();
+    let text = metadata.and_then(|it| it.get(METADATA_KEY));
     Ok(text.and_then(|it| serde_json::from_str(it).ok()))
 }
 
 /// Finds the first value that differs. Returns its path, which starts with `name`, and both values.
-pub(super) fn difference(
+pub(super) fn first_difference(
     name: &str,
     one: &Value,
     other: &Value,
@@ -92,7 +93,7 @@ pub(super) fn difference(
     }
     if let (Value::Object(ones), Value::Object(others)) = (one, other) {
         let keys = ones.keys().chain(others.keys());
-        let at = |key: &String| difference(&format!("{name}.{key}"), &one[key], &other[key]);
+        let at = |key: &String| first_difference(&format!("{name}.{key}"), &one[key], &other[key]);
         return keys.into_iter().find_map(at);
     }
     Some((name.into(), one.to_string(), other.to_string()))

@@ -15,9 +15,9 @@ use super::error::{CheckpointError, io_error};
 pub const FOLDER: &str = "checkpoints";
 /// Start of a checkpoint's name; the number of its update follows.
 pub(super) const PREFIX: &str = "checkpoint-";
-const LOCK: &str = ".lock";
+const LOCK_FILE: &str = ".lock";
 /// End of a checkpoint's name while another checkpoint of the same update replaces it.
-const REPLACED: &str = ".replaced.tmp";
+const OLD_SUFFIX: &str = ".replaced.tmp";
 
 /// Creates `folder`, and keeps other learners from saving in it as long as the returned file is open.
 ///
@@ -25,7 +25,7 @@ const REPLACED: &str = ".replaced.tmp";
 /// Another learner saves there, or the file system fails.
 pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
-    let path = folder.join(LOCK);
+    let path = folder.join(LOCK_FILE);
     let lock = lock_file::create(&path, "let no other learner save there");
     let lock = lock.map_err(io_error("create", &path))?;
     lock.ok_or_else(|| CheckpointError::InUse(folder.to_owned()))
@@ -46,7 +46,7 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
             continue;
         };
         // A checkpoint that is being replaced counts until the new one has its name.
-        let replaced = rest.strip_suffix(REPLACED).map(|rest| {
+        let replaced = rest.strip_suffix(OLD_SUFFIX).map(|rest| {
             let is_replaced = folder.join(format!("{PREFIX}{rest}")).exists();
             (rest, is_replaced)
         });
@@ -62,31 +62,31 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     Ok(all)
 }
 
-/// Renames the complete checkpoint `aside` to `path`. If `path` exists, as at a stop right after a periodic save, it is replaced: it
+/// Renames the checkpoint in `staging` to `path`. If `path` exists, as at a stop right after a periodic save, it is replaced: it
 /// first moves to another name, under which [`list`] finds it between the two renames.
-pub(super) fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointError> {
+pub(super) fn move_into_place(staging: &Path, path: &Path) -> Result<(), CheckpointError> {
     let folder = path.parent().unwrap_or(Path::new("."));
-    let older = with_end(path, REPLACED);
+    let replaced = with_suffix(path, OLD_SUFFIX);
     if path.exists() {
-        fs::rename(path, &older).map_err(io_error("move", path))?;
+        fs::rename(path, &replaced).map_err(io_error("move", path))?;
     }
-    fs::rename(aside, path).map_err(io_error("move", aside))?;
+    fs::rename(staging, path).map_err(io_error("move", staging))?;
     sync(folder)?;
-    remove_or_warn(&older);
+    remove_or_warn(&replaced);
     Ok(())
 }
 
 /// Removes what interrupted saves have left, and gives a checkpoint whose replacement was interrupted its name back.
-pub(super) fn tidy(folder: &Path) -> Result<(), CheckpointError> {
+pub(super) fn clean_up(folder: &Path) -> Result<(), CheckpointError> {
     for entry in fs::read_dir(folder).map_err(io_error("read", folder))? {
         let path = entry.map_err(io_error("read", folder))?.path();
         let name = path.file_name().and_then(|name| name.to_str());
         let Some(name) = name.filter(|it| it.starts_with(PREFIX) && it.ends_with(".tmp")) else {
             continue;
         };
-        match name.strip_suffix(REPLACED).map(|name| folder.join(name)) {
-            Some(place) if !place.exists() => {
-                fs::rename(&path, place).map_err(io_error("move", &path))?;
+        match name.strip_suffix(OLD_SUFFIX).map(|name| folder.join(name)) {
+            Some(final_path) if !final_path.exists() => {
+                fs::rename(&path, final_path).map_err(io_error("move", &path))?;
             }
             _ => {
                 tracing::warn!(path = %path.display(), "removing what an unfinished save left");
@@ -97,7 +97,7 @@ pub(super) fn tidy(folder: &Path) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-pub(super) fn read(path: &Path) -> Result<Vec<u8>, CheckpointError> {
+pub(super) fn read_file(path: &Path) -> Result<Vec<u8>, CheckpointError> {
     fs::read(path).map_err(|why| match why.kind() {
         io::ErrorKind::NotFound => CheckpointError::Damaged {
             file: path.to_owned(),
@@ -123,14 +123,14 @@ pub(super) fn sync(folder: &Path) -> Result<(), CheckpointError> {
 
 /// Renames a checkpoint and removes it: what an interrupted removal leaves must not look like a checkpoint.
 pub(super) fn prune(path: &Path) {
-    let aside = with_end(path, ".tmp");
-    match fs::rename(path, &aside) {
-        Ok(()) => remove_or_warn(&aside),
+    let temporary = with_suffix(path, ".tmp");
+    match fs::rename(path, &temporary) {
+        Ok(()) => remove_or_warn(&temporary),
         Err(e) => tracing::warn!("an old checkpoint stays: {}", io_error("move", path)(e)),
     }
 }
 
-fn with_end(path: &Path, end: &str) -> PathBuf {
+fn with_suffix(path: &Path, end: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(end);
     name.into()

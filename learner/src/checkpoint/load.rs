@@ -8,12 +8,12 @@ use serde_json::Value;
 
 use super::{
     contents::{
-        AVERAGE, COMPANION, KEY, LearnerState, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile,
-        TARGET, hex_of, sha256_of,
+        AVERAGE, COMPANION, KEY_ENCODER, LearnerState, ONLINE, OPTIMIZER, STATE, STATE_SHA256,
+        StateFile, TARGET, format_hash, sha256_hex,
     },
     description,
     error::{CheckpointError, damaged},
-    folder::{list, read},
+    folder::{list, read_file},
 };
 use crate::{
     affinity::AffinityEstimator,
@@ -48,7 +48,7 @@ pub fn load(
     run_spec_hash: u64,
 ) -> Result<LearnerState, CheckpointError> {
     let state = read_state(path)?;
-    let expected = hex_of(run_spec_hash);
+    let expected = format_hash(run_spec_hash);
     if state.run_spec_hash != expected {
         let (folder, found) = (path.to_owned(), state.run_spec_hash);
         return Err(CheckpointError::OtherRun {
@@ -58,14 +58,14 @@ pub fn load(
         });
     }
     let has_key = settings.make_auxiliary_loss()?.key_tau().is_some();
-    let tensors = |name: &str| read_file(path, &state, name);
+    let tensors = |name: &str| read_verified(path, &state, name);
     let online = tensors(ONLINE)?;
     check_model(path, &online, model)?;
     let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str, bytes: &[u8]| {
         let loaded = Parameters::load_part(model, part, bytes, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let key = has_key.then(|| parameters(model, Encoder::has, KEY, &tensors(KEY)?));
+    let key = has_key.then(|| parameters(model, Encoder::has, KEY_ENCODER, &tensors(KEY_ENCODER)?));
     let has_average = state.sha256.contains_key(AVERAGE);
     let average = (settings.average_tau.is_some() && has_average)
         .then(|| parameters(&model.without_dim(), |_| true, AVERAGE, &tensors(AVERAGE)?));
@@ -97,7 +97,7 @@ pub fn load(
 
 /// Checks that the network `online` of the checkpoint at `path` has the sizes of `model`, if the checkpoint describes them.
 fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), CheckpointError> {
-    let described = description::described(online).ok().flatten();
+    let described = description::read_description(online).ok().flatten();
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };
@@ -105,8 +105,8 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
     let ours = serde_json::to_string(model).and_then(|text| serde_json::from_str(&text));
     let ours: Value = ours.unwrap_or_default();
     // If the torso differs, only that is reported: other differences follow from it.
-    let torso = description::difference("model.torso", &saved["torso"], &ours["torso"]);
-    match torso.or_else(|| description::difference("model", saved, &ours)) {
+    let torso = description::first_difference("model.torso", &saved["torso"], &ours["torso"]);
+    match torso.or_else(|| description::first_difference("model", saved, &ours)) {
         None => Ok(()),
         Some((key, found, expected)) => Err(CheckpointError::OtherModel {
             folder: path.to_owned(),
@@ -140,29 +140,29 @@ pub fn read_affinity(path: &Path) -> Result<Option<AffinityEstimator>, Checkpoin
 /// A missing or damaged file.
 pub fn read_companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
     let state = read_state(path)?;
-    let there = state.sha256.contains_key(COMPANION);
-    there
-        .then(|| read_file(path, &state, COMPANION))
+    let has_companion = state.sha256.contains_key(COMPANION);
+    has_companion
+        .then(|| read_verified(path, &state, COMPANION))
         .transpose()
 }
 
 fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {
-    let text = read(&path.join(STATE))?;
-    let sum = read(&path.join(STATE_SUM))?;
-    if !sum.starts_with(sha256_of(&text).as_bytes()) {
+    let text = read_file(&path.join(STATE))?;
+    let sum = read_file(&path.join(STATE_SHA256))?;
+    if !sum.starts_with(sha256_hex(&text).as_bytes()) {
         return Err(damaged(
             path,
             STATE,
-            format!("its SHA-256 is not the one in {STATE_SUM}"),
+            format!("its SHA-256 is not the one in {STATE_SHA256}"),
         ));
     }
     StateFile::read(path, &text)
 }
 
 /// Reads the checkpoint's file `name` and checks its SHA-256.
-fn read_file(path: &Path, state: &StateFile, name: &str) -> Result<Vec<u8>, CheckpointError> {
-    let bytes = read(&path.join(name))?;
-    if state.sha256.get(name) == Some(&sha256_of(&bytes)) {
+fn read_verified(path: &Path, state: &StateFile, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    let bytes = read_file(&path.join(name))?;
+    if state.sha256.get(name) == Some(&sha256_hex(&bytes)) {
         return Ok(bytes);
     }
     let length = bytes.len();

@@ -9,8 +9,8 @@ mod load;
 mod save;
 
 pub use contents::{AVERAGE, LearnerState, check_state};
-pub use description::{KEY as DESCRIPTION, describe, described};
+pub use description::{METADATA_KEY, describe, read_description};
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
 pub use load::{load, load_latest, read_affinity, read_companion, read_run_counts};
-pub use save::{Label, save};
+pub use save::{Extras, save};

@@ -10,18 +10,18 @@ use driml_model::{Parameters, StoredAs};
 
 use super::{
     contents::{
-        AVERAGE, COMPANION, FORMAT, KEY, LearnerState, ONLINE, OPTIMIZER, STATE, STATE_SUM,
-        StateFile, TARGET, hex_of, sha256_of,
+        AVERAGE, COMPANION, FORMAT, KEY_ENCODER, LearnerState, ONLINE, OPTIMIZER, STATE,
+        STATE_SHA256, StateFile, TARGET, format_hash, sha256_hex,
     },
     description,
     error::{CheckpointError, io_error},
-    folder::{PREFIX, list, prune, put_in_place, remove_or_warn, sync, tidy, write_durably},
+    folder::{PREFIX, clean_up, list, move_into_place, prune, remove_or_warn, sync, write_durably},
 };
 use crate::{agent::Agent, error::UpdateError};
 
 /// The contents of a checkpoint in addition to the learner's state.
 #[derive(Clone, Copy, Debug)]
-pub struct Label<'a> {
+pub struct Extras<'a> {
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
     /// The description of the online network, from [`describe`](super::describe), for the metadata.
@@ -34,7 +34,7 @@ pub struct Label<'a> {
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
 ///
-/// The files are written and flushed to disk in a folder aside, which is then renamed: a crash at any moment leaves the older
+/// The files are written and flushed to disk in a staging folder, which is then renamed: a crash at any moment leaves the older
 /// checkpoints whole and at most a `.tmp` folder, which the next save removes.
 ///
 /// # Errors
@@ -43,20 +43,20 @@ pub struct Label<'a> {
 pub fn save(
     folder: &Path,
     state: &LearnerState,
-    label: Label<'_>,
+    extras: Extras<'_>,
     keep: usize,
 ) -> Result<PathBuf, CheckpointError> {
     if keep == 0 {
         return Err(CheckpointError::KeepNone);
     }
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
-    tidy(folder)?;
+    clean_up(folder)?;
     let name = format!("{PREFIX}{:012}", state.agent.updates());
-    let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
-    let saved = write(&aside, state, label).and_then(|()| put_in_place(&aside, &path));
+    let (path, staging) = (folder.join(&name), folder.join(format!("{name}.tmp")));
+    let saved = write(&staging, state, extras).and_then(|()| move_into_place(&staging, &path));
     if let Err(error) = saved {
         // The unfinished checkpoint would keep a full disk full.
-        remove_or_warn(&aside);
+        remove_or_warn(&staging);
         return Err(error);
     }
     let all = list(folder)?;
@@ -66,20 +66,20 @@ pub fn save(
     Ok(path)
 }
 
-/// Creates the folder `aside` and writes a checkpoint's files into it.
-fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), CheckpointError> {
+/// Creates the folder `staging` and writes a checkpoint's files into it.
+fn write(staging: &Path, state: &LearnerState, extras: Extras<'_>) -> Result<(), CheckpointError> {
     let agent = &state.agent;
-    let mut files = tensor_files(agent, label).map_err(CheckpointError::Unsound)?;
-    files.extend(label.companion.map(|bytes| (COMPANION, bytes.to_vec())));
-    fs::create_dir(aside).map_err(io_error("create", aside))?;
+    let mut files = tensor_files(agent, extras).map_err(CheckpointError::Unsound)?;
+    files.extend(extras.companion.map(|bytes| (COMPANION, bytes.to_vec())));
+    fs::create_dir(staging).map_err(io_error("create", staging))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {
-        write_durably(&aside.join(name), &bytes)?;
-        sha256.insert(name.to_owned(), sha256_of(&bytes));
+        write_durably(&staging.join(name), &bytes)?;
+        sha256.insert(name.to_owned(), sha256_hex(&bytes));
     }
     let file = StateFile {
         format: FORMAT,
-        run_spec_hash: hex_of(label.run_spec_hash),
+        run_spec_hash: format_hash(extras.run_spec_hash),
         updates: agent.updates(),
         adam_step: agent.adam.step_count(),
         weights_version: state.weights_version,
@@ -90,38 +90,38 @@ fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), Che
     };
     let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {
         what: "encode",
-        path: aside.join(STATE),
+        path: staging.join(STATE),
         why: why.into(),
     })?;
-    write_durably(&aside.join(STATE), &text)?;
+    write_durably(&staging.join(STATE), &text)?;
     // In the format of `sha256sum --check`.
     write_durably(
-        &aside.join(STATE_SUM),
-        format!("{}  {STATE}\n", sha256_of(&text)).as_bytes(),
+        &staging.join(STATE_SHA256),
+        format!("{}  {STATE}\n", sha256_hex(&text)).as_bytes(),
     )?;
-    sync(aside)
+    sync(staging)
 }
 
 /// Serialises the networks and the moments, all of which must be finite, into files with their names.
 fn tensor_files(
     agent: &Agent,
-    label: Label<'_>,
+    extras: Extras<'_>,
 ) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
     let described = |parameters: &Parameters, description: &str| {
-        parameters.to_described_safetensors(StoredAs::F32, description::KEY, description)
+        parameters.to_described_safetensors(StoredAs::F32, description::METADATA_KEY, description)
     };
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
     let mut files = vec![
-        (ONLINE, described(agent.online(), label.description)?),
-        (TARGET, described(agent.target(), label.without_heads)?),
+        (ONLINE, described(agent.online(), extras.description)?),
+        (TARGET, described(agent.target(), extras.without_heads)?),
         (OPTIMIZER, moments),
     ];
     if let Some(key) = agent.key_encoder() {
-        files.push((KEY, described(key, label.description)?));
+        files.push((KEY_ENCODER, described(key, extras.description)?));
     }
     if let Some(average) = agent.average() {
-        files.push((AVERAGE, described(average, label.without_heads)?));
+        files.push((AVERAGE, described(average, extras.without_heads)?));
     }
     Ok(files)
 }

@@ -72,7 +72,7 @@ struct Config {
     adam: AdamSettings,
     /// `key_tau` of the auxiliary loss; absent for a loss without a key encoder.
     key_tau: Option<f64>,
-    model: Sizes,
+    model: ModelSizes,
     /// If absent: one linear layer.
     #[serde(default)]
     head: HeadConfig,
@@ -86,7 +86,7 @@ struct Observation {
 }
 
 #[derive(Debug, Deserialize)]
-struct Sizes {
+struct ModelSizes {
     /// If absent: `nature`.
     #[serde(default)]
     torso: TorsoName,
@@ -113,19 +113,19 @@ pub(super) struct Case {
 impl Case {
     pub(super) fn parse(bytes: &[u8]) -> Result<Self, ParityError> {
         let cut = |why: String| ParityError::Case(format!("not a whole safetensors file: {why}"));
-        let bad = |why: &str| ParityError::Case(format!("metadata key `config`: {why}"));
+        let invalid = |why: &str| ParityError::Case(format!("metadata key `config`: {why}"));
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| cut(e.to_string()))?;
         let metadata = header.metadata().as_ref();
         let text = metadata.and_then(|metadata| metadata.get("config"));
-        let config: Config = serde_json::from_str(text.ok_or_else(|| bad("it is missing"))?)
-            .map_err(|why| bad(&why.to_string()))?;
+        let config: Config = serde_json::from_str(text.ok_or_else(|| invalid("it is missing"))?)
+            .map_err(|why| invalid(&why.to_string()))?;
         let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu);
         let tensors = tensors.map_err(|e| cut(e.to_string()))?;
         let tensors = Tensors(tensors.into_iter().collect());
         let settings = config.settings();
         let expectations = tensors.0.keys().filter(|name| name.starts_with("expect."));
         Ok(Self {
-            inputs: inputs(&tensors, &config.obs, &settings)?,
+            inputs: read_inputs(&tensors, &config.obs, &settings)?,
             unused: RefCell::new(expectations.cloned().collect()),
             config,
             settings,
@@ -176,20 +176,21 @@ impl Case {
         self.inputs.batch()
     }
 
-    fn under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
+    fn tensors_under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
         let all = self.tensors.0.iter();
         all.filter_map(move |(name, tensor)| Some((name.strip_prefix(prefix)?, tensor)))
     }
 
-    pub(super) fn online(&self) -> impl Iterator<Item = (&str, &Tensor)> {
-        self.under("online.")
+    pub(super) fn online_parameters(&self) -> impl Iterator<Item = (&str, &Tensor)> {
+        self.tensors_under("online.")
     }
 
     /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.
     pub(super) fn parameters(&self, prefix: &str, model: &ModelConfig) -> HashMap<String, Tensor> {
         let shapes = model.parameter_shapes().into_iter();
         let built: BTreeSet<_> = shapes.map(|it| it.0).collect();
-        let named = self.under(prefix).filter(|(name, _)| built.contains(*name));
+        let named = self.tensors_under(prefix);
+        let named = named.filter(|(name, _)| built.contains(*name));
         named
             .map(|(name, it)| (name.to_owned(), it.clone()))
             .collect()
@@ -221,12 +222,12 @@ impl Case {
 
 impl Config {
     fn settings(&self) -> UpdateSettings {
-        let by_lambda = if self.lambda.active_pairs().contains(&true) {
+        let default_loss = if self.lambda.active_pairs().contains(&true) {
             AuxiliaryKind::from_item(&DIM)
         } else {
             AuxiliaryKind::NONE
         };
-        let auxiliary_loss = self.auxiliary_loss.unwrap_or(by_lambda);
+        let auxiliary_loss = self.auxiliary_loss.unwrap_or(default_loss);
         // The loss's own table, of which cases have this one setting.
         let own = self.key_tau.map(|key_tau| {
             let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
@@ -251,7 +252,7 @@ impl Config {
     }
 }
 
-fn inputs(
+fn read_inputs(
     tensors: &Tensors,
     obs: &Observation,
     settings: &UpdateSettings,
@@ -268,14 +269,14 @@ fn inputs(
     } else {
         // [B] if a row has one positive, else [P, B].
         let dims = tensors.get("input.positive_valid")?.dims();
-        let several = if dims.len() > 1 { &dims[..1] } else { &[] };
-        let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;
-        let valid = bytes("input.positive_valid", &[several, &[rows]].concat())?;
+        let positive_dims = if dims.len() > 1 { &dims[..1] } else { &[] };
+        let states_k = bytes("input.frames_k", &[positive_dims, &state[..]].concat())?;
+        let valid = bytes("input.positive_valid", &[positive_dims, &[rows]].concat())?;
         (states_k, valid)
     };
     let actions = tensors.read::<i64>("input.action", DType::I64, &[rows])?;
-    let narrow = |&action: &i64| u8::try_from(action).ok().filter(|it| *it != NO_ACTION);
-    let action: Option<Vec<u8>> = actions.iter().map(narrow).collect();
+    let to_action = |&action: &i64| u8::try_from(action).ok().filter(|it| *it != NO_ACTION);
+    let action: Option<Vec<u8>> = actions.iter().map(to_action).collect();
     let weight = "input.importance_weight";
     let is_weighted = tensors.0.contains_key(weight);
     Ok(OwnedBatch {

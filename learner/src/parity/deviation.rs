@@ -15,7 +15,7 @@ pub const REFERENCE: Compute = Compute {
 
 /// How far an agent's numbers are from a reference's.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ErrorOfUpdate {
+pub struct UpdateDeviation {
     /// The agent's total loss.
     pub own_loss: f64,
     /// The reference's total loss.
@@ -30,20 +30,20 @@ pub struct ErrorOfUpdate {
     pub same_next_action: f64,
 }
 
-impl ErrorOfUpdate {
+impl UpdateDeviation {
     /// Compares `agent` on `batch` with `reference`, an agent of the same parameters on [`REFERENCE`]. Both use the noise of `agent`.
-    pub fn of(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
+    pub fn new(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
         let noise = agent.noise();
         let own = agent.evaluate_with(batch, &noise)?;
         let expected = reference.evaluate_with(batch, &noise)?;
-        let (mut apart, mut dot, mut own_square, mut square) = (0.0, 0.0, 0.0, 0.0);
+        let (mut difference, mut dot, mut own_square, mut square) = (0.0, 0.0, 0.0, 0.0);
         for (name, var) in reference.online().iter() {
             let [got, expected] = [&own.gradients, &expected.gradients].map(|gradients| {
                 let gradient = gradients.get(name);
                 gradient.map_or_else(|| Ok(vec![0.0; var.elem_count()]), to_vec_f64)
             });
             for (got, expected) in got?.iter().zip(expected?) {
-                apart += (got - expected).powi(2);
+                difference += (got - expected).powi(2);
                 dot += got * expected;
                 own_square += got * got;
                 square += expected * expected;
@@ -59,9 +59,9 @@ impl ErrorOfUpdate {
             own_loss,
             reference_loss,
             loss: (own_loss - reference_loss).abs() / reference_loss.abs(),
-            gradient: match apart {
+            gradient: match difference {
                 0.0 => 0.0,
-                _ => f64::sqrt(apart / square),
+                _ => f64::sqrt(difference / square),
             },
             angle: 1.0 - dot / f64::sqrt(own_square * square),
             same_next_action: if next.is_empty() {
@@ -75,7 +75,7 @@ impl ErrorOfUpdate {
 
 /// How far values [B, A] are from a reference's.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct QError {
+pub struct QDeviation {
     /// Root mean square of the errors, in units of return.
     pub rms: f64,
     /// The largest error.
@@ -84,9 +84,9 @@ pub struct QError {
     pub same_action: f64,
 }
 
-impl QError {
+impl QDeviation {
     /// Compares `got` [B, A] with `expected` [B, A].
-    pub fn of(got: &[f32], expected: &[f32], num_actions: usize) -> Self {
+    pub fn new(got: &[f32], expected: &[f32], num_actions: usize) -> Self {
         let (mut square, mut max) = (0.0, 0f64);
         for (&got, &expected) in got.iter().zip(expected) {
             let error = (f64::from(got) - f64::from(expected)).abs();
@@ -110,7 +110,7 @@ mod tests {
 
     #[test]
     fn values_are_compared_row_by_row() {
-        let found = QError::of(&[1.0, 2.0, 5.0, 4.0], &[1.0, 2.5, 4.0, 4.5], 2);
+        let found = QDeviation::new(&[1.0, 2.0, 5.0, 4.0], &[1.0, 2.5, 4.0, 4.5], 2);
         assert_eq!((found.max, found.same_action), (1.0, 0.5));
         assert!((found.rms - (1.5f64 / 4.0).sqrt()).abs() < 1e-12);
     }

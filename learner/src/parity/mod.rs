@@ -44,7 +44,7 @@ pub struct ParityLine {
 
 impl ParityLine {
     /// Whether the error is within the tolerance; NaN is not.
-    pub fn ok(&self) -> bool {
+    pub fn passed(&self) -> bool {
         self.error <= self.tolerance
     }
 }
@@ -61,7 +61,7 @@ pub struct ParityReport {
 impl ParityReport {
     /// Whether everything is within tolerance.
     pub fn passed(&self) -> bool {
-        self.lines.iter().all(ParityLine::ok)
+        self.lines.iter().all(ParityLine::passed)
     }
 }
 
@@ -69,7 +69,7 @@ impl fmt::Display for ParityReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}", self.file.display())?;
         for line in &self.lines {
-            let verdict = if line.ok() { "ok" } else { "FAILED" };
+            let verdict = if line.passed() { "ok" } else { "FAILED" };
             let (error, tolerance) = (line.error, line.tolerance);
             writeln!(
                 f,
@@ -105,12 +105,12 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let mut agent = agent_of(case, compute)?;
+    let mut agent = case_agent(case, compute)?;
     let forward = forward_losses(case, compute)?;
     let evaluation = agent.evaluate_with(&case.batch(), &case.noise(agent.model())?)?;
-    let mut check = Check {
+    let mut check = CaseCheck {
         case,
-        allowed: Tolerances::of(compute.kernels, agent.model().torso),
+        allowed: Tolerances::new(compute.kernels, agent.model().torso),
         lines: Vec::new(),
     };
     check.targets(&agent, &evaluation)?;
@@ -124,15 +124,15 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     Ok(check.lines)
 }
 
-struct Check<'a> {
+struct CaseCheck<'a> {
     case: &'a Case,
     allowed: Tolerances,
     lines: Vec<ParityLine>,
 }
 
-impl Check<'_> {
+impl CaseCheck<'_> {
     fn add(&mut self, name: &str, error: f64, tolerance: f64) {
-        self.lines.push(line(name, error, tolerance));
+        self.lines.push(new_line(name, error, tolerance));
     }
 
     /// Compares values of s_t, greedy actions in s_{t+n} and projected targets.
@@ -140,7 +140,7 @@ impl Check<'_> {
         let (case, allowed, model) = (self.case, self.allowed, agent.model());
         let batch = case.batch();
         let expected = case.expected("q_values_t", &[batch.rows, model.num_actions])?;
-        let error = largest(&widened(&agent.q_values_t(&batch)?), &expected);
+        let error = largest_error(&to_f64(&agent.q_values_t(&batch)?), &expected);
         let width = f64::from(model.v_max - model.v_min);
         self.add("q_values_t", error, allowed.q_values * width);
 
@@ -158,39 +158,39 @@ impl Check<'_> {
         );
 
         let expected = case.expected("target_projection", &[batch.rows, model.atoms])?;
-        let found = widened(&evaluation.target_projection);
+        let found = to_f64(&evaluation.target_projection);
         let rows = found.chunks(model.atoms).zip(expected.chunks(model.atoms));
         let rows = rows.zip(same).filter(|(_, same)| *same);
-        let errors = rows.map(|((got, expected), _)| largest(got, expected));
-        let error = errors.fold(0.0, nan_or_larger);
+        let errors = rows.map(|((got, expected), _)| largest_error(got, expected));
+        let error = errors.fold(0.0, max_or_nan);
         self.add("target_projection", error, allowed.projection);
         Ok(())
     }
 
-    fn losses(&mut self, found: &Evaluation, forward: &[Forward]) -> Result<(), ParityError> {
+    fn losses(&mut self, found: &Evaluation, forward: &[ForwardLoss]) -> Result<(), ParityError> {
         if !found.row_kls.is_empty() {
             let expected = self.case.expected("row_kl", &[found.row_kls.len()])?;
-            let error = largest(&widened(&found.row_kls), &expected);
+            let error = largest_error(&to_f64(&found.row_kls), &expected);
             let most = expected.iter().copied().fold(0.0, f64::max);
-            self.add("row_kl", error, self.allowed.of_loss(most, false));
+            self.add("row_kl", error, self.allowed.loss_tolerance(most, false));
         }
         self.loss("loss.c51_kl", found.c51_kl, false)?;
         let mut total_saturates = false;
-        for alone in forward {
+        for loss in forward {
             // A loss of weight 0 is not in the update: its value comes from the forward pass alone.
-            let in_update = found.losses.iter().find(|it| it.0 == alone.name);
-            let got = in_update.map_or(alone.value, |it| it.1);
+            let in_update = found.losses.iter().find(|it| it.0 == loss.name);
+            let got = in_update.map_or(loss.value, |it| it.1);
             // A case names every loss after its pair of levels. A loss without a pair compares global features.
-            let pair = alone.name.split_once('_').map_or("4t4", |it| it.1);
-            self.loss(&format!("loss.dim.{pair}"), got, alone.saturates)?;
-            total_saturates |= alone.saturates && in_update.is_some();
+            let pair = loss.name.split_once('_').map_or("4t4", |it| it.1);
+            self.loss(&format!("loss.dim.{pair}"), got, loss.is_saturated)?;
+            total_saturates |= loss.is_saturated && in_update.is_some();
         }
         self.loss("loss.total", found.total, total_saturates)
     }
 
     fn loss(&mut self, name: &str, got: f32, is_saturated: bool) -> Result<(), ParityError> {
         let expected = self.case.expected(name, &[1])?[0];
-        let tolerance = self.allowed.of_loss(expected, is_saturated);
+        let tolerance = self.allowed.loss_tolerance(expected, is_saturated);
         self.add(name, (f64::from(got) - expected).abs(), tolerance);
         Ok(())
     }
@@ -198,23 +198,23 @@ impl Check<'_> {
     fn gradients(&mut self, evaluation: &Evaluation) -> Result<(), ParityError> {
         let (case, allowed) = (self.case, self.allowed);
         let global_norm = case.expected("grad_norm", &[1])?[0];
-        let (mut worst, mut angles) = (Worst::default(), Worst::default());
-        for (name, tensor) in case.online() {
+        let (mut worst, mut angles) = (WorstByGroup::default(), WorstByGroup::default());
+        for (name, tensor) in case.online_parameters() {
             let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
             let got = match evaluation.gradients.get(name) {
                 Some(gradient) => to_vec_f64(gradient)?,
                 None => vec![0.0; expected.len()],
             };
-            let apart = norm(got.iter().zip(&expected).map(|(got, wanted)| got - wanted));
-            let own = norm(expected.iter().copied());
-            let tolerance = allowed.gradient * own + allowed.gradient_of_global * global_norm;
-            worst.add("grad", name, apart, tolerance);
+            let difference = norm(got.iter().zip(&expected).map(|(got, wanted)| got - wanted));
+            let own_norm = norm(expected.iter().copied());
+            let tolerance = allowed.gradient * own_norm + allowed.gradient_of_global * global_norm;
+            worst.add("grad", name, difference, tolerance);
             if let Some(angle) = allowed
                 .angle
-                .filter(|_| own > 0.0 && own >= 0.1 * global_norm)
+                .filter(|_| own_norm > 0.0 && own_norm >= 0.1 * global_norm)
             {
                 let dot: f64 = got.iter().zip(&expected).map(|(a, b)| a * b).sum();
-                let cosine = dot / (own * norm(got.iter().copied()));
+                let cosine = dot / (own_norm * norm(got.iter().copied()));
                 angles.add("1 - cosine", name, 1.0 - cosine, angle);
             }
         }
@@ -226,17 +226,17 @@ impl Check<'_> {
     fn updated(&mut self, agent: &Agent) -> Result<(), ParityError> {
         let (case, allowed) = (self.case, self.allowed);
         let tolerance = allowed.updated + allowed.updated_rates * case.settings.adam.lr;
-        let (mut online, mut keys) = (Worst::default(), Worst::default());
-        for (name, tensor) in case.online() {
+        let (mut online, mut keys) = (WorstByGroup::default(), WorstByGroup::default());
+        for (name, tensor) in case.online_parameters() {
             let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
             // Parameters that no lambda uses are not built, so they stay as in the file.
             let var = agent.online().get(name);
             let got = to_vec_f64(var.map_or(tensor, |var| var.as_tensor()))?;
-            online.add("updated", name, largest(&got, &expected), tolerance);
+            online.add("updated", name, largest_error(&got, &expected), tolerance);
         }
         for (name, var) in agent.key_encoder().iter().flat_map(|key| key.iter()) {
             let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
-            let error = largest(&to_vec_f64(var)?, &expected);
+            let error = largest_error(&to_vec_f64(var)?, &expected);
             keys.add("updated_key", name, error, tolerance);
         }
         self.lines.extend(online.0.into_values());
@@ -246,7 +246,7 @@ impl Check<'_> {
 }
 
 /// The agent of a case before its update.
-fn agent_of(case: &Case, compute: &Compute) -> Result<Agent, ParityError> {
+fn case_agent(case: &Case, compute: &Compute) -> Result<Agent, ParityError> {
     let sizes = case.model(DimHeads::NONE);
     let model = case.model(case.settings.dim_heads(sizes.num_actions));
     let slow = model.without_dim();
@@ -277,15 +277,15 @@ fn key_parameters(
 }
 
 /// The value of an auxiliary loss, from a forward pass alone.
-struct Forward {
+struct ForwardLoss {
     name: &'static str,
     value: f32,
     /// Whether a score is beyond the clip's bound, where the clip's derivative is below 0.42.
-    saturates: bool,
+    is_saturated: bool,
 }
 
 /// Computes the auxiliary losses of all pairs that the case contains, by a forward pass alone and whatever lambda is.
-fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, ParityError> {
+fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>, ParityError> {
     let settings = &case.settings;
     let kind = if settings.auxiliary_loss == AuxiliaryKind::NONE {
         AuxiliaryKind::from_item(&DIM)
@@ -302,7 +302,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     let loss = loss.or_else(|_| settings.make_auxiliary_loss())?;
     // Read from the case's parameters: if the update is C51's alone, the settings do not say it.
     let gives_action = |(name, _): (&str, _)| name.starts_with("dim.action.");
-    let model = case.model(loss.heads(case.online().any(gives_action)));
+    let model = case.model(loss.heads(case.online_parameters().any(gives_action)));
     let (device, kernels) = (&compute.device, compute.kernels);
     let named = case.parameters("online.", &model);
     let parameters = Parameters::from_tensors(&model, named, device)?;
@@ -320,24 +320,24 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         key_encoder: key.as_ref(),
         device,
     })?;
-    let saturates = |it: &DotProducts| -> Result<bool, ParityError> {
+    let is_saturated = |it: &DotProducts| -> Result<bool, ParityError> {
         let clip = ScoreClip::new(it.width, settings.tanh_clip);
         let mut dots = to_vec_f64(&it.values)?.into_iter();
         Ok(dots.any(|dot| dot.abs() * clip.scale > clip.tanh_clip))
     };
     let mut forward = Vec::new();
     for it in &losses {
-        let saturating: Result<Vec<bool>, _> = it.dot_products.iter().map(saturates).collect();
-        forward.push(Forward {
+        let saturating: Result<Vec<bool>, _> = it.dot_products.iter().map(is_saturated).collect();
+        forward.push(ForwardLoss {
             name: it.name,
             value: it.loss.to_scalar()?,
-            saturates: saturating?.contains(&true),
+            is_saturated: saturating?.contains(&true),
         });
     }
     Ok(forward)
 }
 
-fn line(name: &str, error: f64, tolerance: f64) -> ParityLine {
+fn new_line(name: &str, error: f64, tolerance: f64) -> ParityLine {
     ParityLine {
         name: name.to_owned(),
         error,
@@ -347,13 +347,13 @@ fn line(name: &str, error: f64, tolerance: f64) -> ParityLine {
 
 /// One line per group of parameters (`torso`, `head`, `dim.psi3`, ..): the tensor nearest to its tolerance.
 #[derive(Default)]
-struct Worst(BTreeMap<String, ParityLine>);
+struct WorstByGroup(BTreeMap<String, ParityLine>);
 
-impl Worst {
+impl WorstByGroup {
     fn add(&mut self, what: &str, name: &str, error: f64, tolerance: f64) {
         let parts = if name.starts_with("dim.") { 2 } else { 1 };
         let group = name.split('.').take(parts).collect::<Vec<_>>().join(".");
-        let new = line(&format!("{what}.{name}"), error, tolerance);
+        let new = new_line(&format!("{what}.{name}"), error, tolerance);
         let worst = self.0.entry(group).or_insert_with(|| new.clone());
         // An error of NaN is kept.
         let nearer = error * worst.tolerance > worst.error * tolerance;
@@ -363,7 +363,7 @@ impl Worst {
     }
 }
 
-fn widened(values: &[f32]) -> Vec<f64> {
+fn to_f64(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&value| f64::from(value)).collect()
 }
 
@@ -372,18 +372,18 @@ fn norm(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Largest absolute difference; NaN if any is.
-fn largest(got: &[f64], expected: &[f64]) -> f64 {
+fn largest_error(got: &[f64], expected: &[f64]) -> f64 {
     if got.len() != expected.len() {
         return f64::INFINITY;
     }
     let pairs = got.iter().zip(expected);
     pairs
         .map(|(got, expected)| (got - expected).abs())
-        .fold(0.0, nan_or_larger)
+        .fold(0.0, max_or_nan)
 }
 
 /// The larger one; NaN if either is.
-fn nan_or_larger(largest: f64, d: f64) -> f64 {
+fn max_or_nan(largest: f64, d: f64) -> f64 {
     if d.is_nan() || d > largest {
         d
     } else {
@@ -407,7 +407,7 @@ mod tests {
             }
             let case = Case::parse(&std::fs::read(&path).unwrap()).unwrap();
             let (batch, name) = (case.batch(), path.display());
-            let agent = agent_of(&case, &Compute::CPU).unwrap();
+            let agent = case_agent(&case, &Compute::CPU).unwrap();
             let shape = [batch.rows, agent.model().num_actions];
             let expected = case.expected("q_values_t", &shape).unwrap();
             let weights = agent.weights().unwrap();
@@ -417,7 +417,7 @@ mod tests {
             policy.q_values(batch.states_t, &mut acted).unwrap();
             let scale = expected.iter().fold(1.0, |a: f64, b| a.max(b.abs()));
             for found in [acted, agent.q_values_t(&batch).unwrap()] {
-                let error = largest(&widened(&found), &expected);
+                let error = largest_error(&to_f64(&found), &expected);
                 assert!(error < 2e-6 * scale, "{name}: {error}");
             }
         }

@@ -15,7 +15,7 @@ pub(super) struct Tolerances {
     pub(super) loss: f64,
     /// Losses, relative, if scores saturate.
     pub(super) saturated_loss: f64,
-    pub(super) least_loss: f64,
+    pub(super) loss_min: f64,
     /// Gradients, as a share of the tensor's own 2-norm; `gradient_of_global` is added.
     pub(super) gradient: f64,
     /// Gradients, as a share of the global 2-norm.
@@ -39,7 +39,7 @@ impl Tolerances {
         projection: 5e-6,
         loss: 1e-5,
         saturated_loss: 1e-4,
-        least_loss: 1e-6,
+        loss_min: 1e-6,
         gradient: 1e-4,
         gradient_of_global: 1e-6,
         norm: 1e-4,
@@ -58,7 +58,7 @@ impl Tolerances {
         projection: 2e-3,
         loss: 1e-2,
         saturated_loss: 2e-2,
-        least_loss: 2e-3,
+        loss_min: 2e-3,
         gradient: 0.15,
         gradient_of_global: 0.03,
         norm: 0.05,
@@ -68,16 +68,16 @@ impl Tolerances {
     };
 
     /// The tolerance of a loss with this expected value.
-    pub(super) fn of_loss(&self, expected: f64, is_saturated: bool) -> f64 {
+    pub(super) fn loss_tolerance(&self, expected: f64, is_saturated: bool) -> f64 {
         let relative = if is_saturated {
             self.saturated_loss
         } else {
             self.loss
         };
-        (relative * expected.abs()).max(self.least_loss)
+        (relative * expected.abs()).max(self.loss_min)
     }
 
-    pub(super) fn of(kernels: Kernels, torso: TorsoName) -> Self {
+    pub(super) fn new(kernels: Kernels, torso: TorsoName) -> Self {
         match (kernels, torso) {
             (Kernels::Fused(Precision::Bf16), TorsoName::Nature) => Self::BF16,
             // 15 convolutions round instead of 3, and independent rounding errors grow as the root of their number.

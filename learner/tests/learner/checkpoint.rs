@@ -8,7 +8,7 @@ use std::{
 
 use driml_learner::{
     AffinityEstimator, Alphabet, LearnedAffinity, RunCounts,
-    checkpoint::{self, CheckpointError, Label, LearnerState, list, load_latest, lock},
+    checkpoint::{self, CheckpointError, Extras, LearnerState, list, load_latest, lock},
 };
 use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
 use driml_protocol::ShardCounts;
@@ -58,13 +58,13 @@ pub(crate) fn try_save(
     keep: usize,
     description: &str,
 ) -> Result<PathBuf, CheckpointError> {
-    let label = Label {
+    let extras = Extras {
         run_spec_hash: SPEC,
         description,
         without_heads: WITHOUT_HEADS,
         companion: None,
     };
-    checkpoint::save(folder, run, label, keep)
+    checkpoint::save(folder, run, extras, keep)
 }
 
 fn resume(folder: &Path) -> LearnerState {

@@ -3,7 +3,7 @@
 use candle_core::Device;
 use driml_learner::{
     Agent, Compute, NetworkParameters, OwnedBatch, UpdateSettings,
-    parity::deviation::{ErrorOfUpdate, REFERENCE},
+    parity::deviation::{REFERENCE, UpdateDeviation},
 };
 use driml_machine::resources::Machine;
 use driml_model::{ModelConfig, Parameters};
@@ -161,7 +161,7 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let (mut loss, mut gradient) = (Vec::new(), Vec::new());
         for deduplicate in [false, true] {
             agent = agent.with_deduplication(deduplicate);
-            let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
+            let found = UpdateDeviation::new(&agent, &batch.batch(), &reference)?;
             loss.push(loss_error(found.own_loss, found.reference_loss));
             // `None` if two nearly equal values swap their order: then the next action and the target differ, so gradients do too.
             gradient.push((found.same_next_action == 1.0).then_some(found.gradient));

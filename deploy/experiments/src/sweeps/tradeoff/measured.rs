@@ -6,7 +6,7 @@ use anyhow::Context;
 use driml_launch::run_folder::RunFolder;
 use driml_learner::{
     Agent, Compute, NetworkParameters, checkpoint,
-    parity::deviation::{ErrorOfUpdate, QError, REFERENCE},
+    parity::deviation::{QDeviation, REFERENCE, UpdateDeviation},
 };
 use driml_machine::effort::{Effort, Work};
 use driml_model::PolicyNetwork;
@@ -107,7 +107,7 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<M
     let weights = agent.weights()?;
     let (rows, states) = sizes(config);
     let held = fixed_batch::play(config, Some(&weights), rows)?;
-    let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
+    let found = UpdateDeviation::new(&agent, &held.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
     let held = fixed_batch::play(config, Some(&weights), states)?;
@@ -115,7 +115,7 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<M
     policy.q_values(&held.states_t, &mut acted)?;
     let expected = reference.q_values_t(&held.batch())?;
     let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]
-        .map(|values| QError::of(&values, &expected, model.num_actions));
+        .map(|values| QDeviation::new(&values, &expected, model.num_actions));
     let errors = [
         // The relative errors of the total loss and of the gradient, and 1 - cosine of the gradient's angle to the reference.
         ("loss_error", found.loss),
