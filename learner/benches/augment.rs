@@ -16,7 +16,7 @@ fn augmentation(criterion: &mut Criterion) {
     let mut rng = ChaCha8Rng::seed_from_u64(6);
     let mut states = vec![0; ROWS * 64 * 64 * 3];
     rng.fill_bytes(&mut states);
-    let mut seen = Vec::new();
+    let mut augmented = Vec::new();
     let mut group = criterion.benchmark_group("augment");
     group.throughput(Throughput::Elements(ROWS as u64));
     for (name, crop_side, jitter) in [
@@ -34,7 +34,7 @@ fn augmentation(criterion: &mut Criterion) {
         };
         let augment = Augmenter::new(settings, (64, 64, 3), 3);
         group.bench_function(name, |bencher| {
-            bencher.iter(|| augment.apply(black_box(&states), &mut seen, &mut rng));
+            bencher.iter(|| augment.apply(black_box(&states), &mut augmented, &mut rng));
         });
     }
     group.finish();

@@ -323,8 +323,8 @@ impl Agent {
         adam_step: u64,
         moments: HashMap<String, Tensor>,
     ) -> Result<(), UpdateError> {
-        let device = &self.networks.compute.device;
-        self.adam.restore(adam_step, moments, device)?;
+        self.adam
+            .restore(adam_step, moments, &self.networks.compute.device)?;
         self.updates = updates;
         Ok(())
     }

@@ -82,7 +82,7 @@ impl UpdateCost {
         // The forward product and the gradients of both operands; keys have no gradient.
         let products = if passes.keys > 0 { 2 } else { 3 };
         let value = forward(&["torso", "head"]);
-        let own = model.loss_layers.iter().map(|it| learning(&[&it.layer()]));
+        let loss_layers = model.loss_layers.iter().map(|it| learning(&[&it.layer()]));
         Self {
             online: rows * learning(&["torso"]),
             head: rows * learning(&["head"]) / actions,
@@ -93,7 +93,7 @@ impl UpdateCost {
             heads: rows
                 * (passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
                     + passes.phi * learning(&["dim.phi3", "dim.phi4"])
-                    + own.sum::<u64>()),
+                    + loss_layers.sum::<u64>()),
             scores: 2 * products * matrices * rows * rows * model.embedding_dim as u64,
         }
     }

@@ -56,7 +56,7 @@ fn so_it_is_in_bf16() {
 fn a_broken_file_is_a_clear_error() {
     let folder = tempfile::tempdir().unwrap();
     let whole = fs::read(&cases()[0]).unwrap();
-    let says = |bytes: &[u8]| {
+    let error_of = |bytes: &[u8]| {
         let file = folder.path().join("broken.safetensors");
         fs::write(&file, bytes).unwrap();
         let error = check_file(&file, &Compute::CPU)
@@ -67,7 +67,7 @@ fn a_broken_file_is_a_clear_error() {
     };
     for length in [0, 5, 8, 1000, whole.len() / 2, whole.len() - 1] {
         assert!(
-            says(&whole[..length]).contains("not a whole safetensors file"),
+            error_of(&whole[..length]).contains("not a whole safetensors file"),
             "{length} bytes"
         );
     }
@@ -100,7 +100,7 @@ fn a_broken_file_is_a_clear_error() {
         let at = windows.position(|it| it == from.as_bytes()).unwrap();
         let mut broken = whole.clone();
         broken[at..at + to.len()].copy_from_slice(to.as_bytes());
-        let error = says(&broken);
+        let error = error_of(&broken);
         assert!(error.contains(said), "{from} as {to}: {error}");
     }
     let none = folder.path().join("none.safetensors");

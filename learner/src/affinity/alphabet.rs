@@ -77,7 +77,7 @@ impl Alphabet {
     }
 
     /// Maps pairs of raw actions to pairs of dense indices.
-    pub(super) fn map_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
+    pub(super) fn index_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
         let index = |action: u8| {
             let index = self.index.get(usize::from(action)).copied();
             let count = self.index.len();
@@ -88,7 +88,7 @@ impl Alphabet {
     }
 
     /// Expands a matrix [m, m] by dense indices to one [n, n] by raw actions.
-    pub(super) fn expand(&self, matrix: &[f64]) -> Vec<f32> {
+    pub(super) fn expand_matrix(&self, matrix: &[f64]) -> Vec<f32> {
         let entry = |&i: &u8, &j: &u8| matrix[usize::from(i) * self.len + usize::from(j)] as f32;
         let row = |i| self.index.iter().map(move |j| entry(i, j));
         self.index.iter().flat_map(row).collect()
@@ -104,10 +104,10 @@ mod tests {
         let alphabet = Alphabet::new(&[1, 1, 2, 4, 4]).unwrap();
         assert_eq!((alphabet.len(), alphabet.num_actions()), (3, 5));
         assert_eq!(
-            alphabet.map_pairs(&[(0, 2), (3, 1)]).unwrap(),
+            alphabet.index_pairs(&[(0, 2), (3, 1)]).unwrap(),
             [(0, 1), (2, 0)]
         );
-        let expanded = alphabet.expand(&[0.0, 1.0, 2.0, 10.0, 11.0, 12.0, 20.0, 21.0, 22.0]);
+        let expanded = alphabet.expand_matrix(&[0.0, 1.0, 2.0, 10.0, 11.0, 12.0, 20.0, 21.0, 22.0]);
         assert_eq!(expanded[..5], [0.0, 0.0, 1.0, 2.0, 2.0]);
         assert_eq!(expanded[20..], [20.0, 20.0, 21.0, 22.0, 22.0]);
     }

@@ -74,11 +74,11 @@ impl ExactAffinity {
 
     /// A by raw actions [n, n].
     pub(super) fn matrix(&self) -> Vec<f32> {
-        self.alphabet.expand(&self.ratios())
+        self.alphabet.expand_matrix(&self.ratios())
     }
 
     pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) -> Result<(), AffinityError> {
-        let pairs = self.alphabet.map_pairs(pairs)?;
+        let pairs = self.alphabet.index_pairs(pairs)?;
         if pairs.is_empty() {
             return Ok(());
         }
@@ -128,7 +128,7 @@ mod tests {
     use super::*;
     use crate::affinity::tests::EXACT;
 
-    fn of_15() -> ExactAffinity {
+    fn affinity_of_15() -> ExactAffinity {
         ExactAffinity::new(Alphabet::raw(15).unwrap(), EXACT).unwrap()
     }
 
@@ -136,7 +136,7 @@ mod tests {
     #[test]
     fn actions_that_tell_nothing_leave_a_uniform() {
         let uniform = |row: &[f32]| row.iter().all(|a| (a * 15.0 - 1.0).abs() < 1e-4);
-        let (mut always_1, mut odd_ones) = (of_15(), of_15());
+        let (mut always_1, mut odd_ones) = (affinity_of_15(), affinity_of_15());
         for _ in 0..100 {
             always_1.observe(&[(1, 1); 64]).unwrap();
             // Actions 1 and 3 are independent of each other; the even actions never occur.

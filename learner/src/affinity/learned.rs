@@ -116,7 +116,7 @@ impl LearnedAffinity {
 
     /// A by raw actions [n, n].
     pub(super) fn matrix(&self) -> Vec<f32> {
-        self.alphabet.expand(&self.smoothed)
+        self.alphabet.expand_matrix(&self.smoothed)
     }
 
     /// Takes one Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
@@ -127,7 +127,7 @@ impl LearnedAffinity {
         pairs: &[(u8, u8)],
         rng: &mut ChaCha8Rng,
     ) -> Result<(), AffinityError> {
-        let pairs = self.alphabet.map_pairs(pairs)?;
+        let pairs = self.alphabet.index_pairs(pairs)?;
         if pairs.is_empty() {
             return Ok(());
         }
@@ -258,7 +258,7 @@ mod tests {
         ..PRESET
     };
 
-    fn of_three_actions() -> (LearnedAffinity, ChaCha8Rng) {
+    fn learned_of_three_actions() -> (LearnedAffinity, ChaCha8Rng) {
         let (alphabet, mut rng) = (Alphabet::raw(3).unwrap(), ChaCha8Rng::seed_from_u64(3));
         let learned = LearnedAffinity::new(alphabet, SETTINGS, &mut rng);
         (learned.unwrap(), rng)
@@ -266,7 +266,7 @@ mod tests {
 
     #[test]
     fn the_gradient_is_the_slope() {
-        let (mut learned, mut rng) = of_three_actions();
+        let (mut learned, mut rng) = learned_of_three_actions();
         for parameter in &mut learned.parameters {
             *parameter = rng.random_range(-1.0..1.0);
         }
@@ -290,7 +290,7 @@ mod tests {
     #[test]
     fn updates_beyond_32_bits_are_counted() {
         let after = |updates| {
-            let (mut learned, mut rng) = of_three_actions();
+            let (mut learned, mut rng) = learned_of_three_actions();
             learned.updates = updates;
             for _ in 0..20 {
                 let pairs = [(0, 1), (1, 2), (2, 0)];

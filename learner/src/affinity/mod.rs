@@ -101,11 +101,11 @@ mod tests {
 
     /// A source of actions as skewed as a game's. It repeats its action with probability 0.3, and otherwise draws action j with a
     /// probability proportional to 0.7^j, which differs by a factor of 150 between the first and the 15th action.
-    struct Skewed {
+    struct SkewedSource {
         marginal: Vec<f64>,
     }
 
-    impl Skewed {
+    impl SkewedSource {
         const REPEATS: f64 = 0.3;
 
         fn new() -> Self {
@@ -153,7 +153,7 @@ mod tests {
         }
 
         /// P(k > i) for i = 1, .., K_MAX - 1 if k follows `matrix`, over the source's sequences of actions.
-        fn beyond(&self, matrix: &[f32]) -> Vec<f64> {
+        fn k_tail(&self, matrix: &[f32]) -> Vec<f64> {
             let mut alive = self.marginal.clone();
             let step = |alive: &[f64], to: usize| -> f64 {
                 let from = alive.iter().enumerate();
@@ -185,8 +185,8 @@ mod tests {
     /// updates say nothing about the agent.
     #[test]
     fn with_the_preset_s_numbers_learned_and_exact_come_to_the_source_s_law_of_k() {
-        let source = Skewed::new();
-        let truth = source.beyond(&source.matrix());
+        let source = SkewedSource::new();
+        let truth = source.k_tail(&source.matrix());
         for (batch, seed) in [(256, 4), (256, 5), (64, 4), (64, 5)] {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let alphabet = Alphabet::raw(ACTIONS).unwrap();
@@ -200,7 +200,7 @@ mod tests {
                     exact.observe(&pairs, &mut rng).unwrap();
                     learned.observe(&pairs, &mut rng).unwrap();
                 }
-                [&learned, &exact].map(|it| source.beyond(&it.matrix()))
+                [&learned, &exact].map(|it| source.k_tail(&it.matrix()))
             };
             let [learned, exact] = after(100);
             let after_100 = distance(&learned, &exact);

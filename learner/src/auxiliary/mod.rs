@@ -44,7 +44,7 @@ pub fn register(items: Vec<&'static MenuItem>) {
 }
 
 /// All items: the menu and the registered losses.
-fn all() -> impl Iterator<Item = &'static MenuItem> {
+fn all_items() -> impl Iterator<Item = &'static MenuItem> {
     MENU.iter()
         .chain(CUSTOM.get().into_iter().flatten())
         .copied()
@@ -113,9 +113,9 @@ impl TryFrom<String> for AuxiliaryKind {
     type Error = String;
 
     fn try_from(name: String) -> Result<Self, String> {
-        let item = all().find(|item| item.name == name);
+        let item = all_items().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
-            let known: Vec<_> = all().map(|item| format!("`{}`", item.name)).collect();
+            let known: Vec<_> = all_items().map(|item| format!("`{}`", item.name)).collect();
             format!(
                 "unknown variant `{name}`, expected one of {}",
                 known.join(", ")

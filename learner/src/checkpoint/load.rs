@@ -141,9 +141,8 @@ pub fn read_affinity(path: &Path) -> Result<Option<AffinityEstimator>, Checkpoin
 pub fn read_companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
     let state = read_state(path)?;
     let has_companion = state.sha256.contains_key(COMPANION);
-    has_companion
-        .then(|| read_verified(path, &state, COMPANION))
-        .transpose()
+    let companion = has_companion.then(|| read_verified(path, &state, COMPANION));
+    companion.transpose()
 }
 
 fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {

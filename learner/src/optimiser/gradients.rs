@@ -47,15 +47,15 @@ impl Gradients {
     pub fn norm(&self, kernels: Kernels) -> Result<f64, UpdateError> {
         let squares: Vec<f64> = match kernels {
             Kernels::Fused(_) => {
-                let each = self.by_name.values().map(squares_on_cpu);
-                each.collect::<Result<_, _>>()?
+                let per_tensor = self.by_name.values().map(squares_on_cpu);
+                per_tensor.collect::<Result<_, _>>()?
             }
             Kernels::Candle => {
                 let squares = |g: &Tensor| g.to_dtype(DType::F64)?.sqr()?.sum_all();
-                let each = self.by_name.values().map(squares);
-                let each = each.collect::<candle_core::Result<Vec<_>>>()?;
+                let per_tensor = self.by_name.values().map(squares);
+                let per_tensor = per_tensor.collect::<candle_core::Result<Vec<_>>>()?;
                 // One copy to the host, not one per parameter.
-                Tensor::stack(&each, 0)?.to_vec1()?
+                Tensor::stack(&per_tensor, 0)?.to_vec1()?
             }
         };
         let bad = self.by_name.keys().zip(&squares);

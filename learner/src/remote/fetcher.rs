@@ -28,11 +28,11 @@ use crate::run_counts::{BatchPart, RunCounts};
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause before a retry when the replay server is unreachable.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-
 /// Pause before empty shards are asked again.
 const EMPTY_SHARDS_PAUSE: Duration = Duration::from_millis(50);
 /// How long to wait for the last batch once all transitions are stored and no shard refills its memory.
 const LAST_BATCH_MAX: Duration = Duration::from_secs(30);
+
 /// What the threads request, for which learner, and how.
 #[derive(Clone, Copy, Debug)]
 pub struct Requests {

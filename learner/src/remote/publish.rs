@@ -115,9 +115,8 @@ impl Publisher {
         let mut queryables = Vec::new();
         for client in clients {
             let declared = status_queries.declare(client, PAYLOAD_BYTES_MAX, |_| ());
-            queryables.push(
-                declared.map_err(|e| anyhow::anyhow!("declaring the learner's status: {e}"))?,
-            );
+            let error = |e| anyhow::anyhow!("declaring the learner's status: {e}");
+            queryables.push(declared.map_err(error)?);
         }
         let this = Self {
             learner_id,

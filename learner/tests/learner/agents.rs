@@ -8,7 +8,7 @@ use driml_learner::{
 use driml_model::{Compute, ModelConfig};
 
 use crate::synthetic::{
-    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, check_says, made, model, random_batch, settings,
+    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, check_says, model, new_agent, random_batch, settings,
     values,
 };
 
@@ -18,7 +18,7 @@ pub(crate) const GLOBAL: Lambda = Lambda {
 };
 const POSITIVES: usize = 3;
 /// A loss that a program adds, whose keys are later states.
-const KEYS_OF_LATER: AuxiliaryKind = AuxiliaryKind::from_item(&MenuItem {
+const LATER_STATE_KEYS: AuxiliaryKind = AuxiliaryKind::from_item(&MenuItem {
     positives: Positives::One,
     ..CURL_ITEM
 });
@@ -34,12 +34,12 @@ pub(crate) fn curl_table(key_tau: Option<f64>) -> toml::Table {
 type Losses = Vec<(&'static str, f32)>;
 
 /// The only loss of an agent that has one.
-fn only(losses: &Losses) -> f32 {
+fn only_loss(losses: &Losses) -> f32 {
     assert_eq!(losses.len(), 1, "{losses:?}");
     losses[0].1
 }
 
-pub(crate) fn of(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, UpdateSettings) {
+pub(crate) fn configs(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, UpdateSettings) {
     let settings = UpdateSettings {
         auxiliary_loss: kind,
         condition_on_action: false,
@@ -54,12 +54,12 @@ pub(crate) fn of(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, UpdateSet
 }
 
 fn agent(kind: AuxiliaryKind, lambda: Lambda) -> Agent {
-    let (model, settings) = of(kind, lambda);
-    made(model, settings, &Compute::CPU, 1)
+    let (model, settings) = configs(kind, lambda);
+    new_agent(model, settings, &Compute::CPU, 1)
 }
 
 /// A batch of `rows` with `POSITIVES` positives per row.
-fn cpc<'a>(rows: &'a OwnedBatch, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
+fn cpc_batch<'a>(rows: &'a OwnedBatch, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
     Batch {
         positives: POSITIVES,
         states_k,
@@ -68,11 +68,11 @@ fn cpc<'a>(rows: &'a OwnedBatch, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'
     }
 }
 
-fn later(rows: &OwnedBatch) -> Vec<u8> {
+fn later_states(rows: &OwnedBatch) -> Vec<u8> {
     [&rows.states_t[..], &rows.states_k, &rows.states_n].concat()
 }
 
-fn curl(rows: &OwnedBatch) -> Batch<'_> {
+fn curl_batch(rows: &OwnedBatch) -> Batch<'_> {
     Batch {
         anchors: Some(&rows.states_k),
         states_k: &rows.states_n,
@@ -80,10 +80,10 @@ fn curl(rows: &OwnedBatch) -> Batch<'_> {
     }
 }
 
-/// `states` without the ones that are not `there`.
-fn packed(states: &[u8], there: impl ExactSizeIterator<Item = bool>) -> Vec<u8> {
-    let states = states.chunks_exact(states.len() / there.len());
-    let present = states.zip(there).filter(|(_, there)| *there);
+/// The `states` that are `present`.
+fn present_states(states: &[u8], present: impl ExactSizeIterator<Item = bool>) -> Vec<u8> {
+    let states = states.chunks_exact(states.len() / present.len());
+    let present = states.zip(present).filter(|(_, present)| *present);
     present.flat_map(|(state, _)| state.to_vec()).collect()
 }
 
@@ -93,7 +93,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         (AuxiliaryKind::NONE, NO_DIM),
         (DIM, ALL_DIM),
         (CPC, ALL_DIM),
-        (KEYS_OF_LATER, GLOBAL),
+        (LATER_STATE_KEYS, GLOBAL),
     ] {
         let mut rows = random_batch(6, 4);
         rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
@@ -103,17 +103,17 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         for row in [0, 2] {
             rows.states_k[row * len..][..len].fill(0);
         }
-        let several = later(&rows);
+        let several = later_states(&rows);
         let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
         let whole = if kind == CPC {
-            cpc(&rows, &several, &valid)
+            cpc_batch(&rows, &several, &valid)
         } else {
             rows.batch()
         };
         let valid = whole.positive_valid.iter().map(|it| *it != 0);
-        let states_k = packed(whole.states_k, valid);
+        let states_k = present_states(whole.states_k, valid);
         let bootstraps = whole.bootstrap_discount.iter().map(|it| *it != 0.0);
-        let states_n = packed(whole.states_n, bootstraps);
+        let states_n = present_states(whole.states_n, bootstraps);
         let parts = Batch {
             states_k: &states_k,
             states_n: &states_n,
@@ -144,13 +144,13 @@ fn states_that_rows_do_not_have_may_be_left_out() {
 #[test]
 fn without_two_positives_the_return_alone_is_learned() {
     let mut rows = random_batch(5, 5);
-    let states_k = later(&rows);
-    for there in 0..2 {
+    let states_k = later_states(&rows);
+    for valid_count in 0..2 {
         let mut valid = [0; 5 * POSITIVES];
-        valid[..there].fill(1);
+        valid[..valid_count].fill(1);
         rows.positive_valid = valid[..5].to_vec();
         for (kind, lambda, batch) in [
-            (CPC, GLOBAL, cpc(&rows, &states_k, &valid)),
+            (CPC, GLOBAL, cpc_batch(&rows, &states_k, &valid)),
             (DIM, ALL_DIM, rows.batch()),
         ] {
             let report = agent(kind, lambda).update(&batch).unwrap();
@@ -165,14 +165,15 @@ fn without_two_positives_the_return_alone_is_learned() {
 #[test]
 fn cpc_and_curl_bring_their_losses_down() {
     let rows = random_batch(16, 6);
-    let (states_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
-    for (kind, batch) in [(CPC, cpc(&rows, &states_k, &valid)), (CURL, curl(&rows))] {
+    let (states_k, valid) = (later_states(&rows), [1; 16 * POSITIVES]);
+    let cpc = cpc_batch(&rows, &states_k, &valid);
+    for (kind, batch) in [(CPC, cpc), (CURL, curl_batch(&rows))] {
         let mut agent = agent(kind, GLOBAL);
-        let first = only(&agent.update(&batch).unwrap().losses);
+        let first = only_loss(&agent.update(&batch).unwrap().losses);
         for _ in 0..80 {
             agent.update(&batch).unwrap();
         }
-        let last = only(&agent.update(&batch).unwrap().losses);
+        let last = only_loss(&agent.update(&batch).unwrap().losses);
         assert!(last < 0.7 * first, "{kind:?}: {first} to {last}");
     }
 }
@@ -181,27 +182,27 @@ fn cpc_and_curl_bring_their_losses_down() {
 fn curl_compares_its_views_and_not_the_state() {
     let rows = random_batch(8, 7);
     let agent = agent(CURL, GLOBAL);
-    let loss = |batch: &Batch<'_>| only(&agent.evaluate(batch).unwrap().losses);
-    let before = loss(&curl(&rows));
+    let loss = |batch: &Batch<'_>| only_loss(&agent.evaluate(batch).unwrap().losses);
+    let before = loss(&curl_batch(&rows));
     let mut other = rows.clone();
     other.states_t.fill(3);
-    assert_eq!(loss(&curl(&other)), before, "s_t itself");
+    assert_eq!(loss(&curl_batch(&other)), before, "s_t itself");
     // No row is masked: the end of an episode does not affect either view.
     other.positive_valid.fill(0);
-    assert_eq!(loss(&curl(&other)), before, "positive_valid");
+    assert_eq!(loss(&curl_batch(&other)), before, "positive_valid");
     other.states_k.fill(3);
-    assert_ne!(loss(&curl(&other)), before, "the query's view");
+    assert_ne!(loss(&curl_batch(&other)), before, "the query's view");
     let mut other = rows.clone();
     other.states_n = other.states_k.clone();
     let batch = Batch {
         states_n: &rows.states_n,
-        ..curl(&other)
+        ..curl_batch(&other)
     };
     assert_ne!(loss(&batch), before, "the key's view");
 }
 
 /// The entries of `values` whose names pass `part`.
-fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
+fn select(values: &Values, part: impl Fn(&str) -> bool) -> Values {
     let named = values.iter().filter(|(name, _)| part(name));
     named.map(|(name, v)| (name.clone(), v.clone())).collect()
 }
@@ -212,12 +213,12 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
     let mut agent = agent(CURL, GLOBAL);
     let key = |agent: &Agent| values(agent.key_encoder().unwrap());
     let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
-    let start = part_of(&values(agent.online()), encoder);
+    let start = select(&values(agent.online()), encoder);
     assert_eq!(key(&agent), start, "torso and psi_4, and nothing else");
     let mut average = start.clone();
     // The target network moves once, at the third update.
     for _ in 0..4 {
-        agent.update(&curl(&rows)).unwrap();
+        agent.update(&curl_batch(&rows)).unwrap();
         let online = values(agent.online());
         for (name, values) in &mut average {
             for (value, online) in values.iter_mut().zip(&online[name]) {
@@ -247,7 +248,7 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
         let mut agent = agent(kind, lambda);
         assert_eq!(agent.key_encoder().is_some(), kind == CURL);
         let online =
-            |agent: &Agent| part_of(&values(agent.online()), |name| !name.starts_with("dim."));
+            |agent: &Agent| select(&values(agent.online()), |name| !name.starts_with("dim."));
         let start = online(&agent);
         assert_eq!(values(agent.target()), start, "{kind:?}");
         let batch = match kind.name() {
@@ -257,7 +258,7 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
                 positive_valid: &[],
                 ..rows.batch()
             },
-            "curl" => curl(&rows),
+            "curl" => curl_batch(&rows),
             _ => rows.batch(),
         };
         for _ in 0..2 {
@@ -280,20 +281,20 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
 #[test]
 fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = random_batch(5, 9);
-    let (states_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
+    let (states_k, valid) = (later_states(&rows), [1; 5 * POSITIVES]);
     let refuses = |kind, batch: Batch<'_>, words: &str| {
         let error = agent(kind, GLOBAL).evaluate(&batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
         check_says(error, &[words]);
     };
-    let several = cpc(&rows, &states_k, &valid);
+    let several = cpc_batch(&rows, &states_k, &valid);
     refuses(DIM, several, "3 positives a row; this agent needs one");
     refuses(CURL, rows.batch(), "needs two views of each state");
-    let short = cpc(&rows, &states_k, &valid[1..]);
+    let short = cpc_batch(&rows, &states_k, &valid[1..]);
     refuses(CPC, short, "positive_valid");
     let short = Batch {
         anchors: Some(&states_k[..8]),
-        ..curl(&rows)
+        ..curl_batch(&rows)
     };
     refuses(CURL, short, "anchors");
 }

@@ -48,10 +48,10 @@ fn at_no_strength_every_byte_stays() {
         ((1, 1, 3), 3),
     ] {
         let states = noise(9 * size.0 * size.1 * size.2, 2);
-        let mut seen = Vec::new();
+        let mut augmented = Vec::new();
         let augment = Augmenter::new(NOTHING, size, frame_channels);
-        augment.apply(&states, &mut seen, &mut rng(3));
-        assert!(seen == states, "{size:?}");
+        augment.apply(&states, &mut augmented, &mut rng(3));
+        assert!(augmented == states, "{size:?}");
     }
 }
 
@@ -141,9 +141,9 @@ fn the_generator_alone_decides_and_rows_differ() {
     let state = noise(16 * 16 * 3, 9);
     let states = state.repeat(33);
     let applied = || {
-        let mut seen = vec![7; 3];
-        augment.apply(&states, &mut seen, &mut rng(1));
-        seen
+        let mut augmented = vec![7; 3];
+        augment.apply(&states, &mut augmented, &mut rng(1));
+        augmented
     };
     let first = applied();
     for threads in [1, 2, 5] {
@@ -154,12 +154,12 @@ fn the_generator_alone_decides_and_rows_differ() {
     different.dedup();
     assert_eq!(different.len(), 33, "each row has its own draw");
     // Each call continues the generator, and reused memory leaves no trace.
-    let (mut rng, mut seen) = (rng(1), vec![1; 7]);
+    let (mut rng, mut augmented) = (rng(1), vec![1; 7]);
     for rows in [20, 13] {
-        augment.apply(&states[..rows * state.len()], &mut seen, &mut rng);
-        assert_eq!(seen.len(), rows * state.len());
+        augment.apply(&states[..rows * state.len()], &mut augmented, &mut rng);
+        assert_eq!(augmented.len(), rows * state.len());
     }
-    assert!(seen == first[20 * state.len()..]);
+    assert!(augmented == first[20 * state.len()..]);
 }
 
 #[test]

@@ -18,14 +18,14 @@ use sha2::{Digest, Sha256};
 use tempfile::tempdir;
 
 use crate::synthetic::{
-    ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, check_says, made, model, random_batch,
+    ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, check_says, model, new_agent, random_batch,
     settings,
 };
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
 /// A learner's state before its first update, in a run with earlier learners.
-pub(crate) fn start() -> LearnerState {
+pub(crate) fn initial_state() -> LearnerState {
     let mut rng = ChaCha8Rng::seed_from_u64(99);
     let alphabet = Alphabet::raw(ACTIONS).unwrap();
     let affinity = LearnedAffinity::new(alphabet, LEARNED, &mut rng).unwrap();
@@ -74,12 +74,12 @@ fn resume(folder: &Path) -> LearnerState {
 }
 
 /// The updates of the checkpoints in `folder`.
-fn listed(folder: &Path) -> Vec<u64> {
+fn listed_updates(folder: &Path) -> Vec<u64> {
     let all = list(folder).unwrap();
     all.iter().map(|(updates, _)| *updates).collect()
 }
 
-fn bytes(run: &LearnerState) -> [Vec<u8>; 2] {
+fn network_bytes(run: &LearnerState) -> [Vec<u8>; 2] {
     let all = |parameters: &Parameters| parameters.to_safetensors(|_| true).unwrap();
     [all(run.agent.online()), all(run.agent.target())]
 }
@@ -127,7 +127,7 @@ pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value))
 #[test]
 fn a_checkpoint_of_another_network_says_which_setting_differs() {
     let folder = tempdir().unwrap();
-    let run = start();
+    let run = initial_state();
     let ours = model(ALL_DIM);
     let description = serde_json::json!({ "model": ours }).to_string();
     let path = try_save(&run, folder.path(), 1, &description).unwrap();
@@ -170,7 +170,7 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
         (&BF16, &Compute::CPU, rounded),
     ] {
         let folder = tempdir().unwrap();
-        let mut run = start();
+        let mut run = initial_state();
         run.agent = agent_on(saver, ALL_DIM, 1);
         learn(&mut run, 4);
         save(&run, folder.path(), 1);
@@ -201,14 +201,14 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
     let parent = tempdir().unwrap();
     let folder = parent.path().join("checkpoints");
     assert!(load(&folder).unwrap().is_none(), "no folder, no checkpoint");
-    let mut run = start();
+    let mut run = initial_state();
     for _ in 0..3 {
         learn(&mut run, 1);
         save(&run, &folder, 2);
     }
     save(&run, &folder, 2);
     fs::create_dir(folder.join("checkpoint-000000000009.tmp")).unwrap();
-    assert_eq!(listed(&folder), [2, 3]);
+    assert_eq!(listed_updates(&folder), [2, 3]);
     assert_eq!(load(&folder).unwrap().unwrap().agent.updates(), 3);
 }
 
@@ -219,11 +219,11 @@ fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
     // The removal works on folders only: this file is renamed like an unfinished save, but not removed.
     let stuck = folder.path().join("checkpoint-000000000000");
     fs::write(&stuck, "").unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     for updates in 1..=3 {
         learn(&mut run, 1);
         save(&run, folder.path(), 1);
-        let left = listed(folder.path());
+        let left = listed_updates(folder.path());
         assert_eq!(left, [updates], "no half of it passes for a checkpoint");
     }
 }
@@ -231,7 +231,7 @@ fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
 #[test]
 fn what_a_cut_off_save_left_is_gone_after_the_next() {
     let folder = tempdir().unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     learn(&mut run, 1);
     save(&run, folder.path(), 3);
     for name in ["checkpoint-000000000009.tmp", "checkpoint-000000000001.tmp"] {
@@ -240,29 +240,29 @@ fn what_a_cut_off_save_left_is_gone_after_the_next() {
     }
     learn(&mut run, 1);
     save(&run, folder.path(), 3);
-    assert_eq!(listed(folder.path()), [1, 2]);
+    assert_eq!(listed_updates(folder.path()), [1, 2]);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
 }
 
 #[test]
 fn a_checkpoint_is_there_while_it_is_replaced() {
     let folder = tempdir().unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     learn(&mut run, 1);
     let path = save(&run, folder.path(), 3);
     // A crash between the two renames.
     let replaced = folder.path().join("checkpoint-000000000001.replaced.tmp");
     fs::rename(&path, &replaced).unwrap();
-    assert_eq!(listed(folder.path()), [1]);
-    assert_eq!(bytes(&resume(folder.path())), bytes(&run));
+    assert_eq!(listed_updates(folder.path()), [1]);
+    assert_eq!(network_bytes(&resume(folder.path())), network_bytes(&run));
     // The next save gives the checkpoint its name back.
     learn(&mut run, 1);
     save(&run, folder.path(), 3);
-    assert_eq!(listed(folder.path()), [1, 2]);
+    assert_eq!(listed_updates(folder.path()), [1, 2]);
     assert!(path.exists() && !replaced.exists());
     // A crash after both renames.
     fs::create_dir(&replaced).unwrap();
-    assert_eq!(listed(folder.path()), [1, 2]);
+    assert_eq!(listed_updates(folder.path()), [1, 2]);
     save(&run, folder.path(), 3);
     assert!(!replaced.exists());
 }
@@ -270,7 +270,7 @@ fn a_checkpoint_is_there_while_it_is_replaced() {
 #[test]
 fn another_run_s_checkpoint_is_refused() {
     let folder = tempdir().unwrap();
-    save(&start(), folder.path(), 1);
+    save(&initial_state(), folder.path(), 1);
     let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
     let error = load_latest(folder.path(), &model, &settings, &Compute::CPU, SPEC + 1).unwrap_err();
     assert!(matches!(error, CheckpointError::OtherRun { .. }), "{error}");
@@ -291,7 +291,7 @@ fn one_learner_saves_in_a_folder() {
 #[test]
 fn the_networks_say_what_they_are_and_need_not() {
     let folder = tempdir().unwrap();
-    let run = start();
+    let run = initial_state();
     let path = save(&run, folder.path(), 1);
     for (name, description) in [
         ("online.safetensors", DESCRIPTION),
@@ -308,7 +308,7 @@ fn the_networks_say_what_they_are_and_need_not() {
     change_state(&path, |state| {
         state["sha256"]["online.safetensors"] = sha256(&bare).into()
     });
-    assert_eq!(bytes(&resume(folder.path())), bytes(&run));
+    assert_eq!(network_bytes(&resume(folder.path())), network_bytes(&run));
 }
 
 /// Compares the averaged weights with float64. The average does not affect learning.
@@ -316,10 +316,10 @@ fn the_networks_say_what_they_are_and_need_not() {
 fn averaged_weights_follow_and_are_saved_and_played() {
     const TAU: f64 = 0.25;
     let folder = tempdir().unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     let mut settings = run.agent.settings().clone();
     settings.average_tau = Some(TAU);
-    run.agent = made(model(ALL_DIM), settings.clone(), &Compute::CPU, 1);
+    run.agent = new_agent(model(ALL_DIM), settings.clone(), &Compute::CPU, 1);
     let values = |parameters: &Parameters| -> Vec<f64> {
         let all = parameters
             .iter()

@@ -11,15 +11,15 @@ use driml_model::Compute;
 use tempfile::tempdir;
 
 use crate::{
-    checkpoint::{DESCRIPTION, change_state, learn, load, save, sha256, start, try_save},
-    errors::diverged,
+    checkpoint::{DESCRIPTION, change_state, initial_state, learn, load, save, sha256, try_save},
+    errors::diverged_agent,
     synthetic::{ACTIONS, ALL_DIM, CANDLE, check_says, model},
 };
 
 #[test]
 fn every_kind_of_damage_is_reported_with_its_file() {
     let folder = tempdir().unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     learn(&mut run, 1);
     let description = serde_json::json!({ "model": model(ALL_DIM) }).to_string();
     let path = try_save(&run, folder.path(), 1, &description).unwrap();
@@ -68,7 +68,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
 #[test]
 fn a_checkpoint_of_another_format_is_rejected() {
     let folder = tempdir().unwrap();
-    let path = save(&start(), folder.path(), 1);
+    let path = save(&initial_state(), folder.path(), 1);
     for unknown in [0, 3, 5] {
         // Another format may have any other fields.
         change_state(&path, |state| {
@@ -84,10 +84,10 @@ fn a_checkpoint_of_another_format_is_rejected() {
 fn a_state_that_is_not_finite_is_not_saved() {
     for compute in [&Compute::CPU, &CANDLE] {
         let folder = tempdir().unwrap();
-        let mut run = start();
+        let mut run = initial_state();
         save(&run, folder.path(), 1);
         for name in ["head.bias", "dim.psi4.out.weight"] {
-            run.agent = diverged(compute, name).0;
+            run.agent = diverged_agent(compute, name).0;
             let said = try_save(&run, folder.path(), 1, DESCRIPTION);
             let said = said.unwrap_err().to_string();
             assert!(
@@ -109,7 +109,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
         smoothing: 1.0,
     };
     let exact = ExactAffinity::new(Alphabet::raw(ACTIONS).unwrap(), exact).unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     let learned = run.affinity.clone().unwrap();
     let refused = |run: &LearnerState, change: &dyn Fn(&mut serde_json::Value), said: &str| {
         let folder = tempdir().unwrap();
@@ -157,7 +157,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     }
     let huge = |state: &mut serde_json::Value| state["affinity"]["settings"]["decay"] = 2.into();
     refused(&run, &huge, "decay = 2");
-    run.affinity = start().affinity;
+    run.affinity = initial_state().affinity;
     for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
         let change =
             |state: &mut serde_json::Value| state["affinity"]["settings"][key] = value.into();
@@ -179,7 +179,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
 #[test]
 fn moments_that_no_optimiser_has_are_damage() {
     let folder = tempdir().unwrap();
-    let mut run = start();
+    let mut run = initial_state();
     learn(&mut run, 1);
     let path = save(&run, folder.path(), 1);
     let file = path.join("optimizer.safetensors");

@@ -4,7 +4,7 @@
 use driml_learner::{Compute, DeviceName, Precision};
 use driml_model::{ModelConfig, TorsoName};
 
-use crate::synthetic::{ALL_DIM, batch_of, made, model, settings};
+use crate::synthetic::{ALL_DIM, model, new_agent, random_batch_of, settings};
 
 /// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had its own stream, most
 /// updates after the first used states that had not arrived yet. Only large batches show this.
@@ -13,7 +13,7 @@ use crate::synthetic::{ALL_DIM, batch_of, made, model, settings};
 fn updates_on_a_gpu_follow_those_on_the_cpu() {
     let gpu = DeviceName::Cuda(0).open(Precision::F32).unwrap();
     let (height, width, input_channels) = (64, 64, 3);
-    let rows = batch_of(256, height * width * input_channels, 3);
+    let rows = random_batch_of(256, height * width * input_channels, 3);
     let totals = |compute: &Compute| {
         let model = ModelConfig {
             height,
@@ -24,7 +24,7 @@ fn updates_on_a_gpu_follow_those_on_the_cpu() {
             channels: vec![16, 32, 32],
             ..model(ALL_DIM)
         };
-        let mut agent = made(model, settings(ALL_DIM), compute, 1);
+        let mut agent = new_agent(model, settings(ALL_DIM), compute, 1);
         (0..10)
             .map(|_| agent.update(&rows.batch()).unwrap().total)
             .collect::<Vec<_>>()

@@ -6,14 +6,14 @@ use driml_model::Kernels;
 
 use crate::agents::{GLOBAL, curl_table};
 use crate::synthetic::{
-    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, made, model, pool, random_batch, settings,
+    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, model, new_agent, pool, random_batch, settings,
 };
 
 const ROWS: usize = 40;
 
 /// Losses, logits, next actions and targets of a batch, and its gradients.
 #[derive(PartialEq)]
-struct Found {
+struct UpdateResult {
     forward: (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>),
     gradients: Vec<(String, Vec<f32>)>,
 }
@@ -24,7 +24,7 @@ fn found(
     double_dqn: bool,
     deduplicate: bool,
     batch: &Batch<'_>,
-) -> Found {
+) -> UpdateResult {
     let mut settings = settings(lambda);
     (settings.auxiliary_loss, settings.double_dqn) = (auxiliary_loss, double_dqn);
     if auxiliary_loss == CURL {
@@ -33,7 +33,7 @@ fn found(
     }
     let mut model = model(lambda);
     model.dim = settings.dim_heads(model.num_actions);
-    let agent = made(model, settings, compute, 1).with_deduplication(deduplicate);
+    let agent = new_agent(model, settings, compute, 1).with_deduplication(deduplicate);
     let it = agent.evaluate(batch).unwrap();
     let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let names = agent.online().iter().map(|(name, _)| name);
@@ -44,7 +44,7 @@ fn found(
     losses.extend(&it.row_kls);
     let logits = values(&it.taken_logits);
     let forward = (losses, logits, it.next_greedy_action, it.target_projection);
-    Found { forward, gradients }
+    UpdateResult { forward, gradients }
 }
 
 /// Which columns hold states that repeat others.
@@ -56,7 +56,7 @@ enum Repeat {
 }
 
 /// Random rows. If states repeat, every third one is an earlier s_t, as when a scene stands still.
-fn rows(repeat: Repeat) -> OwnedBatch {
+fn rows_with(repeat: Repeat) -> OwnedBatch {
     let mut rows = random_batch(ROWS, 3);
     let len = rows.states_t.len() / ROWS;
     for row in (2..ROWS).step_by(3) {
@@ -93,7 +93,7 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
                 (Repeat::Everywhere, false, true),
                 (Repeat::Everywhere, true, false),
             ] {
-                let rows = rows(repeat);
+                let rows = rows_with(repeat);
                 let mut batch = rows.batch();
                 let weights: Vec<f32> = (1..=batch.rows).map(|row| 1.0 / row as f32).collect();
                 batch.importance_weight = is_weighted.then_some(&weights);
@@ -140,7 +140,7 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
 
 #[test]
 fn gradients_have_the_same_bits_for_any_number_of_threads() {
-    let rows = rows(Repeat::Everywhere);
+    let rows = rows_with(Repeat::Everywhere);
     let with_threads = |threads| {
         pool(threads).install(|| {
             let found = found(&Compute::CPU, (DIM, ALL_DIM), false, true, &rows.batch());
@@ -158,7 +158,7 @@ fn gradients_have_the_same_bits_for_any_number_of_threads() {
 #[test]
 fn candle_s_own_operations_compute_each_state() {
     assert_eq!(CANDLE.kernels, Kernels::Candle);
-    let rows = rows(Repeat::Everywhere);
+    let rows = rows_with(Repeat::Everywhere);
     let [each, once] = [false, true]
         .map(|deduplicate| found(&CANDLE, (DIM, ALL_DIM), false, deduplicate, &rows.batch()));
     assert!(each == once);

@@ -8,12 +8,12 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, changed, check_says, made, model, random_batch,
-    settings,
+    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, change_parameters, check_says, model, new_agent,
+    random_batch, settings,
 };
 
 /// Makes an update that fails, checks that every weight keeps its bits, and returns the error.
-fn refused(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
+fn failure(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
     let bits = |agent: &Agent| -> Vec<u32> {
         let all = agent.online().iter();
         all.flat_map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
@@ -31,16 +31,16 @@ fn refused(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
 fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
     let mut settings = settings(NO_DIM);
     settings.double_dqn = true;
-    let agent = made(model(NO_DIM), settings, &Compute::CPU, 16);
+    let agent = new_agent(model(NO_DIM), settings, &Compute::CPU, 16);
     // The features of black states depend on the biases alone.
-    let mut agent = changed(agent, |name, values| {
+    let mut agent = change_parameters(agent, |name, values| {
         if name.starts_with("torso") && name.ends_with("weight") {
             values.iter_mut().for_each(|v| *v = v.abs() * 1e15);
         }
     });
     let mut rows = random_batch(4, 18);
     rows.states_t.fill(0);
-    let error = refused(&mut agent, &rows.batch());
+    let error = failure(&mut agent, &rows.batch());
     check_says(error, &["the online network's value of an s_{t+n}"]);
 }
 
@@ -50,7 +50,7 @@ fn a_target_network_that_overflows_is_an_error_that_changes_nothing() {
     let weight = agent.target().get("torso.conv1.weight").unwrap();
     let large = Tensor::full(1e38f32, weight.dims(), &Device::Cpu).unwrap();
     weight.set(&large).unwrap();
-    check_says(refused(&mut agent, &rows.batch()), &["target network"]);
+    check_says(failure(&mut agent, &rows.batch()), &["target network"]);
 }
 
 #[test]
@@ -59,7 +59,7 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
     let mut says = |change: fn(&mut OwnedBatch), said: &str| {
         let mut rows = good.clone();
         change(&mut rows);
-        let error = refused(&mut agent, &rows.batch());
+        let error = failure(&mut agent, &rows.batch());
         assert!(matches!(error, UpdateError::Batch(_)), "{error}");
         check_says(error, &[said]);
     };
@@ -85,12 +85,12 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
         (&Compute::CPU, "dim.phi4.hidden.bias"),
         (&CANDLE, "head.bias"),
     ] {
-        let mut agent = changed(agent_on(compute, ALL_DIM, 22), |name, values| {
+        let mut agent = change_parameters(agent_on(compute, ALL_DIM, 22), |name, values| {
             if name == poisoned {
                 values[0] = f32::NAN;
             }
         });
-        let error = refused(&mut agent, &rows.batch());
+        let error = failure(&mut agent, &rows.batch());
         assert!(
             matches!(error, UpdateError::NonFinite { .. }),
             "{poisoned}: {error}"
@@ -99,46 +99,46 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
 }
 
 /// An agent with the learning rate `lr`.
-fn fast(compute: &Compute, lr: f64) -> Agent {
+fn agent_with_lr(compute: &Compute, lr: f64) -> Agent {
     let mut settings = settings(ALL_DIM);
     settings.adam.lr = lr;
-    made(model(ALL_DIM), settings, compute, 1)
+    new_agent(model(ALL_DIM), settings, compute, 1)
 }
 
 #[test]
 fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
     for compute in [&Compute::CPU, &CANDLE] {
-        let mut agent = fast(compute, 1e38);
-        let error = refused(&mut agent, &random_batch(6, 30).batch());
+        let mut agent = agent_with_lr(compute, 1e38);
+        let error = failure(&mut agent, &random_batch(6, 30).batch());
         check_says(error, &["a step of Adam with lr = 1e38 is not finite"]);
         agent.weights().unwrap();
     }
 }
 
 /// An agent whose parameter `name` became infinite in its last step, and the result of that step.
-pub(crate) fn diverged(compute: &Compute, name: &str) -> (Agent, Result<f64, UpdateError>) {
-    let mut agent = fast(compute, 3e37);
+pub(crate) fn diverged_agent(compute: &Compute, name: &str) -> (Agent, Result<f64, UpdateError>) {
+    let mut agent = agent_with_lr(compute, 3e37);
     let evaluation = agent.evaluate(&random_batch(6, 31).batch()).unwrap();
     let gradient = evaluation.gradients.get(name).unwrap();
     // The largest finite numbers, so that the next step overflows.
     let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);
     let var = agent.online().get(name).unwrap();
     var.set(&direction.unwrap()).unwrap();
-    let said = agent.apply(&evaluation.gradients);
-    (agent, said)
+    let result = agent.apply(&evaluation.gradients);
+    (agent, result)
 }
 
 #[test]
 fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
     for name in ["torso.conv1.weight", "torso.fc.bias", "head.weight"] {
-        let (agent, said) = diverged(&Compute::CPU, name);
+        let (agent, said) = diverged_agent(&Compute::CPU, name);
         let said = said.unwrap_err();
         assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
         let beyond = format!("update 1 took {name} beyond");
         check_says(said, &[&beyond, "newest checkpoint"]);
         check_says(agent.weights().unwrap_err(), &[name, "inf"]);
         // With candle's operations, the error shows only when the weights are exported.
-        let (agent, said) = diverged(&CANDLE, name);
+        let (agent, said) = diverged_agent(&CANDLE, name);
         said.unwrap();
         check_says(agent.weights().unwrap_err(), &[name, "inf"]);
     }

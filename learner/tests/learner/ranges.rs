@@ -20,7 +20,7 @@ adam.eps      : 0.0 1e-46 1e-30 1e39           : 1e-15 1e-8 1.0
 ";
 
 /// Settings with one of them changed.
-fn with(name: &str, value: f64) -> UpdateSettings {
+fn with_value(name: &str, value: f64) -> UpdateSettings {
     let mut all = toml::Table::try_from(settings(ALL_DIM)).unwrap();
     let (table, key) = match name.split_once('.') {
         Some((table, key)) => (all[table].as_table_mut().unwrap(), key),
@@ -38,12 +38,12 @@ fn what_float32_does_not_hold_is_refused_by_name() {
         };
         let name = name.trim();
         for value in format!("{refused} NaN inf -inf").split_whitespace() {
-            let settings = with(name, value.parse().unwrap());
+            let settings = with_value(name, value.parse().unwrap());
             let said = settings.validate().expect_err(line).to_string();
             assert!(said.starts_with(&format!("{name} = ")), "{value}: {said}");
         }
         for value in taken.split_whitespace() {
-            with(name, value.parse().unwrap()).validate().unwrap();
+            with_value(name, value.parse().unwrap()).validate().unwrap();
         }
     }
 }

@@ -28,7 +28,7 @@ pub(crate) fn config(
     auxiliary_loss: AuxiliaryKind,
     augment: Option<AugmentSettings>,
 ) -> LearnerConfig {
-    let (model, update) = agents::of(auxiliary_loss, agents::GLOBAL);
+    let (model, update) = agents::configs(auxiliary_loss, agents::GLOBAL);
     let horizon = match auxiliary_loss.name() {
         "cpc" => Horizon::All { k_max: 3 },
         "dim" => Horizon::Fixed { k: 1 },
@@ -74,7 +74,7 @@ pub(crate) fn config(
     }
 }
 
-fn made(config: &LearnerConfig) -> Learner {
+fn new_learner(config: &LearnerConfig) -> Learner {
     Learner::new(config.clone(), &Compute::CPU).unwrap()
 }
 
@@ -118,7 +118,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
     for auxiliary_loss in [DIM, CPC] {
         let report = |augment| {
             let config = config(auxiliary_loss, augment);
-            made(&config).update(&served(&config, 1)).unwrap()
+            new_learner(&config).update(&served(&config, 1)).unwrap()
         };
         let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(PAPER)));
         // The augmented states add rows to the pass, so the sum of gradients may round differently.
@@ -155,9 +155,9 @@ fn an_augmenting_run_resumes_bit_for_bit() {
                 learner.update(&served(&config, seed)).unwrap();
             }
         };
-        let mut straight = made(&config);
+        let mut straight = new_learner(&config);
         learn(&mut straight, 0..8);
-        let mut half = made(&config);
+        let mut half = new_learner(&config);
         learn(&mut half, 0..4);
         half.save(folder.path()).unwrap();
         let mut resumed = Learner::resume(config.clone(), &Compute::CPU, folder.path()).unwrap();
@@ -189,7 +189,7 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
     let folder = tempdir().unwrap();
     let config = config(CURL, Some(PAPER));
-    made(&config).save(folder.path()).unwrap();
+    new_learner(&config).save(folder.path()).unwrap();
     let path = folder.path().join("checkpoint-000000000000");
     let resume = || Learner::resume(config.clone(), &Compute::CPU, folder.path()).map(|_| ());
     resume().unwrap();
@@ -204,10 +204,10 @@ fn a_refused_batch_draws_nothing() {
     let config = config(CURL, Some(PAPER));
     let good = served(&config, 1);
     let bad = served_with(&config, 2, |rows| rows[0].action = 77);
-    let mut learner = made(&config);
+    let mut learner = new_learner(&config);
     assert!(learner.update(&bad).is_err());
     let after = learner.update(&good).unwrap();
-    assert_eq!(after, made(&config).update(&good).unwrap());
+    assert_eq!(after, new_learner(&config).update(&good).unwrap());
 }
 
 #[test]
@@ -244,17 +244,17 @@ fn rows_drawn_by_priority_are_weighted_and_answered() {
         batch.set_draws(&draws);
         batch
     };
-    let plain = made(&uniform).update(&served(&uniform, 1)).unwrap();
+    let plain = new_learner(&uniform).update(&served(&uniform, 1)).unwrap();
     assert!(plain.row_kls.is_empty());
 
     // Equal probabilities give each row a weight of 1.
-    let mut equal = made(&config);
+    let mut equal = new_learner(&config);
     let report = equal.update(&drawn(&[0.25; 6])).unwrap();
     assert_eq!(report.losses, plain.losses);
     assert!((report.c51_kl - plain.c51_kl).abs() < 1e-6 * plain.c51_kl);
     assert!((report.grad_norm - plain.grad_norm).abs() < 1e-5 * plain.grad_norm);
 
-    let mut learner = made(&config);
+    let mut learner = new_learner(&config);
     for (update, beta) in [0.5, 1.0, 1.0].into_iter().enumerate() {
         let report = learner.update(&drawn(&chances)).unwrap();
         let weighted = chances.iter().zip(&report.row_kls).map(|(chance, kl)| {

@@ -82,7 +82,7 @@ pub(crate) fn settings(lambda: Lambda) -> UpdateSettings {
     }
 }
 
-pub(crate) fn made(
+pub(crate) fn new_agent(
     model: ModelConfig,
     settings: UpdateSettings,
     compute: &Compute,
@@ -97,7 +97,7 @@ pub(crate) fn agent(lambda: Lambda, seed: u64) -> Agent {
 }
 
 pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
-    made(model(lambda), settings(lambda), compute, seed)
+    new_agent(model(lambda), settings(lambda), compute, seed)
 }
 
 /// An agent with the given head.
@@ -106,18 +106,18 @@ pub(crate) fn agent_with(head: HeadConfig, settings: UpdateSettings, seed: u64) 
         head,
         ..model(settings.lambda)
     };
-    made(model, settings, &Compute::CPU, seed)
+    new_agent(model, settings, &Compute::CPU, seed)
 }
 
 /// The operations of a GPU, on the CPU.
 pub(crate) const CANDLE: Compute = REFERENCE;
 
 pub(crate) fn random_batch(rows: usize, seed: u64) -> OwnedBatch {
-    batch_of(rows, 20 * 24 * 2, seed)
+    random_batch_of(rows, 20 * 24 * 2, seed)
 }
 
 /// A random batch with states of `frame_len` bytes.
-pub(crate) fn batch_of(rows: usize, frame_len: usize, seed: u64) -> OwnedBatch {
+pub(crate) fn random_batch_of(rows: usize, frame_len: usize, seed: u64) -> OwnedBatch {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut states = || -> Vec<u8> { (0..rows * frame_len).map(|_| rng.random()).collect() };
     let [states_t, states_k, states_n] = [states(), states(), states()];
@@ -165,7 +165,7 @@ pub(crate) fn check_says(error: impl Display, all: &[&str]) {
 }
 
 /// Changes the agent's online parameters in place, and returns the agent.
-pub(crate) fn changed(agent: Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
+pub(crate) fn change_parameters(agent: Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
     for (name, var) in agent.online().iter() {
         let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
         change(name, &mut values);

@@ -7,8 +7,8 @@ use driml_model::{Compute, HeadConfig, Parameters};
 use driml_protocol::NO_ACTION;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, agent_with, changed, check_says, made, model,
-    random_batch, settings, values,
+    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, agent_with, change_parameters, check_says, model,
+    new_agent, random_batch, settings, values,
 };
 
 #[test]
@@ -58,9 +58,9 @@ fn double_dqn_chooses_by_the_online_network() {
     let mut chosen = Vec::new();
     for double_dqn in [false, true] {
         settings.double_dqn = double_dqn;
-        let agent = made(model(NO_DIM), settings.clone(), &Compute::CPU, 16);
+        let agent = new_agent(model(NO_DIM), settings.clone(), &Compute::CPU, 16);
         // Only the online network prefers action 2.
-        let agent = changed(agent, |name, values| {
+        let agent = change_parameters(agent, |name, values| {
             if name == "head.bias" {
                 values[2 * 21 + 20] += 50.0;
             }
@@ -119,7 +119,7 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
     for (layer, kernel) in model.conv.iter_mut().zip([4, 3]) {
         (layer.kernel, layer.stride) = (kernel, 2);
     }
-    let agent = made(model, settings(NO_DIM), &CANDLE, 1);
+    let agent = new_agent(model, settings(NO_DIM), &CANDLE, 1);
     let evaluation = agent.evaluate(&random_batch(4, 1).batch()).unwrap();
     for (name, _) in agent.online().iter() {
         assert!(
