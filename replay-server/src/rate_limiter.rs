@@ -16,11 +16,11 @@ use crate::config::Config;
 #[derive(Clone, Debug)]
 pub struct RateLimiter {
     config: Config,
-    pub(crate) counts: Counts,
+    pub(crate) counts: LimiterCounts,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Counts {
+pub(crate) struct LimiterCounts {
     pub(crate) this_shard: ShardCounts,
     /// The counts of the other shards, as the learner last reported them.
     pub(crate) other_shards: ShardCounts,
@@ -35,13 +35,13 @@ impl RateLimiter {
     pub fn new(config: &Config) -> Self {
         Self {
             config: config.clone(),
-            counts: Counts::default(),
+            counts: LimiterCounts::default(),
         }
     }
 
     /// Sets the counts of this shard and of the other shards.
     #[must_use]
-    pub const fn counting_on(mut self, this_shard: ShardCounts, other_shards: ShardCounts) -> Self {
+    pub const fn with_counts(mut self, this_shard: ShardCounts, other_shards: ShardCounts) -> Self {
         (self.counts.this_shard, self.counts.other_shards) = (this_shard, other_shards);
         self
     }
@@ -65,10 +65,10 @@ impl RateLimiter {
         // Tolerance for transitions that a shard stores before the others report.
         let held_max = self.config.capacity_transitions;
         let max = self.config.transitions_max.unwrap_or(u64::MAX);
-        let most = max.max(before.inserted).saturating_add(held_max);
-        if others.inserted > most {
+        let inserted_max = max.max(before.inserted).saturating_add(held_max);
+        if others.inserted > inserted_max {
             return Err(format!(
-                "the other shards' count of stored transitions is {}; this run has at most {most}",
+                "the other shards' count of stored transitions is {}; this run has at most {inserted_max}",
                 others.inserted
             ));
         }
@@ -77,12 +77,12 @@ impl RateLimiter {
         let inserted = inserted.saturating_add(self.counts.this_shard.inserted);
         let start = self.config.ratio_start();
         let allowed = start.rows as f64 + self.config.replay_ratio * inserted as f64;
-        let ahead = self.config.slack_transitions.saturating_add(held_max) as f64
+        let slack_rows = self.config.slack_transitions.saturating_add(held_max) as f64
             * self.config.replay_ratio;
-        let most_rows = allowed.max(before.rows_sampled as f64) + ahead;
-        if others.rows_sampled as f64 > most_rows {
+        let rows_max = allowed.max(before.rows_sampled as f64) + slack_rows;
+        if others.rows_sampled as f64 > rows_max {
             return Err(format!(
-                "the other shards' count of sampled rows is {}; for {inserted} transitions a run samples at most {most_rows:.0}",
+                "the other shards' count of sampled rows is {}; for {inserted} transitions a run samples at most {rows_max:.0}",
                 others.rows_sampled
             ));
         }
@@ -102,7 +102,7 @@ impl RateLimiter {
     pub fn may_insert(&self) -> bool {
         let is_ahead =
             self.credit() > self.config.slack_transitions as f64 * self.config.replay_ratio;
-        !self.all_in() && (self.counts.refill_left > 0 || !is_ahead)
+        !self.all_stored() && (self.counts.refill_left > 0 || !is_ahead)
     }
 
     /// Whether `rows` rows may be sampled now.
@@ -113,14 +113,14 @@ impl RateLimiter {
     }
 
     /// Whether all transitions of the run are stored.
-    pub fn all_in(&self) -> bool {
+    pub fn all_stored(&self) -> bool {
         let max = self.config.transitions_max;
         self.counts.refill_left == 0 && max.is_some_and(|max| self.inserted_total() >= max)
     }
 
     /// Whether all transitions are stored and no further batch of `rows` rows is allowed.
-    pub fn finished(&self, rows: u32) -> bool {
-        self.all_in() && !self.may_sample(rows)
+    pub fn is_finished(&self, rows: u32) -> bool {
+        self.all_stored() && !self.may_sample(rows)
     }
 
     /// Returns the maximum rows of one request. With more, both sides could wait for each other.
@@ -129,7 +129,7 @@ impl RateLimiter {
     }
 
     /// Counts `transitions` stored.
-    pub fn inserted(&mut self, transitions: u64) {
+    pub fn count_inserted(&mut self, transitions: u64) {
         let counts = &mut self.counts;
         let refilled = transitions.min(counts.refill_left);
         counts.refill_left -= refilled;
@@ -138,7 +138,7 @@ impl RateLimiter {
     }
 
     /// Counts `rows` sampled.
-    pub fn sampled(&mut self, rows: u32) {
+    pub fn count_sampled(&mut self, rows: u32) {
         debug_assert!(self.may_sample(rows), "{rows} rows beyond the replay ratio");
         self.counts.this_shard.rows_sampled += u64::from(rows);
     }
@@ -151,9 +151,9 @@ impl RateLimiter {
 
     /// Resumes a run after the counts `counted` of this shard with an empty ring: `refill` transitions must be stored before the next row
     /// is sampled, unless the run has no batch of `rows` rows left to sample.
-    pub(crate) fn resume_empty(&mut self, counted: ShardCounts, refill: u64, rows: u32) {
+    pub(crate) fn resume_with_refill(&mut self, counted: ShardCounts, refill: u64, rows: u32) {
         self.counts.this_shard = counted;
-        if !self.finished(rows) {
+        if !self.is_finished(rows) {
             self.counts.refill_left = refill;
         }
     }
@@ -170,13 +170,13 @@ impl RateLimiter {
             0 => (self.inserted_total(), self.config.warmup_transitions),
             left => (refilled, refilled + left),
         };
-        if self.finished(rows) {
+        if self.is_finished(rows) {
             Waiting::Finished
         } else if have < need {
             Waiting::WarmUp { have, need }
         } else if !self.may_sample(rows) {
             Waiting::LearnerWaitsForActors
-        } else if !self.may_insert() && !self.all_in() {
+        } else if !self.may_insert() && !self.all_stored() {
             Waiting::ActorsWaitForLearner
         } else {
             Waiting::Neither

@@ -117,7 +117,7 @@ impl Server {
             server.lossy(|replay| replay.insert(&chunk))
         });
         self.answer::<ChunkPoll>(endpoint, |server, poll, _| {
-            server.lossy(|replay| replay.poll(&poll).expect("nothing is parked here"))
+            server.lossy(|replay| replay.answer_poll(&poll).expect("nothing is parked here"))
         });
         self.answer::<Leave>(endpoint, |server, leave, _| {
             let mut leaves = server.leaves.lock().unwrap();

@@ -25,7 +25,7 @@ pub(crate) struct Stream {
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct Count {
+struct IncarnationState {
     incarnation: u64,
     /// Transitions that this incarnation has produced, by its last report.
     produced: u64,
@@ -34,16 +34,16 @@ struct Count {
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Actor {
-    current: Count,
+    current: IncarnationState,
     /// Sequence number of the next chunk of the current incarnation.
     expected: u64,
     streams: Vec<Stream>,
-    past: VecDeque<Count>,
+    past: VecDeque<IncarnationState>,
     /// Number of incarnations before the current one, including those no longer in `past`.
     earlier_incarnations: u32,
     /// Sequence number of a chunk that came after a restart of the server although chunks before it are missing.
     #[serde(skip)]
-    insisted: Option<u64>,
+    gap_sequence: Option<u64>,
 }
 
 impl Actor {
@@ -58,7 +58,7 @@ impl Actor {
 }
 
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum ChunkOrder {
     /// The next chunk of its actor: store it.
     Next,
     /// A copy of a chunk that is already stored.
@@ -98,9 +98,9 @@ impl Actors {
     /// Too many actors, or an incarnation that another one has replaced, is an error: the reason, for a person.
     pub(crate) fn join(&mut self, join: ActorJoin) -> Result<u32, String> {
         let ActorJoin { actor, incarnation } = join;
-        let current = Count {
+        let current = IncarnationState {
             incarnation,
-            ..Count::default()
+            ..IncarnationState::default()
         };
         if !self.actors.contains_key(&actor) && self.actors.len() >= ACTORS_MAX {
             return Err(format!(
@@ -115,14 +115,14 @@ impl Actors {
             return Ok(known.earlier_incarnations);
         }
         if known.is_past(incarnation) {
-            return Err(replaced(actor));
+            return Err(replaced_error(actor));
         }
         if known.past.len() == PAST_INCARNATIONS_MAX {
             known.past.pop_front();
         }
         known.past.push_back(known.current);
         known.earlier_incarnations = known.earlier_incarnations.saturating_add(1);
-        (known.current, known.expected, known.insisted) = (current, 0, None);
+        (known.current, known.expected, known.gap_sequence) = (current, 0, None);
         known.streams.clear();
         Ok(known.earlier_incarnations)
     }
@@ -133,10 +133,10 @@ impl Actors {
     }
 
     /// Returns the actor, if `incarnation` is its current one.
-    fn living(&self, actor: u32, incarnation: u64) -> Result<&Actor, String> {
+    fn current_actor(&self, actor: u32, incarnation: u64) -> Result<&Actor, String> {
         match self.actors.get(&actor) {
             Some(known) if known.current.incarnation == incarnation => Ok(known),
-            Some(known) if known.is_past(incarnation) => Err(replaced(actor)),
+            Some(known) if known.is_past(incarnation) => Err(replaced_error(actor)),
             _ => Err(format!(
                 "this replay server does not know this life of actor {actor}: it was started anew since the actor joined, \
                  and what it held is gone; start the actor again"
@@ -145,9 +145,9 @@ impl Actors {
     }
 
     /// Judges a chunk without changing any state. An error says why the chunk must never be stored.
-    pub(crate) fn judge(&self, header: &ChunkHeader) -> Result<Verdict, String> {
+    pub(crate) fn chunk_order(&self, header: &ChunkHeader) -> Result<ChunkOrder, String> {
         let (number, streams) = (header.actor, header.streams);
-        let actor = self.living(number, header.incarnation)?;
+        let actor = self.current_actor(number, header.incarnation)?;
         if streams > STREAMS_MAX {
             return Err(format!(
                 "{streams} streams in one chunk; an actor has at most {STREAMS_MAX}"
@@ -155,13 +155,13 @@ impl Actors {
         }
         let expected = actor.expected;
         if header.sequence < expected {
-            return Ok(Verdict::Retried);
+            return Ok(ChunkOrder::Retried);
         }
         if actor.current.has_left {
             return Err(format!("actor {number} left before it sent this chunk"));
         }
         if header.sequence > expected {
-            return Ok(Verdict::OutOfOrder { expected });
+            return Ok(ChunkOrder::OutOfOrder { expected });
         }
         if header.sequence > 0 && !actor.fits(header) {
             return Err(format!(
@@ -169,12 +169,12 @@ impl Actors {
                 actor.streams.len()
             ));
         }
-        Ok(Verdict::Next)
+        Ok(ChunkOrder::Next)
     }
 
     /// Checks that a chunk can be counted: its incarnation is current, and its number of streams fits. The error says why not.
-    pub(crate) fn check_known(&self, header: &ChunkHeader) -> Result<(), String> {
-        let actor = self.living(header.actor, header.incarnation)?;
+    pub(crate) fn check_sender(&self, header: &ChunkHeader) -> Result<(), String> {
+        let actor = self.current_actor(header.actor, header.incarnation)?;
         if header.sequence == 0 || actor.fits(header) {
             return Ok(());
         }
@@ -186,19 +186,19 @@ impl Actors {
     /// them in a power cut, so that they will never come again.
     ///
     /// An actor that repeats the same chunk, although the reply named the expected one, has no older chunk left.
-    pub(crate) fn insists(&mut self, header: &ChunkHeader) -> bool {
+    pub(crate) fn accepts_gap(&mut self, header: &ChunkHeader) -> bool {
         let actor = self.actors.get_mut(&header.actor);
         actor.is_some_and(|actor| {
             self.restored
                 && actor.fits(header)
-                && actor.insisted.replace(header.sequence) == Some(header.sequence)
+                && actor.gap_sequence.replace(header.sequence) == Some(header.sequence)
         })
     }
 
     /// Unlinks each stream whose last transition is `first_lost` or later, as these transitions are gone.
-    pub(crate) fn cut_streams(&mut self, first_lost: u64) {
+    pub(crate) fn unlink_streams(&mut self, first_lost: u64) {
         for stream in self.actors.values_mut().flat_map(|it| &mut it.streams) {
-            stream.link = stream.link.without(first_lost);
+            stream.link = stream.link.cut_at(first_lost);
         }
     }
 
@@ -212,7 +212,7 @@ impl Actors {
         // A transition has at most one successor.
         let mut followed = BTreeSet::new();
         let streams = self.actors.values().flat_map(|it| &it.streams);
-        let mut after = streams.filter_map(|it| it.link.after());
+        let mut after = streams.filter_map(|it| it.link.previous());
         match after.all(|after| after < inserted && followed.insert(after)) {
             true => Ok(()),
             false => Err("a state with streams that follow on nothing"),
@@ -220,14 +220,14 @@ impl Actors {
     }
 
     /// Returns the actors that have delivered a chunk, or had an earlier incarnation.
-    pub(crate) fn delivered(&self) -> impl Iterator<Item = u32> {
+    pub(crate) fn acting(&self) -> impl Iterator<Item = u32> {
         let all = self.actors.iter();
-        let delivered = all.filter(|(_, it)| it.expected > 0 || it.earlier_incarnations > 0);
-        delivered.map(|(&number, _)| number)
+        let acting = all.filter(|(_, it)| it.expected > 0 || it.earlier_incarnations > 0);
+        acting.map(|(&number, _)| number)
     }
 
     pub(crate) fn is_stored(&self, poll: &ChunkPoll) -> Result<bool, String> {
-        let actor = self.living(poll.actor, poll.incarnation)?;
+        let actor = self.current_actor(poll.actor, poll.incarnation)?;
         Ok(poll.sequence < actor.expected)
     }
 
@@ -253,7 +253,7 @@ impl Actors {
             });
         }
         actor.expected = header.sequence + 1;
-        actor.insisted = None;
+        actor.gap_sequence = None;
         actor.current.produced = header.first_transition + header.transitions() as u64;
         (&mut actor.streams, difference)
     }
@@ -263,25 +263,25 @@ impl Actors {
     pub(crate) fn leave(&mut self, leave: &Leave) -> Result<Option<Difference>, String> {
         let (actor, produced) = (leave.actor, leave.produced);
         let known = self.actors.get_mut(&actor).into_iter();
-        let mut lives = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
-        let life = lives.find(|life| life.incarnation == leave.incarnation);
-        let life = life.ok_or_else(|| format!("no such life of actor {actor} has joined"))?;
-        if std::mem::replace(&mut life.has_left, true) {
+        let mut states = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
+        let state = states.find(|it| it.incarnation == leave.incarnation);
+        let state = state.ok_or_else(|| format!("no such life of actor {actor} has joined"))?;
+        if std::mem::replace(&mut state.has_left, true) {
             return Ok(None);
         }
-        let stored = std::mem::replace(&mut life.produced, produced);
+        let stored = std::mem::replace(&mut state.produced, produced);
         Ok(Some(Difference::between(produced, stored)))
     }
 
-    pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+    pub(crate) fn forgettable(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
         if self.actors.len() < ACTORS_MAX {
             return Vec::new();
         }
-        let absent = self.actors.iter().filter(|&(&number, actor)| {
+        let forgettable = self.actors.iter().filter(|&(&number, actor)| {
             let has_sent = actor.expected > 0 || !actor.past.is_empty();
             !has_sent && !is_connected(number, actor.current.incarnation)
         });
-        absent.map(|(&number, _)| number).collect()
+        forgettable.map(|(&number, _)| number).collect()
     }
 
     pub(crate) fn forget(&mut self, actors: &[u32]) {
@@ -291,7 +291,7 @@ impl Actors {
     }
 }
 
-fn replaced(actor: u32) -> String {
+fn replaced_error(actor: u32) -> String {
     format!(
         "another process has joined as actor {actor} since this one did: give each actor another number (--id)"
     )

@@ -10,7 +10,7 @@ const CLIENTS_MAX: usize = 1024;
 
 /// The last request of each client, the oldest request first.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Requests {
+pub(crate) struct LastRequests {
     last: VecDeque<Request>,
 }
 
@@ -18,16 +18,16 @@ pub(crate) struct Requests {
 struct Request {
     id: RequestId,
     /// The k of each row that the request was given; `None` before.
-    given: Option<Vec<u32>>,
+    ks: Option<Vec<u32>>,
 }
 
-impl Requests {
+impl LastRequests {
     /// Registers a request; it may be repeated until it is given rows. Returns the k of the rows that an earlier attempt was given and that
     /// did not arrive. `None` if the request was already answered, or its client has sent a later attempt or request since.
     pub(crate) fn begin(&mut self, id: RequestId) -> Option<Vec<u32>> {
         let mut last = self.last.iter();
         let known = last.position(|it| it.id.client_id == id.client_id);
-        if known.is_some_and(|at| self.last[at].id == id && self.last[at].given.is_none()) {
+        if known.is_some_and(|at| self.last[at].id == id && self.last[at].ks.is_none()) {
             return Some(Vec::new());
         }
         let order = |id: RequestId| (id.number, id.attempt);
@@ -35,8 +35,8 @@ impl Requests {
             Some(known) if order(id) <= order(known.id) => (known, None),
             known => {
                 let repeated = known.filter(|it| it.id.number == id.number);
-                let lost = repeated.and_then(|it| it.given).unwrap_or_default();
-                (Request { id, given: None }, Some(lost))
+                let lost = repeated.and_then(|it| it.ks).unwrap_or_default();
+                (Request { id, ks: None }, Some(lost))
             }
         };
         if self.last.len() == CLIENTS_MAX {
@@ -49,7 +49,7 @@ impl Requests {
     /// Records that the last request of this client was given rows with these `ks`.
     pub(crate) fn complete(&mut self, client_id: u64, ks: Vec<u32>) {
         if let Some(request) = self.last.iter_mut().find(|it| it.id.client_id == client_id) {
-            request.given = Some(ks);
+            request.ks = Some(ks);
         }
     }
 }
@@ -60,7 +60,7 @@ mod tests {
 
     #[test]
     fn of_too_many_clients_the_one_heard_of_longest_ago_is_forgotten() {
-        let mut requests = Requests::default();
+        let mut requests = LastRequests::default();
         for client_id in 0..CLIENTS_MAX as u64 {
             requests.begin(RequestId::first(client_id));
             requests.complete(client_id, vec![1]);

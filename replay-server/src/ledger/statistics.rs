@@ -10,7 +10,7 @@ use super::actors::Difference;
 /// Maximum ended episodes kept for clients. Beyond it the oldest are dropped.
 const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
 /// The same for a snapshot on disk, which has only the episodes that the recorder has not fetched yet.
-const EPISODES_LOGGED_MAX: usize = 1_024;
+const EPISODES_SNAPSHOT_MAX: usize = 1_024;
 
 /// The counters, besides those of the ring and the limiter.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -23,10 +23,10 @@ pub(crate) struct Statistics {
     newest: VecDeque<EndedEpisode>,
     /// How many ended episodes the recording process had at its last request; `None` before its first.
     #[serde(skip)]
-    recorded: Option<u64>,
+    recorded_episodes: Option<u64>,
     /// Whether the recording process is the run's launcher.
     #[serde(skip)]
-    is_launched: bool,
+    launcher_records: bool,
 }
 
 impl Statistics {
@@ -43,7 +43,7 @@ impl Statistics {
     }
 
     /// Resets the counters that the log cannot restore: retried and rejected messages, and waiting times.
-    pub(crate) fn of_changes(mut self) -> Self {
+    pub(crate) fn without_transient(mut self) -> Self {
         let counted = &mut self.counted;
         (counted.chunks_retried, counted.messages_refused) = (0, 0);
         (counted.learner_waited_s, counted.actors_waited_s) = (0.0, 0.0);
@@ -51,15 +51,15 @@ impl Statistics {
     }
 
     /// Takes the ended episodes that `before` keeps, if both have counted the same number: a snapshot has only those not yet recorded.
-    pub(crate) fn keep_newest_of(&mut self, before: &mut Self) {
+    pub(crate) fn take_episodes(&mut self, before: &mut Self) {
         if self.counted.episodes == before.counted.episodes {
             self.newest = std::mem::take(&mut before.newest);
         }
     }
 
     /// Also resets the counters of rows drawn, so that only those of transitions stored remain.
-    pub(crate) fn of_stored(self) -> Self {
-        let mut stored = self.of_changes();
+    pub(crate) fn without_draws(self) -> Self {
+        let mut stored = self.without_transient();
         let counted = &mut stored.counted;
         counted.k_histogram.fill(0);
         (counted.batches_retried, counted.rows_unlearned) = (0, 0);
@@ -68,7 +68,7 @@ impl Statistics {
     }
 
     /// Counts a difference between an actor's count and ours. Returns whether to log it: the 1st, 2nd, 4th, 8th and so on.
-    pub(crate) fn count(&mut self, Difference { lost, duplicated }: Difference) -> bool {
+    pub(crate) fn count_difference(&mut self, Difference { lost, duplicated }: Difference) -> bool {
         if lost == 0 && duplicated == 0 {
             return false;
         }
@@ -80,13 +80,13 @@ impl Statistics {
         self.differences.is_power_of_two()
     }
 
-    pub(crate) fn served(&mut self, ks: &[u32]) {
+    pub(crate) fn count_served(&mut self, ks: &[u32]) {
         for &k in ks {
             self.counted.k_histogram[k as usize] += 1;
         }
     }
 
-    /// Subtracts rows that [`Statistics::served`] counted, and counts a retried batch.
+    /// Subtracts rows that [`Statistics::count_served`] counted, and counts a retried batch.
     pub(crate) fn refund(&mut self, ks: &[u32]) {
         self.counted.batches_retried += 1;
         for &k in ks {
@@ -95,7 +95,7 @@ impl Statistics {
     }
 
     /// Counts an ended episode, and its return if all of the episode was seen.
-    pub(crate) fn episode_ended(&mut self, episode: EndedEpisode) {
+    pub(crate) fn count_episode(&mut self, episode: EndedEpisode) {
         self.counted.episodes += 1;
         if self.newest.len() == EPISODES_KEPT_MAX {
             self.newest.pop_front();
@@ -124,10 +124,10 @@ impl Statistics {
     }
 
     /// Notes that a recorder has the first `episodes` ended episodes. Once the launcher records, other clients no longer count.
-    pub(crate) fn note_recorded(&mut self, episodes: u64, is_launcher: bool) {
-        if is_launcher || !self.is_launched {
-            self.recorded = Some(episodes.min(self.counted.episodes));
-            self.is_launched = is_launcher;
+    pub(crate) fn set_recorded(&mut self, episodes: u64, is_launcher: bool) {
+        if is_launcher || !self.launcher_records {
+            self.recorded_episodes = Some(episodes.min(self.counted.episodes));
+            self.launcher_records = is_launcher;
         }
     }
 
@@ -144,13 +144,13 @@ impl Statistics {
     }
 
     /// Returns the statistics for a snapshot: without connected actors, and with unrecorded episodes only.
-    pub(crate) fn logged(&self) -> Self {
+    pub(crate) fn for_snapshot(&self) -> Self {
         let mut logged = self.clone();
         // Connections do not outlive the process.
         logged.counted.actors = 0;
-        let recorded = logged.recorded.take();
+        let recorded = logged.recorded_episodes.take();
         let unrecorded = recorded.map_or(0, |it| self.counted.episodes - it);
-        let kept = EPISODES_LOGGED_MAX.min(unrecorded as usize);
+        let kept = EPISODES_SNAPSHOT_MAX.min(unrecorded as usize);
         let newest = logged.newest.len();
         logged.newest.drain(..newest.saturating_sub(kept));
         logged
@@ -166,7 +166,7 @@ mod tests {
         let mut statistics = Statistics::new(1, 1);
         assert_eq!(statistics.episodes_since(0), EpisodesReply::default());
         let end = |statistics: &mut Statistics, frames| {
-            statistics.episode_ended(EndedEpisode {
+            statistics.count_episode(EndedEpisode {
                 frames,
                 actor: 0,
                 env: 0,
@@ -192,11 +192,11 @@ mod tests {
         assert_eq!(statistics.counted.episodes, all);
         for (recorded, logged) in [
             (None, 0),
-            (Some(9), EPISODES_LOGGED_MAX),
+            (Some(9), EPISODES_SNAPSHOT_MAX),
             (Some(all - 3), 3),
         ] {
-            statistics.recorded = recorded;
-            let reply = statistics.logged().episodes_since(0);
+            statistics.recorded_episodes = recorded;
+            let reply = statistics.for_snapshot().episodes_since(0);
             assert_eq!((reply.up_to(), reply.episodes.len()), (all, logged));
         }
     }

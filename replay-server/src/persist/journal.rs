@@ -172,7 +172,7 @@ impl Journal {
 
     /// Appends a chunk before it is stored. `false`: the disk rejects it, so do not store it. Error: it is too large for a message.
     pub(crate) fn append_chunk(&mut self, packed: &PackedChunk<'_>) -> Result<bool, String> {
-        let head = packed.sealed.as_ref();
+        let head = packed.message_head.as_ref();
         let head = head.ok_or("the chunk is larger than a message may be")?;
         let payload = packed.chunk.payload();
         let record = record::head(RecordKind::Chunk, self.ordinal, head, payload.len());

@@ -106,7 +106,7 @@ pub(super) fn recover(
 ) -> Result<(Place, Recovery), PersistError> {
     let numbers = folder.segments()?;
     let packer = replay.packer();
-    replay.quiet = true;
+    replay.is_recovering = true;
     let mut reader = Reader {
         folder,
         id,
@@ -301,7 +301,7 @@ impl Reader<'_> {
                     .and_then(|(header, payload)| Chunk::from_payload(header, payload))
                     .map_err(|e| e.to_string())?;
                 self.replay.check_chunk(&chunk)?;
-                self.replay.state.actors.check_known(&chunk.header)?;
+                self.replay.state.actors.check_sender(&chunk.header)?;
                 let packed = self.packer.pack(Cow::Owned(chunk));
                 self.replay.store(&packed);
                 Ok(())
@@ -345,7 +345,7 @@ impl Reader<'_> {
         }
         // Older segments are removed once none of their transitions is held.
         let ring = &self.replay.ring;
-        let (first, end) = (ring.first(), ring.inserted());
+        let (first, end) = (ring.first_index(), ring.inserted());
         let held_from = self.oldest.max(end.saturating_sub(ring.capacity()));
         if self.same_capacity && held_from < first {
             self.warn(format!(
@@ -354,11 +354,11 @@ impl Reader<'_> {
             ));
         }
         let replay = self.replay;
-        replay.quiet = false;
+        replay.is_recovering = false;
         if self.recovery.found && self.mark.is_none() {
             // Draws since the last snapshot are unknown: the learner reports their number, and another random stream is used from here on.
-            replay.awaits_learner = replay.state.learner.is_some();
-            replay.state.draw_anew(replay.origin.shard, end);
+            replay.awaits_row_count = replay.state.learner.is_some();
+            replay.state.set_rng_stream(replay.origin.shard, end);
         }
         Ok((self.place, self.recovery))
     }

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     config::SHARDS_MAX,
     ledger::{actors::Actors, statistics::Statistics},
-    rate_limiter::Counts,
+    rate_limiter::LimiterCounts,
     sampling::{horizon::Affinity, rows::RowsState},
 };
 
@@ -62,10 +62,10 @@ impl ReplayState {
     }
 
     /// Switches to another random stream, for a shard that was resumed after `resumed` transitions or updates.
-    pub(crate) fn draw_anew(&mut self, shard: u32, resumed: u64) {
-        let beyond = resumed.wrapping_mul(u64::from(SHARDS_MAX));
+    pub(crate) fn set_rng_stream(&mut self, shard: u32, resumed: u64) {
+        let stream_offset = resumed.wrapping_mul(u64::from(SHARDS_MAX));
         let stream = RNG_STREAM + u64::from(shard);
-        self.rng.set_stream(stream.wrapping_add(beyond));
+        self.rng.set_stream(stream.wrapping_add(stream_offset));
     }
 }
 
@@ -76,7 +76,7 @@ pub(crate) struct Snapshot {
     pub(crate) inserted: u64,
     pub(crate) oldest: u64,
     pub(crate) capacity: u64,
-    pub(crate) counts: Counts,
+    pub(crate) counts: LimiterCounts,
     pub(crate) rows: RowsState,
     pub(crate) state: ReplayState,
 }

@@ -44,9 +44,9 @@ fn begin(sampling: Sampling) -> (TempDir, Replay) {
 
 /// Makes writes to the newest segment fail, as on a full disk. Returns the file to put back.
 fn refuse(replay: &mut Replay) -> Arc<File> {
-    let log = replay.log.as_mut().unwrap();
+    let journal = replay.journal.as_mut().unwrap();
     let full = Arc::new(File::open("/dev/null").unwrap());
-    std::mem::replace(&mut log.file, full)
+    std::mem::replace(&mut journal.file, full)
 }
 
 fn store(replay: &mut Replay, sequence: u64) {
@@ -71,7 +71,7 @@ fn save_checkpoint(replay: &mut Replay) {
         saved_updates: 1,
         ..Learned::default()
     };
-    replay.note_learned(learned).unwrap();
+    replay.set_progress(learned).unwrap();
 }
 
 /// Drops the replay and opens its folder again: all that was stored must be restored.
@@ -99,11 +99,11 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     };
     replay.leave(&leave);
     assert!(replay.is_refused_by_disk());
-    replay.log.as_mut().unwrap().file = file;
+    replay.journal.as_mut().unwrap().file = file;
     // The learner's checkpoint begins the first segment after the disk accepts writes again.
     save_checkpoint(&mut replay);
     replay.join_actor(join(1, 1)).unwrap();
-    let bytes = |replay: &Replay| replay.log.as_ref().unwrap().bytes();
+    let bytes = |replay: &Replay| replay.journal.as_ref().unwrap().bytes();
     let before = bytes(&replay);
     replay.leave(&leave);
     assert_eq!(bytes(&replay), before, "a repeated `Leave` is not written");
@@ -165,7 +165,7 @@ fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
     let mut most = 0;
     for sequence in 0..800 {
         store(&mut replay, sequence);
-        most = most.max(replay.log.as_ref().unwrap().bytes());
+        most = most.max(replay.journal.as_ref().unwrap().bytes());
     }
     // The 2,000 transitions held take 34 kB in chunks, and a snapshot takes 16 kB.
     assert!(most < 200_000, "{most}");
@@ -187,7 +187,7 @@ fn where_a_launcher_records_it_alone_says_which_episodes_need_not_be_kept() {
     let (_folder, mut replay) = begin(Sampling::default());
     store(&mut replay, 0);
     for (since, is_launcher, kept) in [(1, false, 0), (0, true, 1), (1, false, 1), (1, true, 0)] {
-        replay.episodes(EpisodesRequest { since, is_launcher });
+        replay.answer_episodes(EpisodesRequest { since, is_launcher });
         let kept_now = replay.snapshot().state.statistics.episodes_since(0);
         assert_eq!(kept_now.episodes.len(), kept, "{since} {is_launcher}");
     }

@@ -114,7 +114,7 @@ impl KeptReplay {
         }
         let snapshot = replay.snapshot();
         let journal = Journal::begin(folder, id, place, self.limits, &snapshot)?;
-        replay.log = Some(journal);
+        replay.journal = Some(journal);
         replay.tidy();
         Ok((replay, recovery))
     }
@@ -146,21 +146,19 @@ pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
 impl Replay {
     /// Writes notes that the disk rejected before. Returns whether all are written; until then joins and `Leave`s get no reply.
     pub(crate) fn write_pending(&mut self) -> bool {
-        let log = self.log.as_mut();
-        log.is_none_or(Journal::write_pending)
+        self.journal.as_mut().is_none_or(Journal::write_pending)
     }
 
     /// Whether the last write to the disk failed.
     pub fn is_refused_by_disk(&self) -> bool {
-        let log = self.log.as_ref();
-        log.is_some_and(Journal::is_failing)
+        self.journal.as_ref().is_some_and(Journal::is_failing)
     }
 
     /// Marks this moment in the log, flushed to disk. The log can be opened at the mark even after it has grown, which restores the replay
     /// bit for bit. The last two marks are kept, not counting those given up. `None` if the replay is in memory.
     pub fn mark(&mut self) -> Result<Option<Mark>, PersistError> {
         let snapshot = self.snapshot();
-        let marked = self.log.as_mut().map(|log| log.mark(&snapshot));
+        let marked = self.journal.as_mut().map(|journal| journal.mark(&snapshot));
         self.prune();
         marked.transpose()
     }
@@ -168,21 +166,21 @@ impl Replay {
     /// Gives up `mark`, as the checkpoint that should refer to it could not be saved. So it does not displace a mark to which a saved
     /// checkpoint refers.
     pub fn give_up_mark(&mut self, mark: Mark) {
-        if let Some(log) = &mut self.log {
-            log.give_up(mark);
+        if let Some(journal) = &mut self.journal {
+            journal.give_up(mark);
         }
     }
 
     pub(crate) fn note(&mut self, note: Note) {
-        if let Some(log) = &mut self.log {
-            log.append_note(&note);
+        if let Some(journal) = &mut self.journal {
+            journal.append_note(&note);
         }
         self.tidy();
     }
 
     /// Begins a new segment if the newest is full, and removes segments that are no longer needed.
     pub(crate) fn tidy(&mut self) {
-        if self.log.as_ref().is_some_and(Journal::is_full) {
+        if self.journal.as_ref().is_some_and(Journal::is_full) {
             self.next_segment();
         }
         self.prune();
@@ -190,20 +188,20 @@ impl Replay {
 
     /// Begins a new segment. If the disk budget has no room for it, drops the oldest transitions first.
     pub(crate) fn next_segment(&mut self) {
-        let log = self.log.as_ref();
-        if let Some(oldest) = log.and_then(|log| log.over_budget(|| self.snapshot())) {
+        let journal = self.journal.as_ref();
+        if let Some(oldest) = journal.and_then(|journal| journal.over_budget(|| self.snapshot())) {
             self.forget_before(oldest);
             self.prune();
         }
-        let snapshot = self.log.is_some().then(|| self.snapshot());
-        if let (Some(log), Some(snapshot)) = (&mut self.log, snapshot) {
-            log.rotate(&snapshot);
+        let snapshot = self.journal.is_some().then(|| self.snapshot());
+        if let (Some(journal), Some(snapshot)) = (&mut self.journal, snapshot) {
+            journal.rotate(&snapshot);
         }
     }
 
     fn prune(&mut self) {
         let oldest = self.ring.oldest();
-        self.log.iter_mut().for_each(|log| log.prune(oldest));
+        self.journal.iter_mut().for_each(|it| it.prune(oldest));
     }
 
     fn forget_before(&mut self, oldest: u64) {
@@ -223,7 +221,7 @@ impl Replay {
             counts: self.limiter.counts,
             rows: self.sampler.rows.state(&self.ring),
             state: ReplayState {
-                statistics: self.state.statistics.logged(),
+                statistics: self.state.statistics.for_snapshot(),
                 ..self.state.clone()
             },
         }
@@ -236,17 +234,17 @@ impl Replay {
         let (inserted, oldest) = (snapshot.inserted, snapshot.oldest);
         let mut state = snapshot.state;
         let stored = self.ring.inserted();
-        let is_empty = self.ring.first() == stored;
+        let is_empty = self.ring.first_index() == stored;
         if !is_empty && inserted < stored {
             return Err(format!(
                 "a state after {inserted} transitions, where {stored} are stored"
             ));
         }
         if !is_empty && inserted > stored {
-            state.actors.cut_streams(stored);
+            state.actors.unlink_streams(stored);
         }
         if is_empty || inserted - stored >= self.ring.capacity() {
-            self.ring.start_at(inserted);
+            self.ring.restart_at(inserted);
         } else {
             self.push_gone(inserted - stored);
         }
@@ -255,8 +253,7 @@ impl Replay {
         let rows = &mut self.sampler.rows;
         rows.restore(&self.ring, oldest, &snapshot.rows);
         state.actors.restored = true;
-        let statistics = &mut state.statistics;
-        statistics.keep_newest_of(&mut self.state.statistics);
+        state.statistics.take_episodes(&mut self.state.statistics);
         self.state = state;
         Ok(())
     }
@@ -273,14 +270,14 @@ impl Replay {
         for _ in 0..count {
             let step = Step::new(0, 0.0, End::Running, 0);
             self.ring
-                .push_run(packed.run(0), [step].into_iter(), Link::Lost);
+                .push_steps(packed.stream_frames(0), [step].into_iter(), Link::Lost);
         }
     }
 
     /// Encodes the state without the transitions, for tests. Equal states give equal bytes. A mark restores all of this state.
     pub fn state_bytes(&self) -> Result<Vec<u8>, CodecError> {
         let mut snapshot = self.snapshot();
-        snapshot.state.statistics = snapshot.state.statistics.of_changes();
+        snapshot.state.statistics = snapshot.state.statistics.without_transient();
         codec::encode_value(&snapshot)
     }
 
@@ -293,7 +290,7 @@ impl Replay {
             (counts.this_shard.inserted, counts.refilled),
             (counts.refill_left, state.resumed_after),
             (state.actors, state.learner),
-            state.statistics.of_stored(),
+            state.statistics.without_draws(),
         ))
     }
 }

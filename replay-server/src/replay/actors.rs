@@ -7,7 +7,7 @@ use driml_protocol::{ActorJoin, Chunk, ChunkPoll, EndedEpisode, InsertReply, Lea
 
 use super::Replay;
 use crate::{
-    ledger::actors::{Difference, Verdict},
+    ledger::actors::{ChunkOrder, Difference},
     persist::{journal::Journal, snapshot::Note},
     storage::{
         pack::{PackedChunk, Packer},
@@ -16,7 +16,7 @@ use crate::{
 };
 
 /// Maximum transitions that one incarnation of an actor may report: three years at three million per second.
-const TRANSITIONS_MAX: u64 = 1 << 48;
+const PRODUCED_MAX: u64 = 1 << 48;
 
 impl Replay {
     /// Admits an incarnation of an actor: from now on its chunks are stored, and those of earlier incarnations are not. Returns the number
@@ -35,7 +35,7 @@ impl Replay {
 
     /// If the run has its maximum number of actors, forgets those that never sent a chunk and are not connected. Returns their numbers.
     pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
-        let absent = self.state.actors.absent(is_connected);
+        let absent = self.state.actors.forgettable(is_connected);
         if !absent.is_empty() {
             self.state.actors.forget(&absent);
             self.note(Note::Forgotten(absent.clone()));
@@ -52,7 +52,7 @@ impl Replay {
     pub(crate) fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
-            seal_for: self.log.as_ref().map(Journal::spec_hash),
+            spec_hash: self.journal.as_ref().map(Journal::spec_hash),
         }
     }
 
@@ -63,71 +63,72 @@ impl Replay {
 
     /// Does the same as [`Replay::insert`] for a chunk that this replay's packer has packed.
     pub(crate) fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
-        self.settle(packed).unwrap_or_else(|| self.admit(packed))
+        self.early_reply(packed)
+            .unwrap_or_else(|| self.store_if_allowed(packed))
     }
 
     /// Returns the reply to a chunk that must not be stored: it is already stored, out of order, invalid, or comes after the end of the
-    /// run. `None` if [`Replay::admit`] has to decide.
+    /// run. `None` if [`Replay::store_if_allowed`] has to decide.
     ///
     /// A retry is answered `Stored`, whatever the limiter allows. An out-of-order chunk is stored only if its actor insists on it.
-    pub(crate) fn settle(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
-        let chunk = &*packed.chunk;
-        let verdict = self.check_chunk(chunk);
-        let verdict = verdict.and_then(|()| self.state.actors.judge(&chunk.header));
-        match verdict {
-            Err(why) => Some(self.refused(why)),
-            Ok(Verdict::Retried) => {
-                self.counted().chunks_retried += 1;
-                Some(self.stored())
+    pub(crate) fn early_reply(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
+        let header = &packed.chunk.header;
+        let order = self.check_chunk(&packed.chunk);
+        let order = order.and_then(|()| self.state.actors.chunk_order(header));
+        match order {
+            Err(why) => Some(self.reject(why)),
+            Ok(ChunkOrder::Retried) => {
+                self.counters_mut().chunks_retried += 1;
+                Some(self.stored_reply())
             }
-            Ok(_) if self.limiter.all_in() => Some(self.run_is_full()),
-            Ok(Verdict::OutOfOrder { .. }) if self.state.actors.insists(&chunk.header) => None,
-            Ok(Verdict::OutOfOrder { expected }) => Some(InsertReply::OutOfOrder { expected }),
-            Ok(Verdict::Next) => None,
+            Ok(_) if self.limiter.all_stored() => Some(self.finished_reply()),
+            Ok(ChunkOrder::OutOfOrder { .. }) if self.state.actors.accepts_gap(header) => None,
+            Ok(ChunkOrder::OutOfOrder { expected }) => Some(InsertReply::OutOfOrder { expected }),
+            Ok(ChunkOrder::Next) => None,
         }
     }
 
-    /// Stores a chunk for which [`Replay::settle`] returned `None`, on disk before in memory. Replies `Wait` while the disk rejects writes,
-    /// and if the limiter has no room, unless the actor is leaving or the last draw found no anchor.
-    pub(crate) fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
+    /// Stores a chunk for which [`Replay::early_reply`] returned `None`, on disk before in memory. Replies `Wait` while the disk rejects
+    /// writes, and if the limiter has no room, unless the actor is leaving or the last draw found no anchor.
+    pub(crate) fn store_if_allowed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         let is_leaving = packed.chunk.header.leaving;
         if !(self.limiter.may_insert() || self.state.starving || is_leaving) {
-            return self.wait(false);
+            return self.wait_reply(false);
         }
-        let log = self.log.as_mut();
-        match log.map_or(Ok(true), |log| log.append_chunk(packed)) {
+        let journal = self.journal.as_mut();
+        match journal.map_or(Ok(true), |journal| journal.append_chunk(packed)) {
             Ok(true) => {}
-            Ok(false) => return self.wait(false),
+            Ok(false) => return self.wait_reply(false),
             Err(why) => return InsertReply::Refused { why },
         }
         self.store(packed);
         self.tidy();
-        self.stored()
+        self.stored_reply()
     }
 
     /// Returns what became of a chunk: stored, no longer wanted, or never to be stored. `None` if the chunk has not arrived or is parked.
-    pub fn poll(&mut self, poll: &ChunkPoll) -> Option<InsertReply> {
+    pub fn answer_poll(&mut self, poll: &ChunkPoll) -> Option<InsertReply> {
         match self.state.actors.is_stored(poll) {
-            Ok(true) => Some(self.stored()),
-            Ok(false) => self.limiter.all_in().then(|| self.run_is_full()),
-            Err(why) => Some(self.refused(why)),
+            Ok(true) => Some(self.stored_reply()),
+            Ok(false) => self.limiter.all_stored().then(|| self.finished_reply()),
+            Err(why) => Some(self.reject(why)),
         }
     }
 
     /// Returns the reply that a chunk has to wait. `kept` tells whether the server keeps the chunk meanwhile.
-    pub(crate) fn wait(&self, kept: bool) -> InsertReply {
+    pub(crate) fn wait_reply(&self, kept: bool) -> InsertReply {
         InsertReply::Wait {
             inserted_total: self.inserted_total(),
             kept,
         }
     }
 
-    fn refused(&mut self, why: String) -> InsertReply {
-        self.counted().messages_refused += 1;
+    fn reject(&mut self, why: String) -> InsertReply {
+        self.counters_mut().messages_refused += 1;
         InsertReply::Refused { why }
     }
 
-    fn stored(&self) -> InsertReply {
+    fn stored_reply(&self) -> InsertReply {
         let actors = self.state.statistics.counted.actors;
         InsertReply::Stored {
             inserted_total: self.inserted_total(),
@@ -136,7 +137,7 @@ impl Replay {
         }
     }
 
-    fn run_is_full(&self) -> InsertReply {
+    fn finished_reply(&self) -> InsertReply {
         InsertReply::Finished {
             inserted_total: self.inserted_total(),
         }
@@ -168,7 +169,7 @@ impl Replay {
         }
         let (sequence, first) = (header.sequence, header.first_transition);
         let count = first.checked_add(transitions);
-        if sequence == u64::MAX || count.is_none_or(|count| count > TRANSITIONS_MAX) {
+        if sequence == u64::MAX || count.is_none_or(|count| count > PRODUCED_MAX) {
             return Err(format!(
                 "counts that no run reaches: chunk {sequence}, transition {first}"
             ));
@@ -197,10 +198,10 @@ impl Replay {
         let header = chunk.header;
         let statistics = &mut self.state.statistics;
         let (streams, difference) = self.state.actors.accept(&header);
-        self.limiter.inserted(header.transitions() as u64);
+        self.limiter.count_inserted(header.transitions() as u64);
         let steps = header.steps as usize;
         // The count of all shards, by their last reports.
-        let frames = self.limiter.inserted_total();
+        let total = self.limiter.inserted_total();
         for (number, stream) in streams.iter_mut().enumerate() {
             let rows = number * steps..(number + 1) * steps;
             let step = |row| {
@@ -208,8 +209,8 @@ impl Replay {
                 Step::new(action, reward, chunk.end(row), header.weights_version)
             };
             let (link, first) = (stream.link, self.ring.inserted());
-            let run = packed.run(number);
-            stream.link = self.ring.push_run(run, rows.clone().map(step), link);
+            let frames = packed.stream_frames(number);
+            stream.link = self.ring.push_steps(frames, rows.clone().map(step), link);
             self.sampler.rows.stored(&self.ring, first, link);
             for step in rows.map(step) {
                 statistics.counted.action_histogram[usize::from(step.action)] += 1;
@@ -218,8 +219,8 @@ impl Replay {
                     episode.steps += 1;
                 }
                 if step.end.is_episode_end() {
-                    statistics.episode_ended(EndedEpisode {
-                        frames,
+                    statistics.count_episode(EndedEpisode {
+                        frames: total,
                         actor: header.actor,
                         env: number as u32,
                         played: stream.episode.replace(Played::default()),
@@ -228,13 +229,13 @@ impl Replay {
             }
         }
         self.state.starving = false;
-        self.count(header.actor, difference);
+        self.count_difference(header.actor, difference);
     }
 
-    fn count(&mut self, actor: u32, difference: Difference) {
+    fn count_difference(&mut self, actor: u32, difference: Difference) {
         let Difference { lost, duplicated } = difference;
-        // `Statistics::count` limits the rate of this line, which a faulty actor could trigger with every message.
-        if self.state.statistics.count(difference) && !self.quiet {
+        // `Statistics::count_difference` limits the rate of this line, which a faulty actor could trigger with every message.
+        if self.state.statistics.count_difference(difference) && !self.is_recovering {
             tracing::warn!(
                 "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
             );
@@ -244,21 +245,21 @@ impl Replay {
     /// Takes an actor's `Leave`. Transitions that it produced and that are not stored count as lost, the reverse as duplicated. Returns the
     /// reason if the message is rejected: its incarnation never joined, or its count is impossible.
     pub fn leave(&mut self, leave: &Leave) -> Option<String> {
-        let said = match leave.produced {
-            0..=TRANSITIONS_MAX => self.state.actors.leave(leave),
+        let result = match leave.produced {
+            0..=PRODUCED_MAX => self.state.actors.leave(leave),
             produced => Err(format!(
                 "actor {} says it produced {produced} transitions, a count that no run reaches",
                 leave.actor
             )),
         };
-        match said {
+        match result {
             Ok(Some(difference)) => {
-                self.count(leave.actor, difference);
+                self.count_difference(leave.actor, difference);
                 self.note(Note::Leave(*leave));
             }
             Ok(None) => {}
-            Err(_) => self.counted().messages_refused += 1,
+            Err(_) => self.counters_mut().messages_refused += 1,
         }
-        said.err()
+        result.err()
     }
 }

@@ -9,7 +9,7 @@ use driml_protocol::{
 use super::{Replay, VERSION_AHEAD_MAX};
 use crate::{
     config,
-    ledger::requests::Requests,
+    ledger::requests::LastRequests,
     persist::snapshot::{COUNT_MAX, Note},
     sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
@@ -42,17 +42,17 @@ impl Replay {
                      that holds its checkpoints, or with --restart to begin again from the first update"
                 ));
             }
-            None => self.resume_empty(&join),
+            None => self.resume_counts_if_empty(&join),
         }
         let learned = join.counts.rows_sampled;
         let unlearned = self.counts().rows_sampled.saturating_sub(learned);
-        let again = done.saturating_sub(join.updates);
+        let repeated_updates = done.saturating_sub(join.updates);
         self.limiter.refund(unlearned);
         self.limiter.counts.this_shard.rows_sampled = learned;
         self.limiter.counts.other_shards = join.other_shards;
         let state = &mut self.state;
         state.statistics.counted.rows_unlearned += unlearned;
-        state.statistics.counted.updates_relearned += again;
+        state.statistics.counted.updates_relearned += repeated_updates;
         state.learned = Learned {
             updates: join.updates,
             saved_updates: join.updates,
@@ -60,14 +60,14 @@ impl Replay {
         };
         state.learner = Some(join);
         state.affinity.expect_another_source();
-        self.awaits_learner = false;
-        self.requests = Requests::default();
+        self.awaits_row_count = false;
+        self.requests = LastRequests::default();
         self.note(Note::LearnerJoined(join));
-        Ok(again)
+        Ok(repeated_updates)
     }
 
     /// Continues the counts of a learner's checkpoint, if nothing is stored here.
-    fn resume_empty(&mut self, join: &LearnerJoin) {
+    fn resume_counts_if_empty(&mut self, join: &LearnerJoin) {
         if join.updates == 0 || self.ring.inserted() > 0 {
             return;
         }
@@ -78,33 +78,33 @@ impl Replay {
             .min(config.capacity_transitions)
             .max(config.warmup_transitions);
         let refill = refill.div_ceil(config.shards.into());
-        // `RateLimiter::resume_empty` needs the counts of all shards to decide whether the run still has rows to sample.
+        // `RateLimiter::resume_with_refill` needs the counts of all shards to decide whether the run still has rows to sample.
         self.limiter.counts.other_shards = join.other_shards;
         self.limiter
-            .resume_empty(join.counts, refill, self.batch_size);
+            .resume_with_refill(join.counts, refill, self.batch_size);
         self.state.resumed_after = join.updates;
-        self.state.draw_anew(self.origin.shard, join.updates);
+        self.state.set_rng_stream(self.origin.shard, join.updates);
     }
 
     /// Returns the learner that is served.
-    pub fn learner(&self) -> Option<u64> {
+    pub fn learner_id(&self) -> Option<u64> {
         self.state.learner.map(|it| it.learner)
     }
 
     /// Returns the updates done when the run was resumed without its replay; 0 if it never was, or before its learner has joined.
-    pub const fn resumed_after(&self) -> u64 {
+    pub const fn resumed_after_updates(&self) -> u64 {
         self.state.resumed_after
     }
 
     /// Takes the learner's progress. If the learner has saved a checkpoint, a replay on disk begins a new segment with a snapshot.
-    pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
+    pub fn set_progress(&mut self, learned: Learned) -> Result<(), String> {
         let (updates, rows) = (learned.updates, learned.rows_received);
         if updates.max(learned.saved_updates).max(rows) > COUNT_MAX {
             return Err(format!(
                 "a learner with {updates} updates and {rows} rows, counts that no run reaches"
             ));
         }
-        if std::mem::take(&mut self.awaits_learner) {
+        if std::mem::take(&mut self.awaits_row_count) {
             self.limiter.counts.this_shard.rows_sampled = rows;
         }
         // A request may overtake another.
@@ -118,7 +118,7 @@ impl Replay {
         Ok(())
     }
 
-    pub(crate) fn note_updates(&mut self, updates: u64) {
+    pub(crate) fn raise_updates(&mut self, updates: u64) {
         let done = &mut self.state.learned.updates;
         *done = updates.min(COUNT_MAX).max(*done);
     }
@@ -168,7 +168,7 @@ impl Replay {
         &mut self,
         id: RequestId,
         rows: u32,
-        memory: impl FnOnce(usize) -> Buffer,
+        alloc: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, NotReady> {
         let Some(lost) = self.requests.begin(id) else {
             return Err(NotReady::Wait(self.limiter.waiting(rows)));
@@ -178,13 +178,13 @@ impl Replay {
             self.limiter.refund(lost.len() as u64);
             self.state.statistics.refund(&lost);
         }
-        let draft = self.draw(rows, memory)?;
-        self.requests.complete(id.client_id, draft.ks.clone());
-        Ok(draft)
+        let batch = self.draw(rows, alloc)?;
+        self.requests.complete(id.client_id, batch.ks.clone());
+        Ok(batch)
     }
 
     /// Draws a batch of `rows` rows, or returns why there is none. Anchors are drawn with replacement by the rule of `replay.sampling`.
-    /// Compressed frames are unpacked later by [`PackedBatch::unpack`], which does not need the replay. `memory` returns a buffer of the
+    /// Compressed frames are unpacked later by [`PackedBatch::unpack`], which does not need the replay. `alloc` returns a buffer of the
     /// given size; the finished batch overwrites all of it.
     ///
     /// # Errors
@@ -192,18 +192,18 @@ impl Replay {
     pub fn draw(
         &mut self,
         rows: u32,
-        memory: impl FnOnce(usize) -> Buffer,
+        alloc: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, NotReady> {
         let rows_max = config::rows_max(&self.spec, &self.config.sampling);
         let rows_max = rows_max.min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
-            self.counted().messages_refused += 1;
+            self.counters_mut().messages_refused += 1;
             let why = format!(
                 "a batch of {rows} rows; this run serves 1 to {rows_max}: change the batch size, or raise slack_transitions"
             );
             return Err(NotReady::Refused { why });
         }
-        if self.limiter.finished(rows) {
+        if self.limiter.is_finished(rows) {
             return Err(NotReady::Finished);
         }
         if !self.limiter.may_sample(rows) {
@@ -218,9 +218,9 @@ impl Replay {
         };
         let state = &mut self.state;
         let (affinity, rng) = (&state.affinity, &mut state.rng);
-        let drawn = self.sampler.draw(&self.ring, affinity, rng, header, memory);
+        let drawn = self.sampler.draw(&self.ring, affinity, rng, header, alloc);
         let Some(mut drawn) = drawn else {
-            if self.limiter.all_in() {
+            if self.limiter.all_stored() {
                 let why = format!(
                     "none of the {held} transitions held can be sampled, and no more will come: every environment needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer environments"
                 );
@@ -229,10 +229,10 @@ impl Replay {
             state.starving = true;
             return Err(NotReady::Wait(Waiting::LearnerWaitsForActors));
         };
-        self.limiter.sampled(rows);
+        self.limiter.count_sampled(rows);
         drawn.batch.header.counts = self.limiter.counts();
         state.statistics.counted.mean_age = drawn.batch.header.mean_age;
-        state.statistics.served(&drawn.ks);
+        state.statistics.count_served(&drawn.ks);
         state.starving = false;
         Ok(drawn)
     }

@@ -11,11 +11,11 @@ use driml_protocol::{
 
 use crate::{
     config::Config,
-    ledger::requests::Requests,
+    ledger::requests::LastRequests,
     persist::{journal::Journal, snapshot::ReplayState},
     rate_limiter::RateLimiter,
     sampling::batch::BatchSampler,
-    storage::{frame_store::Frames, ring::Ring},
+    storage::{frame_store::FrameStore, ring::Ring},
 };
 
 /// Maximum lead of a version: of an affinity matrix over the rows served, and of the weights that acted over the newest weights. Not 0, as
@@ -31,15 +31,15 @@ pub struct Replay {
     pub(crate) limiter: RateLimiter,
     pub(crate) sampler: BatchSampler,
     pub(crate) state: ReplayState,
-    requests: Requests,
+    requests: LastRequests,
     /// The identity of this sampler, which prioritised batches carry. Priorities of rows from another origin are ignored: a restarted
     /// replay server numbers its transitions anew, or has lost some, and so has another incarnation.
     pub(crate) origin: Origin,
     /// Set while the log is read back: differences counted then were logged when they happened.
-    pub(crate) quiet: bool,
+    pub(crate) is_recovering: bool,
     /// Set after the log was read back: the learner's next request tells how many rows it has received.
-    pub(crate) awaits_learner: bool,
-    pub(crate) log: Option<Journal>,
+    pub(crate) awaits_row_count: bool,
+    pub(crate) journal: Option<Journal>,
 }
 
 /// Constructors.
@@ -75,7 +75,7 @@ impl Replay {
             let key = "replay.capacity_transitions";
             ConfigError::of(key, config.capacity_transitions, why)
         };
-        let frames = Frames::new(config.compression, capacity, spec.frame_bytes(), bytes_max)
+        let frames = FrameStore::new(config.compression, capacity, spec.frame_bytes(), bytes_max)
             .map_err(not_granted)?;
         Ok(Self {
             spec: spec.clone(),
@@ -85,14 +85,14 @@ impl Replay {
             limiter: RateLimiter::new(config),
             sampler: BatchSampler::new(spec, &config.sampling, capacity).map_err(not_granted)?,
             state: ReplayState::new(spec, shard),
-            requests: Requests::default(),
+            requests: LastRequests::default(),
             origin: Origin {
                 shard,
                 incarnation: 0,
             },
-            quiet: false,
-            awaits_learner: false,
-            log: None,
+            is_recovering: false,
+            awaits_row_count: false,
+            journal: None,
         })
     }
 }
@@ -100,7 +100,7 @@ impl Replay {
 /// Status, and the counters that the service updates.
 impl Replay {
     /// Returns the counters of messages, waits and connections.
-    pub(crate) const fn counted(&mut self) -> &mut ReplayStatus {
+    pub(crate) const fn counters_mut(&mut self) -> &mut ReplayStatus {
         &mut self.state.statistics.counted
     }
 
@@ -145,15 +145,15 @@ impl Replay {
             warmup_transitions: self.config.warmup_transitions,
             waiting: self.waiting(),
             affinity_version: self.state.affinity.version(),
-            finished: self.limiter.all_in(),
+            finished: self.limiter.all_stored(),
             ..self.state.statistics.counted.clone()
         }
     }
 
     /// Notes that the client has the first `request.since` ended episodes, and returns the next ones.
-    pub(crate) fn episodes(&mut self, request: EpisodesRequest) -> EpisodesReply {
+    pub(crate) fn answer_episodes(&mut self, request: EpisodesRequest) -> EpisodesReply {
         let EpisodesRequest { since, is_launcher } = request;
-        self.state.statistics.note_recorded(since, is_launcher);
+        self.state.statistics.set_recorded(since, is_launcher);
         self.episodes_since(since)
     }
 
@@ -163,8 +163,8 @@ impl Replay {
     }
 
     /// Notes that the launcher has the first `episodes` ended episodes.
-    pub fn note_recorded(&mut self, episodes: u64) {
-        self.state.statistics.note_recorded(episodes, true);
+    pub fn set_recorded_episodes(&mut self, episodes: u64) {
+        self.state.statistics.set_recorded(episodes, true);
     }
 
     /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.

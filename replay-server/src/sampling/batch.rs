@@ -13,8 +13,8 @@ use super::{
     rows::{RowSampler, prioritised::Priorities, uniform::Uniform},
 };
 use crate::storage::{
-    frame_store::Frames,
-    pack::{Block, Layout},
+    frame_store::FrameStore,
+    pack::{Block, BlockLayout},
     ring::Ring,
 };
 
@@ -24,7 +24,7 @@ pub(crate) struct BatchSampler {
     episodes: Episodes,
     assembler: Assembler,
     window: Window,
-    layout: Layout,
+    layout: BlockLayout,
 }
 
 impl BatchSampler {
@@ -42,7 +42,7 @@ impl BatchSampler {
             rows,
             assembler: Assembler::new(spec),
             window: Window::default(),
-            layout: Layout::new(spec.frame_bytes()),
+            layout: BlockLayout::new(spec.frame_bytes()),
         })
     }
 
@@ -53,7 +53,7 @@ impl BatchSampler {
         affinity: &Affinity,
         rng: &mut ChaCha8Rng,
         mut header: BatchHeader,
-        memory: impl FnOnce(usize) -> Buffer,
+        alloc: impl FnOnce(usize) -> Buffer,
     ) -> Option<PackedBatch> {
         let rows = header.rows as usize;
         let (mut scalars, mut anchors) = (Vec::with_capacity(rows), Vec::with_capacity(rows));
@@ -85,7 +85,7 @@ impl BatchSampler {
             stacked.frames = shared.frames.len() as u32;
             shared
         });
-        let mut batch = Batch::of_rows(header, &scalars, memory);
+        let mut batch = Batch::of_rows(header, &scalars, alloc);
         // Computed after all draws: a draw that finds an invalid anchor zeroes its mass, which makes the others more likely.
         let probability = |anchor| {
             let probability = self.rows.probability(anchor)? as f32;
@@ -157,7 +157,7 @@ impl SharedFrames {
 #[must_use]
 pub struct PackedBatch {
     pub(crate) batch: Batch,
-    layout: Layout,
+    layout: BlockLayout,
     /// The frames to unpack, row by row; empty if the batch has all its frames.
     packed: Vec<PackedFrame>,
     /// The k of each row, the largest if there are several; 0 if there is none.
@@ -186,14 +186,14 @@ fn write_or_take(
     places: &mut BatchStatesMut<'_>,
 ) -> Vec<PackedFrame> {
     match ring.frames() {
-        Frames::Plain(frames) => {
+        FrameStore::Plain(frames) => {
             for &NeededFrame { index, place, .. } in needed {
                 let frame = frames.frame(ring.slot(index));
                 places.frame(place).copy_from_slice(frame);
             }
             Vec::new()
         }
-        Frames::Compressed(frames) => {
+        FrameStore::Compressed(frames) => {
             let packed = |&NeededFrame { row, index, place }: &NeededFrame| {
                 let (block, number) = frames.block(index);
                 PackedFrame {
@@ -228,7 +228,7 @@ impl PackedBatch {
             unpacked.parts.clear();
             for frame in row {
                 let part = layout.part_of(frame.number);
-                let first = layout.frames_of(part, frame.block.frames).start;
+                let first = layout.frames_in_part(part, frame.block.frames).start;
                 let at = unpacked.part(&frame.block, part);
                 let at = at + (frame.number - first) * layout.frame_bytes;
                 let bytes = &unpacked.bytes[at..at + layout.frame_bytes];
@@ -241,7 +241,7 @@ impl PackedBatch {
 
 /// A cache of unpacked parts of blocks.
 struct Unpacked<'a> {
-    layout: Layout,
+    layout: BlockLayout,
     parts: Vec<Part<'a>>,
     /// The unpacked parts, one after the other. May be longer, as rows reuse the buffer.
     bytes: Vec<u8>,
@@ -263,7 +263,7 @@ impl<'a> Unpacked<'a> {
         let frame_bytes = self.layout.frame_bytes;
         let key = (number > 0).then(|| self.part(block, 0));
         let start = self.parts.last().map_or(0, |it| it.place.end);
-        let length = self.layout.frames_of(number, block.frames).len() * frame_bytes;
+        let length = self.layout.frames_in_part(number, block.frames).len() * frame_bytes;
         let place = start..start + length;
         if self.bytes.len() < place.end {
             self.bytes.resize(place.end, 0);

@@ -52,7 +52,7 @@ impl Service {
                 "a batch of {rows} rows; those of this run have {most} (learner.batch_size)"
             ));
         }
-        state.replay.note_learned(request.learned)?;
+        state.replay.set_progress(request.learned)?;
         let (_, shards) = self.shard;
         match request.other_shards {
             None if shards > 1 => Err(format!(
@@ -78,7 +78,7 @@ impl Service {
                 continue;
             };
             let waited = now.saturating_duration_since(parked.arrived);
-            state.replay.counted().learner_waited_s += waited.as_secs_f64();
+            state.replay.counters_mut().learner_waited_s += waited.as_secs_f64();
             drop(state);
             self.changed.notify_all();
             match drawn.map(PackedBatch::unpack) {
@@ -103,11 +103,11 @@ impl State {
         for at in 0..self.requests.len() {
             let parked = &self.requests[at];
             let request = parked.request;
-            let memory = |bytes| match request.shared_memory {
+            let alloc = |bytes| match request.shared_memory {
                 true => pool.take(bytes),
                 false => pool.take_own(bytes),
             };
-            let drawn = self.replay.draw_for(request.id, request.rows, memory);
+            let drawn = self.replay.draw_for(request.id, request.rows, alloc);
             if !matches!(drawn, Err(NotReady::Wait(_))) || parked.left(now).is_zero() {
                 let parked = self.requests.remove(at);
                 return parked.map(|parked| (parked, drawn));

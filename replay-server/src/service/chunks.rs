@@ -68,7 +68,7 @@ impl Service {
             let now = Instant::now();
             let mut answers = state.admit(now);
             for question in state.chunks.overdue(now, self.hold_max) {
-                answers.push((question, state.replay.wait(true)));
+                answers.push((question, state.replay.wait_reply(true)));
             }
             if answers.is_empty() {
                 let due_in = state.chunks.due_in(now, self.hold_max);
@@ -95,12 +95,14 @@ impl State {
         let (version, arrived) = (header.weights_version, question.arrived);
         let actor = Alive::actor(header.actor, header.incarnation);
         self.participants.seen(actor, Some(version), arrived);
-        let reply = match self.replay.settle(&packed) {
+        let reply = match self.replay.early_reply(&packed) {
             Some(reply) => reply,
             // Parked chunks, which came before, go first.
-            None if !self.chunks.line.is_empty() && !header.leaving => self.replay.wait(false),
+            None if !self.chunks.line.is_empty() && !header.leaving => {
+                self.replay.wait_reply(false)
+            }
             None => {
-                let reply = self.replay.admit(&packed);
+                let reply = self.replay.store_if_allowed(&packed);
                 if matches!(reply, InsertReply::Stored { .. }) {
                     self.timings.stored(version, arrived, Instant::now());
                 }
@@ -130,14 +132,14 @@ impl State {
 
     /// Replies what became of a chunk, or keeps the query with the parked chunk. If the actor is leaving, stores its parked chunk.
     fn take_poll(&mut self, poll: &ChunkPoll, question: Question) -> Answers {
-        if let Some(reply) = self.replay.poll(poll) {
+        if let Some(reply) = self.replay.answer_poll(poll) {
             if let InsertReply::Refused { why } = &reply {
                 self.say("poll", &format!("a poll was refused: {why}"));
             }
             return vec![(question, reply)];
         }
         let Some(parked) = self.chunks.polled(poll) else {
-            return vec![(question, self.replay.wait(false))];
+            return vec![(question, self.replay.wait_reply(false))];
         };
         // The actor has given up an older query about this chunk.
         (parked.asked, parked.question) = (question.arrived, Some(question));
@@ -164,7 +166,7 @@ impl State {
             }
             if let Some(parked) = self.chunks.line.pop_front() {
                 let waited = now.saturating_duration_since(parked.arrived);
-                self.replay.counted().actors_waited_s += waited.as_secs_f64();
+                self.replay.counters_mut().actors_waited_s += waited.as_secs_f64();
                 answers.extend(self.leave_line(parked, reply));
             }
         }

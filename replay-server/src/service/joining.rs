@@ -20,7 +20,7 @@ impl Service {
         state.participants.note_connected(who, is_connected, now);
         let joined = match who.process {
             ProcessName::Actor(actor) => state.replay.actor_incarnation(actor),
-            ProcessName::Learner => state.replay.learner(),
+            ProcessName::Learner => state.replay.learner_id(),
         };
         // A process that joined before the server restarted with its replay does not join again.
         if joined.is_some_and(|number| Alive::of(who.process, number) == who) {
@@ -35,8 +35,8 @@ impl Service {
         let run_info = RunInfo {
             config_toml: self.config_toml.clone(),
             inserted_total: state.replay.inserted_total(),
-            has_learner: state.replay.learner().is_some(),
-            after_updates: state.replay.resumed_after(),
+            has_learner: state.replay.learner_id().is_some(),
+            after_updates: state.replay.resumed_after_updates(),
             shard: self.shard,
             shared_memory: self.shared_memory && lives < SHARED_LIVES_MAX,
         };
@@ -87,12 +87,12 @@ fn refused(why: String) -> JoinReply {
 
 impl State {
     fn count_actors(&mut self) {
-        self.replay.counted().actors = self.participants.actors_connected();
+        self.replay.counters_mut().actors = self.participants.actors_connected();
     }
 
     /// Checks that `learner` is the learner that is served. If not, the error says what happened, for a person.
     pub(super) fn check_learner(&self, learner: u64) -> Result<(), String> {
-        match self.replay.learner() {
+        match self.replay.learner_id() {
             Some(served) if served == learner => Ok(()),
             Some(_) => Err("another learner has joined the run since this one did: a run has one learner".into()),
             None => Err("this replay server does not know the learner: it was started again since the learner joined, and what it held \
@@ -128,7 +128,7 @@ impl State {
 
     fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, JoinReply> {
         let (learner, updates) = (join.learner, join.updates);
-        let served = self.replay.learner();
+        let served = self.replay.learner_id();
         let other = served.filter(|&other| other != learner);
         if other.is_some() && self.participants.is_over() {
             let done = self.replay.status().updates;
@@ -140,10 +140,10 @@ impl State {
             let why = "another learner takes part in this run, which has one alone".into();
             return Err(JoinReply::Taken { why });
         }
-        let again = self.replay.join_learner(join).map_err(refused)?;
-        if again > 0 {
+        let repeated = self.replay.join_learner(join).map_err(refused)?;
+        if repeated > 0 {
             tracing::warn!(
-                "the learner resumes from its checkpoint after {updates} updates; updates since then, to be learned again: {again}"
+                "the learner resumes from its checkpoint after {updates} updates; updates since then, to be learned again: {repeated}"
             );
         }
         if served != Some(learner) {

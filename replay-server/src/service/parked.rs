@@ -46,7 +46,7 @@ impl<Q> ParkedChunks<Q> {
     }
 
     pub(super) fn bytes(&self) -> usize {
-        self.line.iter().map(|it| it.chunk.bytes()).sum()
+        self.line.iter().map(|it| it.chunk.memory_bytes()).sum()
     }
 
     fn place(&self, actor: u32) -> Option<usize> {
@@ -67,9 +67,9 @@ impl<Q> ParkedChunks<Q> {
         now: Instant,
     ) -> Result<(), Q> {
         let place = self.place(chunk.chunk.header.actor);
-        let others = self.bytes() - place.map_or(0, |at| self.line[at].chunk.bytes());
+        let others = self.bytes() - place.map_or(0, |at| self.line[at].chunk.memory_bytes());
         // A single chunk of any size is kept, as an actor with large chunks would otherwise retry forever.
-        if others > 0 && others + chunk.bytes() > CHUNK_BYTES_MAX {
+        if others > 0 && others + chunk.memory_bytes() > CHUNK_BYTES_MAX {
             return Err(question);
         }
         let parked = ParkedChunk {
@@ -166,7 +166,7 @@ mod tests {
         });
         let packer = Packer {
             compression: Compression::None,
-            seal_for: None,
+            spec_hash: None,
         };
         packer.pack(Cow::Owned(chunk))
     }

@@ -269,12 +269,12 @@ mod tests {
     fn what_is_missing_is_named() {
         let now = Instant::now();
         let mut participants = Participants::new(now);
-        let mut check = |who, joins, connected, all_in, missing| {
+        let mut check = |who, joins, connected, all_stored, missing| {
             participants.note_connected(who, connected, now);
             if joins {
                 participants.joined(who, now);
             }
-            assert_eq!(participants.missing(all_in), missing);
+            assert_eq!(participants.missing(all_stored), missing);
         };
         let (learner, actor) = (Alive::learner(5), actor(1));
         let no_learner = Some("no learner has joined yet");

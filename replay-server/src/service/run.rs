@@ -192,8 +192,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     drop(alive);
     let closed = close(&client, queryables, threads);
     let mut state = service.state();
-    if let Some(log) = &mut state.replay.log {
-        log.flush();
+    if let Some(journal) = &mut state.replay.journal {
+        journal.flush();
     }
     if let Some(counts) = state.replay.priority_counts() {
         tracing::info!(

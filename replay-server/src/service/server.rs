@@ -127,7 +127,7 @@ impl State {
 
     /// Counts a rejected message, and logs a line of this kind.
     pub(super) fn refuse(&mut self, kind: &'static str, line: &str) {
-        self.replay.counted().messages_refused += 1;
+        self.replay.counters_mut().messages_refused += 1;
         self.say(kind, line);
     }
 

@@ -77,7 +77,7 @@ impl Service {
             // If not, the process was replaced or is about to join. It repeats a report of the end of the run until it gets an `Ack`.
             let has_joined = state.participants.reported(report, Instant::now());
             if has_joined {
-                state.replay.note_updates(finished.unwrap_or(0));
+                state.replay.raise_updates(finished.unwrap_or(0));
             } else {
                 tracing::debug!("a report of a process that has not joined");
             }
@@ -102,7 +102,7 @@ impl Service {
             chunk_bytes_waiting: state.chunks.bytes() as u64,
             weights_version,
             weights_age_s: state.timings.weights_age_s(now),
-            log: state.replay.log.as_ref().map(Journal::status),
+            log: state.replay.journal.as_ref().map(Journal::status),
             last_warning: last_warning::get()
                 .map(|(text, age)| Warning::new(&text, age.as_secs_f64())),
             processes: state.participants.processes(now, held_since),
@@ -119,7 +119,8 @@ impl Service {
         while !self.shutdown.wait_timeout(LOOK) {
             fail_point::reach("missing");
             let state = self.state();
-            let now = state.participants.missing(state.replay.limiter.all_in());
+            let all_stored = state.replay.limiter.all_stored();
+            let now = state.participants.missing(all_stored);
             drop(state);
             if now != missing.map(|(before, ..)| before) {
                 missing = now.map(|now| (now, Instant::now(), SILENT_MAX));
@@ -166,7 +167,7 @@ impl Service {
 
     pub(super) fn episodes(&self, incoming: Incoming<EpisodesRequest>) {
         self.answer(incoming, |state, request| {
-            Some(state.replay.episodes(request))
+            Some(state.replay.answer_episodes(request))
         });
     }
 
@@ -175,7 +176,7 @@ impl Service {
         let mut status = state.replay.status();
         status.learner_finished = state.participants.is_over();
         // Actors that have delivered a chunk, including those that have exited.
-        let mut acting: HashSet<u32> = state.replay.state.actors.delivered().collect();
+        let mut acting: HashSet<u32> = state.replay.state.actors.acting().collect();
         acting.extend(state.chunks.line.iter().map(|it| it.header().actor));
         status.actors_acting = acting.len() as u32;
         status.actors_waiting = state.chunks.line.len() as u32;

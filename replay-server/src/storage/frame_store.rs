@@ -4,17 +4,17 @@
 use std::{collections::VecDeque, sync::Arc};
 
 use super::{
-    pack::{Block, Run},
+    pack::{Block, StreamFrames},
     reserve,
 };
 use crate::config::Compression;
 
-pub(crate) enum Frames {
+pub(crate) enum FrameStore {
     Plain(PlainFrames),
     Compressed(CompressedFrames),
 }
 
-impl Frames {
+impl FrameStore {
     /// Creates a store for the frames of `capacity` transitions. Compressed frames take at most `bytes_max` bytes, if given. An error holds
     /// the bytes that the system does not grant.
     pub(crate) fn new(
@@ -31,13 +31,13 @@ impl Frames {
 
     /// Stores the frames of the next transitions, the first in `slot`. May drop the frames before transition `oldest`. Returns the oldest
     /// transition whose frame is held.
-    pub(crate) fn push(&mut self, run: Run<'_>, slot: usize, oldest: u64) -> u64 {
-        match (self, run) {
-            (Self::Plain(frames), Run::Plain(run)) => {
-                frames.push(run, slot);
+    pub(crate) fn push(&mut self, new: StreamFrames<'_>, slot: usize, oldest: u64) -> u64 {
+        match (self, new) {
+            (Self::Plain(frames), StreamFrames::Plain(new)) => {
+                frames.push(new, slot);
                 oldest
             }
-            (Self::Compressed(frames), Run::Packed(run)) => frames.push(run, oldest),
+            (Self::Compressed(frames), StreamFrames::Packed(new)) => frames.push(new, oldest),
             _ => panic!("a chunk was packed for a replay with another compression"),
         }
     }
@@ -102,11 +102,11 @@ impl PlainFrames {
         let capacity_bytes = self.capacity as usize * self.frame_bytes;
         let mut at = slot * self.frame_bytes;
         while !frames.is_empty() {
-            let (now, rest) = frames.split_at(frames.len().min(capacity_bytes - at));
+            let (part, rest) = frames.split_at(frames.len().min(capacity_bytes - at));
             if at == self.bytes.len() {
-                self.bytes.extend_from_slice(now);
+                self.bytes.extend_from_slice(part);
             } else {
-                self.bytes[at..][..now.len()].copy_from_slice(now);
+                self.bytes[at..][..part.len()].copy_from_slice(part);
             }
             (frames, at) = (rest, 0);
         }
@@ -119,12 +119,12 @@ impl PlainFrames {
 }
 
 /// A block that is held, with the index of its first transition.
-struct Held {
+struct HeldBlock {
     first: u64,
     block: Arc<Block>,
 }
 
-impl Held {
+impl HeldBlock {
     fn end(&self) -> u64 {
         self.first + self.block.frames as u64
     }
@@ -138,7 +138,7 @@ pub(crate) struct CompressedFrames {
     bytes_max: u64,
     /// The bytes of all blocks.
     bytes: u64,
-    blocks: VecDeque<Held>,
+    blocks: VecDeque<HeldBlock>,
 }
 
 impl CompressedFrames {
@@ -154,8 +154,8 @@ impl CompressedFrames {
     /// Stores the next transitions' frames. Drops those before `oldest`, and more of the oldest if `bytes_max` requires it.
     ///
     /// Returns the oldest transition whose frame is held.
-    pub(crate) fn push(&mut self, run: &[Arc<Block>], mut oldest: u64) -> u64 {
-        for block in run {
+    pub(crate) fn push(&mut self, new: &[Arc<Block>], mut oldest: u64) -> u64 {
+        for block in new {
             let bytes = block.bytes.len() as u64;
             self.forget_before(oldest);
             while self.bytes + bytes > self.bytes_max
@@ -165,8 +165,8 @@ impl CompressedFrames {
                 self.forget_before(oldest);
             }
             self.bytes += bytes;
-            self.blocks.push_back(Held {
-                first: self.blocks.back().map_or(oldest, Held::end),
+            self.blocks.push_back(HeldBlock {
+                first: self.blocks.back().map_or(oldest, HeldBlock::end),
                 block: Arc::clone(block),
             });
         }
@@ -190,7 +190,7 @@ impl CompressedFrames {
     pub(crate) fn bytes_held(&self) -> u64 {
         // An `Arc` adds two reference counts to a block.
         let block = size_of::<Block>() + 2 * size_of::<usize>();
-        let queue = self.blocks.capacity() * size_of::<Held>();
+        let queue = self.blocks.capacity() * size_of::<HeldBlock>();
         self.bytes + (self.blocks.len() * block + queue) as u64
     }
 

@@ -8,8 +8,8 @@ pub(crate) mod ring;
 /// Reserves an empty vector for `count` values; the system provides memory only as values are written. An error holds the bytes that the
 /// system does not grant.
 pub(crate) fn reserve<T>(count: u64) -> Result<Vec<T>, u64> {
-    let asked = count.saturating_mul(size_of::<T>() as u64);
+    let bytes = count.saturating_mul(size_of::<T>() as u64);
     let mut values = Vec::new();
     let reserved = values.try_reserve_exact(usize::try_from(count).unwrap_or(usize::MAX));
-    reserved.map(|()| values).map_err(|_| asked)
+    reserved.map(|()| values).map_err(|_| bytes)
 }

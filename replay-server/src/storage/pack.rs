@@ -28,16 +28,16 @@ const PARTS_MAX: usize = 5;
 pub(crate) struct Packer {
     pub(crate) compression: Compression,
     /// Hash of the run spec, if chunks are also written to disk, as messages.
-    pub(crate) seal_for: Option<u64>,
+    pub(crate) spec_hash: Option<u64>,
 }
 
 /// A chunk with its frames as the replay will keep them.
 pub(crate) struct PackedChunk<'a> {
     pub(crate) chunk: Cow<'a, Chunk>,
     /// The blocks of each stream; empty without compression.
-    packed: Vec<Vec<Arc<Block>>>,
+    blocks: Vec<Vec<Arc<Block>>>,
     /// Prefix and header of the chunk's message, if chunks are written to disk and this chunk fits into a message.
-    pub(crate) sealed: Option<Vec<u8>>,
+    pub(crate) message_head: Option<Vec<u8>>,
 }
 
 /// Consecutive frames of one stream, compressed.
@@ -51,7 +51,7 @@ pub(crate) struct Block {
 
 /// The frames of one stream, to be stored in the replay.
 #[derive(Clone, Copy)]
-pub(crate) enum Run<'a> {
+pub(crate) enum StreamFrames<'a> {
     Plain(&'a [u8]),
     Packed(&'a [Arc<Block>]),
 }
@@ -59,63 +59,64 @@ pub(crate) enum Run<'a> {
 impl Packer {
     /// Compresses the chunk's frames if the replay compresses, and encodes the message's head if the replay is on disk.
     pub(crate) fn pack<'a>(&self, chunk: Cow<'a, Chunk>) -> PackedChunk<'a> {
-        let packed = match self.compression {
+        let blocks = match self.compression {
             Compression::None => Vec::new(),
-            Compression::Lz4 => runs(&chunk)
-                .map(|run| blocks(run, Layout::new(chunk.header.frame_bytes as usize)))
+            Compression::Lz4 => frames_by_stream(&chunk)
+                .map(|frames| pack_blocks(frames, chunk.header.frame_bytes as usize))
                 .collect(),
         };
         let seal = |hash| codec::seal(hash, &chunk.header, chunk.payload()).ok();
-        let sealed = self.seal_for.and_then(seal);
+        let message_head = self.spec_hash.and_then(seal);
         PackedChunk {
             chunk,
-            packed,
-            sealed,
+            blocks,
+            message_head,
         }
     }
 }
 
 impl PackedChunk<'_> {
     /// Returns the approximate bytes of memory that the chunk takes.
-    pub(crate) fn bytes(&self) -> usize {
-        let packed = self.packed.iter().flatten().map(|block| block.bytes.len());
-        self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed.sum::<usize>()
+    pub(crate) fn memory_bytes(&self) -> usize {
+        let bytes = self.blocks.iter().flatten().map(|block| block.bytes.len());
+        self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + bytes.sum::<usize>()
     }
 
     /// Returns the frames of one of the chunk's streams.
-    pub(crate) fn run(&self, stream: usize) -> Run<'_> {
-        match self.packed.get(stream) {
-            Some(blocks) => Run::Packed(blocks),
+    pub(crate) fn stream_frames(&self, stream: usize) -> StreamFrames<'_> {
+        match self.blocks.get(stream) {
+            Some(blocks) => StreamFrames::Packed(blocks),
             None => {
-                let run = runs(&self.chunk).nth(stream);
-                Run::Plain(run.expect("a chunk that is stored has all its streams"))
+                let frames = frames_by_stream(&self.chunk).nth(stream);
+                StreamFrames::Plain(frames.expect("a chunk that is stored has all its streams"))
             }
         }
     }
 }
 
 /// Returns the frames of each stream. An empty chunk, which will be rejected, has none.
-fn runs(chunk: &Chunk) -> impl Iterator<Item = &[u8]> {
-    let run_bytes = chunk.header.steps as usize * chunk.header.frame_bytes as usize;
-    chunk.frames().chunks_exact(run_bytes.max(1))
+fn frames_by_stream(chunk: &Chunk) -> impl Iterator<Item = &[u8]> {
+    let stream_bytes = chunk.header.steps as usize * chunk.header.frame_bytes as usize;
+    chunk.frames().chunks_exact(stream_bytes.max(1))
 }
 
 /// Compresses a stream's frames into consecutive blocks.
-fn blocks(frames: &[u8], layout: Layout) -> Vec<Arc<Block>> {
-    let blocks = frames.chunks(layout.block_frames_max() * layout.frame_bytes);
+fn pack_blocks(frames: &[u8], frame_bytes: usize) -> Vec<Arc<Block>> {
+    let layout = BlockLayout::new(frame_bytes);
+    let blocks = frames.chunks(layout.block_frames_max() * frame_bytes);
     let packed = blocks.map(|block| Arc::new(Block::new(block, layout)));
     packed.collect()
 }
 
 /// How a block is divided into parts.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Layout {
+pub(crate) struct BlockLayout {
     pub(crate) frame_bytes: usize,
     /// Frames of each part but the key; the last part may have fewer.
     part_frames: usize,
 }
 
-impl Layout {
+impl BlockLayout {
     pub(crate) fn new(frame_bytes: usize) -> Self {
         Self {
             frame_bytes,
@@ -129,7 +130,7 @@ impl Layout {
     }
 
     /// Returns the number of parts of a block of `frames` frames, key included.
-    const fn parts(&self, frames: usize) -> usize {
+    const fn part_count(&self, frames: usize) -> usize {
         1 + (frames - 1).div_ceil(self.part_frames)
     }
 
@@ -139,7 +140,7 @@ impl Layout {
     }
 
     /// Returns the frames of one part of a block of `frames` frames.
-    pub(crate) fn frames_of(&self, part: usize, frames: usize) -> Range<usize> {
+    pub(crate) fn frames_in_part(&self, part: usize, frames: usize) -> Range<usize> {
         match part {
             0 => 0..1,
             _ => {
@@ -151,14 +152,14 @@ impl Layout {
 }
 
 impl Block {
-    fn new(frames: &[u8], layout: Layout) -> Self {
+    fn new(frames: &[u8], layout: BlockLayout) -> Self {
         let key = &frames[..layout.frame_bytes];
         let count = frames.len() / layout.frame_bytes;
         let (mut bytes, mut scratch) = (Vec::new(), Vec::new());
         let mut part_ends = [0; 1 + PARTS_MAX];
-        let parts = layout.parts(count);
+        let parts = layout.part_count(count);
         for (part, end) in part_ends.iter_mut().enumerate().take(parts) {
-            let range = layout.frames_of(part, count);
+            let range = layout.frames_in_part(part, count);
             let plain = &frames[range.start * layout.frame_bytes..range.end * layout.frame_bytes];
             scratch.resize(get_maximum_output_size(plain.len()), 0);
             let packed = match part {

@@ -4,7 +4,7 @@
 use driml_protocol::End;
 use serde::{Deserialize, Serialize};
 
-use super::{frame_store::Frames, pack::Run, reserve};
+use super::{frame_store::FrameStore, pack::StreamFrames, reserve};
 
 /// How a transition continues its stream. `after` is the index of the transition just before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -21,7 +21,7 @@ pub(crate) enum Link {
 
 impl Link {
     /// Returns `Lost` if the transition before is `first_lost` or later, and is therefore gone; otherwise returns the link unchanged.
-    pub(crate) const fn without(self, first_lost: u64) -> Self {
+    pub(crate) const fn cut_at(self, first_lost: u64) -> Self {
         match self {
             Self::LevelStart { after } | Self::Within { after } if after >= first_lost => {
                 Self::Lost
@@ -31,7 +31,7 @@ impl Link {
     }
 
     /// Returns the index of the transition just before, if there is one.
-    pub(crate) const fn after(self) -> Option<u64> {
+    pub(crate) const fn previous(self) -> Option<u64> {
         match self {
             Self::LevelStart { after } | Self::Within { after } => Some(after),
             Self::EpisodeStart | Self::Lost => None,
@@ -51,7 +51,7 @@ impl Link {
 /// No successor: it has not come yet, never will, or belongs to the next episode.
 const NO_NEXT: u64 = u64::MAX;
 /// No predecessor: this is the first of an episode or level.
-const LEVEL_START: u64 = u64::MAX;
+const NO_PREVIOUS: u64 = u64::MAX;
 /// The predecessor was lost.
 const PREVIOUS_LOST: u64 = u64::MAX - 1;
 
@@ -70,7 +70,7 @@ impl Step {
     pub(crate) const fn new(action: u8, reward: f32, end: End, weights_version: u64) -> Self {
         Self {
             next: NO_NEXT,
-            previous: LEVEL_START,
+            previous: NO_PREVIOUS,
             weights_version,
             reward,
             action,
@@ -104,12 +104,12 @@ pub(crate) struct Ring {
     oldest: u64,
     inserted: u64,
     steps: Vec<Step>,
-    frames: Frames,
+    frames: FrameStore,
 }
 
 impl Ring {
     /// Creates an empty ring of `capacity` transitions with their `frames`. An error holds the bytes that the system does not grant.
-    pub(crate) fn new(capacity: u64, frames: Frames) -> Result<Self, u64> {
+    pub(crate) fn new(capacity: u64, frames: FrameStore) -> Result<Self, u64> {
         Ok(Self {
             capacity,
             first: 0,
@@ -121,13 +121,13 @@ impl Ring {
     }
 
     /// Drops all transitions. The next one gets the index `first`.
-    pub(crate) fn start_at(&mut self, first: u64) {
+    pub(crate) fn restart_at(&mut self, first: u64) {
         self.steps.clear();
         (self.first, self.oldest, self.inserted) = (first, first, first);
         self.frames.clear();
     }
 
-    pub(crate) const fn first(&self) -> u64 {
+    pub(crate) const fn first_index(&self) -> u64 {
         self.first
     }
 
@@ -139,9 +139,9 @@ impl Ring {
     /// Stores consecutive transitions of one stream. Once the ring is full, they overwrite the oldest ones.
     ///
     /// `link` is the link of the first one. Returns the link of the transition that will follow the last one.
-    pub(crate) fn push_run(
+    pub(crate) fn push_steps(
         &mut self,
-        frames: Run<'_>,
+        frames: StreamFrames<'_>,
         steps: impl ExactSizeIterator<Item = Step>,
         mut link: Link,
     ) -> Link {
@@ -159,7 +159,7 @@ impl Ring {
     fn push(&mut self, step: Step, link: Link) -> u64 {
         let index = self.inserted;
         let previous = match link {
-            Link::EpisodeStart | Link::LevelStart { .. } => LEVEL_START,
+            Link::EpisodeStart | Link::LevelStart { .. } => NO_PREVIOUS,
             Link::Within { after } => after,
             Link::Lost => PREVIOUS_LOST,
         };
@@ -211,13 +211,13 @@ impl Ring {
         &self.steps[self.slot(index)]
     }
 
-    pub(crate) const fn frames(&self) -> &Frames {
+    pub(crate) const fn frames(&self) -> &FrameStore {
         &self.frames
     }
 
     pub(crate) fn previous(&self, index: u64) -> Previous {
         match self.step(index).previous {
-            LEVEL_START => Previous::Start,
+            NO_PREVIOUS => Previous::Start,
             PREVIOUS_LOST => Previous::Gone,
             previous if previous < self.oldest() => Previous::Gone,
             previous => Previous::Held(previous),
@@ -240,7 +240,7 @@ impl Ring {
                 assert!(!ended, "{index} ended its episode, yet {next} follows");
                 let back = match step.end {
                     End::Running => index,
-                    _ => LEVEL_START,
+                    _ => NO_PREVIOUS,
                 };
                 assert_eq!(self.step(next).previous, back, "{next} follows {index}");
             }

@@ -227,15 +227,15 @@ fn a_poll_says_what_became_of_a_chunk() {
         sequence,
         leaving: false,
     };
-    let unknown = replay.poll(&poll(1, 0)).unwrap();
+    let unknown = replay.answer_poll(&poll(1, 0)).unwrap();
     assert!(is_refused(&unknown), "{unknown:?}");
     insert(&mut replay, header(0, 1, 0, 0));
-    assert_eq!(replay.poll(&poll(1, 0)), Some(stored(6)));
-    assert_eq!(replay.poll(&poll(1, 1)), None, "it is still to come");
+    assert_eq!(replay.answer_poll(&poll(1, 0)), Some(stored(6)));
+    assert_eq!(replay.answer_poll(&poll(1, 1)), None, "it is still to come");
     insert(&mut replay, header(0, 1, 1, 6));
     let finished = InsertReply::Finished { inserted_total: 12 };
-    assert_eq!(replay.poll(&poll(1, 2)), Some(finished));
-    assert_eq!(replay.poll(&poll(1, 1)), Some(stored(12)));
+    assert_eq!(replay.answer_poll(&poll(1, 2)), Some(finished));
+    assert_eq!(replay.answer_poll(&poll(1, 1)), Some(stored(12)));
     assert_eq!(replay.status().chunks_retried, 0, "nothing was sent twice");
 }
 
@@ -264,7 +264,7 @@ fn rows_that_were_not_learned_from_do_not_count() {
     assert_eq!(replay.sample(8), Err(NotReady::Finished));
     let affinity = |version, p| affinity(version, 5, vec![p; 25]);
     replay.set_affinity(&affinity(9, 0.5)).unwrap();
-    replay.note_learned(learned(8, 5, 72)).unwrap();
+    replay.set_progress(learned(8, 5, 72)).unwrap();
 
     assert_eq!(replay.join_learner(learner(2, 5, 40, 18)), Ok(3));
     replay.check_valid();
@@ -312,7 +312,7 @@ fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
         for _ in 0..8 {
             replay.sample(8).unwrap();
         }
-        replay.note_learned(learned(8, 5, 64)).unwrap();
+        replay.set_progress(learned(8, 5, 64)).unwrap();
         let joined = replay.join_learner(join);
         assert_eq!(joined, expected.map_err(String::from), "a learner {which}");
         let rows = match (joined.is_ok(), join.learner) {

@@ -266,7 +266,7 @@ proptest! {
             since: resumed.map(|_| Since { transitions, rows: rows_before, updates: 0 }),
             ..Config::unlimited(1)
         })
-        .counting_on(counts(transitions, rows_before), ShardCounts::default());
+        .with_counts(counts(transitions, rows_before), ShardCounts::default());
         let (mut inserted, mut sampled) = (transitions, rows_before);
         // The rows that the ratio allows, counted one transition at a time.
         let mut allowed = rows_before as f64;
@@ -276,16 +276,16 @@ proptest! {
             let next = moves.next();
             let (insert, chunk) = next.unwrap_or((limiter.may_insert(), 50));
             if insert && limiter.may_insert() {
-                limiter.inserted(chunk);
+                limiter.count_inserted(chunk);
                 allowed += ratio * ((inserted + chunk).max(start) - inserted.max(start)) as f64;
                 inserted += chunk;
             } else if limiter.may_sample(rows) {
-                limiter.sampled(rows);
+                limiter.count_sampled(rows);
                 sampled += u64::from(rows);
             }
             let (may_insert, may_sample) = (limiter.may_insert(), limiter.may_sample(rows));
-            prop_assert_eq!(limiter.finished(rows), inserted >= max && !may_sample);
-            prop_assert!(may_insert || may_sample || limiter.finished(rows), "both sides wait");
+            prop_assert_eq!(limiter.is_finished(rows), inserted >= max && !may_sample);
+            prop_assert!(may_insert || may_sample || limiter.is_finished(rows), "both sides wait");
             prop_assert!(sampled as f64 <= allowed + 1e-6, "{} rows of {}", sampled, allowed);
             prop_assert!(sampled == rows_before || inserted >= warmup);
             let ahead = allowed - sampled as f64 - ratio * slack as f64;
@@ -318,7 +318,7 @@ proptest! {
         let there = counts(inserted_there % inserted, sampled_there % rows_sampled);
         let here = counts(inserted - there.inserted, rows_sampled - there.rows_sampled);
         let config = Config { replay_ratio: 8.0, slack_transitions: 1000, ..Config::unlimited(1) };
-        let limiter = RateLimiter::new(&config).counting_on(here, there);
+        let limiter = RateLimiter::new(&config).with_counts(here, there);
         let near = credit.unsigned_abs() as u32;
         for rows in [1, 32, 256, near, near + 1] {
             prop_assert_eq!(limiter.may_sample(rows), i64::from(rows) <= credit);

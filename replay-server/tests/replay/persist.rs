@@ -199,7 +199,7 @@ fn record_end(bytes: &[u8], at: u64) -> u64 {
 /// Uses a replay restored after a crash: the learner's report replaces the count of rows, and rows are right.
 fn check_continues(life: &StoredReplay, mut replay: Replay) {
     let rows = life.replay.counts().rows_sampled;
-    replay.note_learned(learned(0, 0, rows)).unwrap();
+    replay.set_progress(learned(0, 0, rows)).unwrap();
     assert_eq!(replay.counts(), life.replay.counts());
     for client in 0..6 {
         let id = RequestId::first(1000 + client);
@@ -308,7 +308,7 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
         life.store(1);
         // A checkpoint every 2,000 transitions: no segment is ever full.
         let saved = life.history.inserted / 2000;
-        life.replay.note_learned(learned(saved, saved, 0)).unwrap();
+        life.replay.set_progress(learned(saved, saved, 0)).unwrap();
         let bytes = bytes_in(&life.args.dir);
         assert!(bytes <= 4 << 20, "{bytes}");
     }
@@ -356,7 +356,8 @@ fn a_resumed_run_continues_with_what_was_kept() {
         assert_eq!(status.transitions_inserted, before.transitions_inserted);
         assert_eq!(status.rows_sampled, rows);
         assert_eq!(status.transitions_refilled, 0);
-        assert_eq!(replay.resumed_after(), 0, "the replay is of the whole run");
+        let updates = replay.resumed_after_updates();
+        assert_eq!(updates, 0, "the replay is of the whole run");
         replay.check_valid();
     }
 
@@ -366,7 +367,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
     replay.join_learner(learner(80, 70, 280, 90)).unwrap();
     drop(replay);
     let (replay, _) = open(&args, &config).unwrap();
-    assert_eq!(replay.resumed_after(), 70);
+    assert_eq!(replay.resumed_after_updates(), 70);
     let counts = replay.counts();
     assert_eq!((counts.inserted, counts.rows_sampled), (90, 280));
 }

@@ -84,7 +84,7 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         assert_eq!(status.rows_sampled, served, "{what}");
         let held = stored.min(config.capacity_transitions);
         assert_eq!(status.transitions_held, held, "{what}");
-        assert_eq!(replay.resumed_after(), join.updates, "{what}");
+        assert_eq!(replay.resumed_after_updates(), join.updates, "{what}");
     }
 }
 

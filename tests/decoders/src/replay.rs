@@ -128,7 +128,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
                 sequence: numbers.count()?,
                 leaving: numbers.byte()? % 2 == 0,
             };
-            let _ = replay.poll(&poll);
+            let _ = replay.answer_poll(&poll);
         }
         5 => {
             let id = RequestId {
@@ -169,7 +169,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
                     other_shards: counts(numbers.count()?, numbers.count()?),
                     restart: byte % 8 == 0,
                 });
-                let _ = replay.note_learned(Learned {
+                let _ = replay.set_progress(Learned {
                     updates: numbers.count()?,
                     saved_updates: numbers.count()?,
                     rows_received: numbers.count()?,

@@ -146,6 +146,6 @@ fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockste
     let ask = |_, since| Some(lockstep.replay.episodes_since(since));
     let mut warnings = recorder.record_episodes(view, ask);
     warnings.extend(recorder.record(view, &[]));
-    lockstep.replay.note_recorded(ended);
+    lockstep.replay.set_recorded_episodes(ended);
     warnings
 }

@@ -102,7 +102,7 @@ impl RowSampler for Priorities {
     /// Gives the highest priority seen to each transition that can be an anchor now.
     fn stored(&mut self, ring: &Ring, first: u64, link: Link) {
         self.forget(ring);
-        let waiting = link.after().and_then(|after| self.open.remove(&after));
+        let waiting = link.previous().and_then(|after| self.open.remove(&after));
         let mut waiting = waiting.unwrap_or_default();
         let mass = self.mass(self.highest);
         for index in first.max(ring.oldest())..ring.inserted() {
