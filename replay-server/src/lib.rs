@@ -59,7 +59,7 @@ mod storage;
 pub use config::{Compression, Config, Since};
 pub use driml_protocol::NotReady;
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
-pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery};
+pub use persist::{Mark, PersistArgs, PersistError, RecoveryControl, RecoveryReport, ReplayFolder};
 pub use rate_limiter::RateLimiter;
 pub use replay::Replay;
 pub use sampling::{

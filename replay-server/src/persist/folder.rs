@@ -14,11 +14,11 @@ use serde::{Deserialize, Serialize};
 use super::snapshot::Snapshot;
 
 /// Format of the log (thousands) and of the messages in it (ones). A log of another format is rejected.
-pub(super) const FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
+pub(super) const LOG_FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
 /// The file that identifies the log.
-const ID: &str = "log.toml";
+const ID_FILE: &str = "log.toml";
 /// Maximum number of a segment. Files with higher numbers do not belong to a log.
-const NUMBER_MAX: u64 = 1 << 60;
+const SEGMENT_NUMBER_MAX: u64 = 1 << 60;
 
 /// Why a replay cannot be read from or written to its folder.
 #[derive(Debug, thiserror::Error)]
@@ -99,11 +99,11 @@ impl LogFolder {
         })
     }
 
-    pub(super) fn segment(&self, number: u64) -> PathBuf {
+    pub(super) fn segment_path(&self, number: u64) -> PathBuf {
         self.path.join(format!("segment-{number:012}.log"))
     }
 
-    pub(super) fn segments(&self) -> Result<Vec<u64>, PersistError> {
+    pub(super) fn segment_numbers(&self) -> Result<Vec<u64>, PersistError> {
         let number = |entry: io::Result<fs::DirEntry>| {
             let name = entry?.file_name();
             let name = name.to_str();
@@ -111,8 +111,8 @@ impl LogFolder {
             let number = digits.and_then(|digits| digits.parse().ok());
             // Ignores a copy named without the leading zeros, as its number is another segment's.
             let is_own = |&number: &u64| {
-                let own = self.segment(number);
-                number <= NUMBER_MAX && own.file_name().and_then(OsStr::to_str) == name
+                let own = self.segment_path(number);
+                number <= SEGMENT_NUMBER_MAX && own.file_name().and_then(OsStr::to_str) == name
             };
             Ok(number.filter(is_own))
         };
@@ -124,26 +124,26 @@ impl LogFolder {
         Ok(numbers)
     }
 
-    pub(super) fn read(&self, number: u64) -> Result<Vec<u8>, PersistError> {
-        let path = self.segment(number);
+    pub(super) fn read_segment(&self, number: u64) -> Result<Vec<u8>, PersistError> {
+        let path = self.segment_path(number);
         fs::read(&path).map_err(io_error("reading", &path))
     }
 
-    pub(super) fn cut_off(&self, number: u64, at: usize) -> Result<(), PersistError> {
-        let path = self.segment(number);
+    pub(super) fn truncate_segment(&self, number: u64, at: usize) -> Result<(), PersistError> {
+        let path = self.segment_path(number);
         let opened = File::options().write(true).open(&path);
         opened
             .and_then(|opened| opened.set_len(at as u64))
             .map_err(io_error("cutting off the end of", &path))
     }
 
-    pub(super) fn remove(&self, number: u64) -> Result<(), PersistError> {
-        let path = self.segment(number);
+    pub(super) fn remove_segment(&self, number: u64) -> Result<(), PersistError> {
+        let path = self.segment_path(number);
         fs::remove_file(&path).map_err(io_error("removing", &path))
     }
 
     pub(super) fn read_id(&self) -> Result<Option<LogId>, PersistError> {
-        let path = self.path.join(ID);
+        let path = self.path.join(ID_FILE);
         let text = match fs::read_to_string(&path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
             read => read.map_err(io_error("reading", &path))?,
@@ -155,7 +155,7 @@ impl LogFolder {
     }
 
     pub(super) fn write_id(&self, id: &LogId) -> Result<(), PersistError> {
-        let path = self.path.join(ID);
+        let path = self.path.join(ID_FILE);
         let text = toml::to_string(id).expect("a struct of numbers is TOML");
         let text =
             format!("# The replay that a replay server of driml keeps in this folder.\n{text}");
@@ -163,11 +163,11 @@ impl LogFolder {
     }
 
     /// Checks that `found` is the log of the run and shard of `ours`.
-    pub(super) fn check(&self, found: &LogId, ours: &LogId) -> Result<(), PersistError> {
+    pub(super) fn check_same_run(&self, found: &LogId, ours: &LogId) -> Result<(), PersistError> {
         let unusable = |why| Err(PersistError::Unusable(self.path.clone(), why));
-        if found.format != FORMAT {
+        if found.format != LOG_FORMAT {
             return unusable(format!(
-                "holds a replay of format {}, this version reads {FORMAT}: choose another --replay-dir",
+                "holds a replay of format {}, this version reads {LOG_FORMAT}: choose another --replay-dir",
                 found.format
             ));
         }

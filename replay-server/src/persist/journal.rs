@@ -16,23 +16,23 @@ use driml_protocol::{LogLimiter, LogStatus, codec};
 use super::{
     folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader, io_error},
     record::{self, RecordKind},
-    snapshot::{Note, Snapshot},
+    snapshot::{ProcessEvent, Snapshot},
     sync::Syncer,
 };
 use crate::storage::pack::PackedChunk;
 
 /// The minimum length of a segment, in multiples of the snapshot that it begins with.
-const SNAPSHOTS: u64 = 4;
+const SNAPSHOTS_PER_SEGMENT_MIN: u64 = 4;
 /// Time until a retry after a new segment could not be begun. Meanwhile the newest segment grows.
 const RETRY: Duration = Duration::from_secs(1);
 /// Number of marks kept. If the newest belongs to a checkpoint that was not written completely, the one before it is needed.
-const MARKS: usize = 2;
+const MARKS_KEPT: usize = 2;
 
 /// A segment of the log that is in the folder.
 #[derive(Debug)]
 pub(super) struct Segment {
     pub(super) number: u64,
-    pub(super) first_row: u64,
+    pub(super) first_transition: u64,
     pub(super) bytes: u64,
     /// Bytes of the snapshot that the segment begins with; 0 for a segment that was read back, to which nothing more is written.
     pub(super) snapshot_bytes: u64,
@@ -40,7 +40,7 @@ pub(super) struct Segment {
 
 /// The position at which a log is continued.
 #[derive(Default)]
-pub(super) struct Place {
+pub(super) struct LogPosition {
     /// The usable segments.
     pub(super) segments: VecDeque<Segment>,
     pub(super) number: u64,
@@ -56,10 +56,10 @@ pub(super) struct LogLimits {
     pub(super) segment_bytes: u64,
     pub(super) disk_bytes_max: Option<u64>,
     /// Period between flushes of the log; zero flushes after each write.
-    pub(super) fsync: Duration,
+    pub(super) fsync_period: Duration,
 }
 
-struct Failing {
+struct WriteFailure {
     since: Instant,
     /// The text of the last error.
     why: String,
@@ -79,10 +79,10 @@ pub(crate) struct Journal {
     syncer: Syncer,
     /// Records that the disk has rejected so far. No other record is written before them.
     pending: Vec<u8>,
-    failing: Option<Failing>,
+    write_failure: Option<WriteFailure>,
     /// When a new segment could not be begun; `None` if one was begun since.
-    not_begun: Option<Instant>,
-    said: LogLimiter,
+    rotate_failed_at: Option<Instant>,
+    log_limiter: LogLimiter,
     /// The last two marks that were not given up, newest last, each with the oldest transition held then. Segments that they need are kept.
     marks: VecDeque<(Mark, u64)>,
 }
@@ -92,32 +92,32 @@ impl Journal {
     pub(super) fn begin(
         folder: LogFolder,
         id: LogId,
-        place: Place,
+        position: LogPosition,
         limits: LogLimits,
         snapshot: &Snapshot,
     ) -> Result<Self, PersistError> {
         let syncer = File::open(&folder.path)
-            .and_then(|opened| Syncer::start(opened, limits.fsync))
+            .and_then(|opened| Syncer::start(opened, limits.fsync_period))
             .map_err(io_error("opening", &folder.path))?;
-        let (number, mut segments) = (place.number, place.segments);
-        let begun = begin_segment(&folder, id, number, place.ordinal, snapshot);
-        let (segment, file) = begun.map_err(io_error("writing", &folder.segment(number)))?;
+        let (number, mut segments) = (position.number, position.segments);
+        let begun = create_segment(&folder, id, number, position.ordinal, snapshot);
+        let (segment, file) = begun.map_err(io_error("writing", &folder.segment_path(number)))?;
         segments.push_back(segment);
-        syncer.opened(number, file.clone());
+        syncer.add_segment(number, file.clone());
         Ok(Self {
             folder,
             id,
             segments,
             file,
-            ordinal: place.ordinal + 1,
+            ordinal: position.ordinal + 1,
             limits,
             largest: 0,
             syncer,
             pending: Vec::new(),
-            failing: None,
-            not_begun: None,
-            said: LogLimiter::default(),
-            marks: place.mark.into_iter().collect(),
+            write_failure: None,
+            rotate_failed_at: None,
+            log_limiter: LogLimiter::default(),
+            marks: position.mark.into_iter().collect(),
         })
     }
 
@@ -127,16 +127,16 @@ impl Journal {
 
     pub(crate) fn flush(&mut self) {
         self.write_pending();
-        self.syncer.flush();
+        self.syncer.flush_or_warn();
     }
 
     pub(crate) fn status(&self) -> LogStatus {
-        let refused = self.failing.as_ref();
+        let refused = self.write_failure.as_ref();
         LogStatus {
             folder: self.folder.path.display().to_string(),
             bytes: self.bytes(),
             bytes_max: self.limits.disk_bytes_max,
-            flushed_s: self.syncer.flushed_s(),
+            flushed_s: self.syncer.since_flush_s(),
             refused: refused.map(|it| (it.since.elapsed().as_secs_f64(), it.why.clone())),
             unwritten_bytes: self.pending.len() as u64,
         }
@@ -148,7 +148,7 @@ impl Journal {
 
     /// Whether the last write to the disk failed.
     pub(crate) const fn is_failing(&self) -> bool {
-        self.failing.is_some()
+        self.write_failure.is_some()
     }
 
     /// Writes the records that the disk has rejected before. Returns whether all are written now.
@@ -161,10 +161,10 @@ impl Journal {
         is_written
     }
 
-    /// Appends a note. If the disk rejects it, the note stays pending and is written before any other record.
-    pub(super) fn append_note(&mut self, note: &Note) {
-        let body = codec::encode_value(note).expect("a note is far below the codec's limit");
-        let record = record::head(RecordKind::Note, self.ordinal, &body, 0);
+    /// Appends an event. If the disk rejects it, the event stays pending and is written before any other record.
+    pub(super) fn append_event(&mut self, event: &ProcessEvent) {
+        let body = codec::encode_value(event).expect("a note is far below the codec's limit");
+        let record = record::encode_head(RecordKind::Event, self.ordinal, &body, 0);
         self.ordinal += 1;
         self.pending.extend_from_slice(&record);
         self.write_pending();
@@ -175,13 +175,13 @@ impl Journal {
         let head = packed.message_head.as_ref();
         let head = head.ok_or("the chunk is larger than a message may be")?;
         let payload = packed.chunk.payload();
-        let record = record::head(RecordKind::Chunk, self.ordinal, head, payload.len());
+        let record = record::encode_head(RecordKind::Chunk, self.ordinal, head, payload.len());
         let is_written = self.write_pending() && self.write(&record, payload);
         self.ordinal += u64::from(is_written);
         Ok(is_written)
     }
 
-    fn newest(&mut self) -> &mut Segment {
+    fn newest_segment(&mut self) -> &mut Segment {
         self.segments
             .back_mut()
             .expect("a log always has the segment that it writes")
@@ -191,24 +191,24 @@ impl Journal {
     fn write(&mut self, record: &[u8], payload: &[u8]) -> bool {
         let &mut Segment {
             number, bytes: at, ..
-        } = self.newest();
+        } = self.newest_segment();
         let bytes = (record.len() + payload.len()) as u64;
         self.largest = self.largest.max(bytes);
         let written = self
             .file
             .write_all_at(record, at)
             .and_then(|()| self.file.write_all_at(payload, at + record.len() as u64))
-            .and_then(|()| self.syncer.written(number, &self.file));
+            .and_then(|()| self.syncer.after_write(number, &self.file));
         if let Err(e) = written {
             // A partial record after the end is ignored on recovery; cutting it off makes room.
             if let Err(e) = self.file.set_len(at) {
                 tracing::debug!("cutting off what was not written whole: {e}");
             }
-            self.note_failing(&e);
+            self.record_write_failure(&e);
             return false;
         }
-        self.newest().bytes = at + bytes;
-        if self.failing.take().is_some() {
+        self.newest_segment().bytes = at + bytes;
+        if self.write_failure.take().is_some() {
             tracing::warn!(
                 "the replay's log in {} can be written again; nothing was lost",
                 self.folder.path.display()
@@ -217,13 +217,13 @@ impl Journal {
         true
     }
 
-    fn note_failing(&mut self, e: &io::Error) {
-        let failing = self.failing.get_or_insert_with(|| Failing {
+    fn record_write_failure(&mut self, e: &io::Error) {
+        let write_failure = self.write_failure.get_or_insert_with(|| WriteFailure {
             since: Instant::now(),
             why: String::new(),
         });
-        failing.why = e.to_string();
-        if let Some(more) = self.said.due() {
+        write_failure.why = e.to_string();
+        if let Some(more) = self.log_limiter.due() {
             tracing::error!(
                 "the replay's log in {} cannot be written: {e}; nothing more is stored until it can: make room or make it writable{more}",
                 self.folder.path.display()
@@ -232,32 +232,32 @@ impl Journal {
     }
 
     /// Whether a new segment is due: the newest has reached its length, or a failed flush may have lost data written to it.
-    pub(super) fn is_full(&self) -> bool {
-        let is_full = |it: &Segment| {
-            it.bytes >= self.length(it.snapshot_bytes) || self.syncer.has_lost(it.number)
+    pub(super) fn needs_rotation(&self) -> bool {
+        let needs_rotation = |it: &Segment| {
+            it.bytes >= self.rotation_bytes(it.snapshot_bytes) || self.syncer.has_failed(it.number)
         };
         self.pending.is_empty()
-            && self.not_begun.is_none_or(|at| at.elapsed() >= RETRY)
-            && self.segments.back().is_some_and(is_full)
+            && self.rotate_failed_at.is_none_or(|at| at.elapsed() >= RETRY)
+            && self.segments.back().is_some_and(needs_rotation)
     }
 
     /// Returns the size from which a segment with such a snapshot is followed by another.
-    fn length(&self, snapshot_bytes: u64) -> u64 {
-        let least = SNAPSHOTS * snapshot_bytes;
+    fn rotation_bytes(&self, snapshot_bytes: u64) -> u64 {
+        let least = SNAPSHOTS_PER_SEGMENT_MIN * snapshot_bytes;
         self.limits.segment_bytes.max(least)
     }
 
     /// If the disk budget has no room for a new segment with `snapshot`, returns the oldest transition that may stay.
-    pub(super) fn over_budget(&self, snapshot: impl FnOnce() -> Snapshot) -> Option<u64> {
+    pub(super) fn oldest_within_budget(&self, snapshot: impl FnOnce() -> Snapshot) -> Option<u64> {
         let max = self.limits.disk_bytes_max?;
-        let mut bytes = self.bytes() + self.length(snapshot().bytes()) + self.largest;
+        let mut bytes = self.bytes() + self.rotation_bytes(snapshot().bytes()) + self.largest;
         let mut keep = None;
         for (segment, next) in self.segments.iter().zip(self.segments.iter().skip(1)) {
             if bytes <= max {
                 break;
             }
             bytes -= segment.bytes;
-            keep = Some(next.first_row);
+            keep = Some(next.first_transition);
         }
         keep
     }
@@ -268,29 +268,29 @@ impl Journal {
         if !self.write_pending() {
             return;
         }
-        let number = self.newest().number + 1;
+        let number = self.newest_segment().number + 1;
         // The record that closes the old segment gets the ordinal before this one.
-        let begun = begin_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
+        let begun = create_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
         let (segment, file) = match begun {
             Ok(begun) => begun,
-            Err(e) => return self.note_not_begun(&e),
+            Err(e) => return self.record_rotation_failure(&e),
         };
-        let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
+        let closed = record::encode_head(RecordKind::Closed, self.ordinal, &[], 0);
         if !self.write(&closed, &[]) {
             // Without that record, the new segment must not stay.
-            remove(&self.folder.segment(number));
+            try_remove(&self.folder.segment_path(number));
             return;
         }
         self.ordinal += 2;
-        self.not_begun = None;
+        self.rotate_failed_at = None;
         self.file = file.clone();
-        self.syncer.opened(number, file);
+        self.syncer.add_segment(number, file);
         self.segments.push_back(segment);
     }
 
-    fn note_not_begun(&mut self, e: &io::Error) {
-        self.not_begun = Some(Instant::now());
-        if let Some(more) = self.said.due() {
+    fn record_rotation_failure(&mut self, e: &io::Error) {
+        self.rotate_failed_at = Some(Instant::now());
+        if let Some(more) = self.log_limiter.due() {
             tracing::error!(
                 "no new file can be begun in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
                  writable{more}",
@@ -301,16 +301,16 @@ impl Journal {
 
     /// Begins a new segment with `snapshot`. It is flushed when this returns, and kept as long as the mark.
     pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
-        let before = self.newest().number;
+        let before = self.newest_segment().number;
         self.rotate(snapshot);
-        let mark = Mark(self.newest().number);
+        let mark = Mark(self.newest_segment().number);
         if mark.0 == before {
             let full = io::Error::other("it refuses to be written, as the log says");
             return Err(io_error("marking", &self.folder.path)(full));
         }
-        let flushed = self.syncer.flushed();
+        let flushed = self.syncer.try_flush();
         flushed.map_err(io_error("flushing", &self.folder.path))?;
-        if self.marks.len() == MARKS {
+        if self.marks.len() == MARKS_KEPT {
             self.marks.pop_front();
         }
         self.marks.push_back((mark, snapshot.oldest));
@@ -318,23 +318,23 @@ impl Journal {
     }
 
     /// Gives up `mark`: the log will not be rolled back to it.
-    pub(super) fn give_up(&mut self, mark: Mark) {
+    pub(super) fn discard_mark(&mut self, mark: Mark) {
         self.marks.retain(|(it, _)| *it != mark);
     }
 
-    /// Removes the oldest segments that neither the ring, whose oldest transition is `oldest_row`, nor a mark needs.
-    pub(super) fn prune(&mut self, oldest_row: u64) {
+    /// Removes the oldest segments that neither the ring, whose oldest transition is `oldest_transition`, nor a mark needs.
+    pub(super) fn prune(&mut self, oldest_transition: u64) {
         let (oldest, keep) = match self.marks.front() {
-            Some((first, marked_row)) => (oldest_row.min(*marked_row), first.0),
-            None => (oldest_row, u64::MAX),
+            Some((first, marked_oldest)) => (oldest_transition.min(*marked_oldest), first.0),
+            None => (oldest_transition, u64::MAX),
         };
         while self.segments.len() > 1
-            && self.segments[1].first_row <= oldest
+            && self.segments[1].first_transition <= oldest
             && self.segments[0].number < keep
         {
             let number = self.segments[0].number;
-            self.syncer.removed(number);
-            if !remove(&self.folder.segment(number)) {
+            self.syncer.forget_segment(number);
+            if !try_remove(&self.folder.segment_path(number)) {
                 return;
             }
             self.segments.pop_front();
@@ -343,7 +343,7 @@ impl Journal {
 }
 
 /// Creates a segment whose only record has the ordinal `ordinal`. Leaves no file if the write fails.
-fn begin_segment(
+fn create_segment(
     folder: &LogFolder,
     log: LogId,
     number: u64,
@@ -356,16 +356,16 @@ fn begin_segment(
         snapshot: snapshot.clone(),
     };
     let body = codec::encode_value(&header).map_err(io::Error::other)?;
-    let head = record::head(RecordKind::Segment, ordinal, &body, 0);
-    let path = folder.segment(number);
+    let head = record::encode_head(RecordKind::Segment, ordinal, &body, 0);
+    let path = folder.segment_path(number);
     let file = File::create(&path)?;
     if let Err(e) = file.write_all_at(&head, 0) {
-        remove(&path);
+        try_remove(&path);
         return Err(e);
     }
     let segment = Segment {
         number,
-        first_row: snapshot.inserted,
+        first_transition: snapshot.inserted,
         bytes: head.len() as u64,
         snapshot_bytes: head.len() as u64,
     };
@@ -373,7 +373,7 @@ fn begin_segment(
 }
 
 /// Removes a file. Returns false on failure, which is harmless: either the caller retries, or the file does no damage.
-pub(crate) fn remove(path: &Path) -> bool {
+pub(crate) fn try_remove(path: &Path) -> bool {
     match fs::remove_file(path) {
         Err(e) if e.kind() != io::ErrorKind::NotFound => {
             tracing::debug!("removing {}: {e}", path.display());

@@ -1,7 +1,7 @@
 //! Keeps a running replay on disk. After its process has died, the replay is restored with every transition, exactly once, and each actor's
 //! place. The number of rows learned is not restored: the learner reports it.
 //!
-//! The log in the folder holds the chunks as received and, between them, notes of joins and leaves. It consists of segments, each of which
+//! The log in the folder holds the chunks as received and, between them, events: joins and leaves. It consists of segments, each of which
 //! begins with a snapshot: the replay's state without the transitions. A segment begins when the one before is full, when the learner has
 //! saved a checkpoint, and at marks. It is removed once all its transitions have left the ring. So the oldest segment's snapshot and all
 //! later records restore the replay. A damaged segment costs only its own transitions, as the next segment has a complete snapshot.
@@ -23,6 +23,6 @@ mod upkeep;
 mod tests;
 
 pub use folder::{Mark, PersistError};
-pub use recover::{Reading, Recovery};
+pub use recover::{RecoveryControl, RecoveryReport};
 pub(crate) use upkeep::shard_dir;
-pub use upkeep::{KeptReplay, PersistArgs};
+pub use upkeep::{PersistArgs, ReplayFolder};

@@ -21,7 +21,7 @@ pub(super) enum RecordKind {
     /// The first record of a segment: the segment's number, and the replay's state where it begins.
     Segment = 1,
     /// An actor or learner that joined, or an actor that left or was forgotten.
-    Note = 2,
+    Event = 2,
     /// A chunk that was stored.
     Chunk = 3,
     /// The last record of a segment that is followed by another segment.
@@ -29,14 +29,14 @@ pub(super) enum RecordKind {
 }
 
 impl RecordKind {
-    fn of(number: u32) -> Option<Self> {
-        let all = [Self::Segment, Self::Note, Self::Chunk, Self::Closed];
+    fn from_number(number: u32) -> Option<Self> {
+        let all = [Self::Segment, Self::Event, Self::Chunk, Self::Closed];
         all.into_iter().find(|kind| *kind as u32 == number)
     }
 }
 
 /// Returns the head of a record, followed by `checked`, the part of its body that the checksum covers. `rest` bytes of body come after it.
-pub(super) fn head(kind: RecordKind, ordinal: u64, checked: &[u8], rest: usize) -> Vec<u8> {
+pub(super) fn encode_head(kind: RecordKind, ordinal: u64, checked: &[u8], rest: usize) -> Vec<u8> {
     let length = (checked.len() + rest) as u64;
     let mut head = Vec::with_capacity(HEAD_BYTES + checked.len());
     head.extend_from_slice(&MAGIC);
@@ -64,14 +64,14 @@ impl Record<'_> {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Broken {
+pub(super) enum RecordError {
     /// The last record was not written whole.
     Torn,
     /// Bytes that are not a record, followed by others.
     Damaged,
 }
 
-impl Broken {
+impl RecordError {
     const fn torn_if(is_torn: bool) -> Self {
         if is_torn { Self::Torn } else { Self::Damaged }
     }
@@ -85,33 +85,33 @@ fn checksum(head: &[u8], checked: &[u8]) -> u32 {
     sum.finalize()
 }
 
-fn number(head: &[u8; HEAD_BYTES], at: usize) -> u32 {
+fn read_u32(head: &[u8; HEAD_BYTES], at: usize) -> u32 {
     u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]])
 }
 
 /// Reads the first record in `rest`, the remaining bytes of a segment.
-pub(super) fn first(rest: &[u8]) -> Result<Record<'_>, Broken> {
+pub(super) fn read_first(rest: &[u8]) -> Result<Record<'_>, RecordError> {
     let Some((head, after)) = rest.split_first_chunk::<HEAD_BYTES>() else {
-        return Err(Broken::Torn);
+        return Err(RecordError::Torn);
     };
     let is_zero = |bytes: &[u8]| bytes.iter().all(|&byte| byte == 0);
-    let number = |at| number(head, at);
-    let long = |at| u64::from(number(at)) | u64::from(number(at + 4)) << 32;
-    let (ordinal, body_bytes, checked) = (long(8), long(16), number(24));
-    let sane = rest.starts_with(&MAGIC)
+    let read_u32 = |at| read_u32(head, at);
+    let read_u64 = |at| u64::from(read_u32(at)) | u64::from(read_u32(at + 4)) << 32;
+    let (ordinal, body_bytes, checked) = (read_u64(8), read_u64(16), read_u32(24));
+    let is_sane = rest.starts_with(&MAGIC)
         && ordinal <= ORDINAL_MAX
         && body_bytes <= BODY_BYTES_MAX
         && u64::from(checked) <= body_bytes;
-    let Some(kind) = RecordKind::of(number(4)).filter(|_| sane) else {
+    let Some(kind) = RecordKind::from_number(read_u32(4)).filter(|_| is_sane) else {
         // A power cut leaves zeros where data was not written yet.
-        return Err(Broken::torn_if(is_zero(rest)));
+        return Err(RecordError::torn_if(is_zero(rest)));
     };
     let Some((body, others)) = after.split_at_checked(body_bytes as usize) else {
         // If another record follows, the length of this one is wrong.
-        return Err(Broken::torn_if(!a_record_follows(after)));
+        return Err(RecordError::torn_if(!contains_record(after)));
     };
-    if checksum(head, &body[..checked as usize]) != number(28) {
-        return Err(Broken::torn_if(is_zero(others)));
+    if checksum(head, &body[..checked as usize]) != read_u32(28) {
+        return Err(RecordError::torn_if(is_zero(others)));
     }
     Ok(Record {
         kind,
@@ -121,13 +121,13 @@ pub(super) fn first(rest: &[u8]) -> Result<Record<'_>, Broken> {
 }
 
 /// Whether a record whose checksum is right begins somewhere in `bytes`.
-fn a_record_follows(bytes: &[u8]) -> bool {
+fn contains_record(bytes: &[u8]) -> bool {
     let begins = (0..bytes.len()).filter(|&at| bytes[at..].starts_with(&MAGIC));
     begins.take(CANDIDATES_MAX).any(|at| {
         let Some((head, after)) = bytes[at..].split_first_chunk::<HEAD_BYTES>() else {
             return false;
         };
-        let checked = after.get(..number(head, 24) as usize);
-        checked.is_some_and(|checked| checksum(head, checked) == number(head, 28))
+        let checked = after.get(..read_u32(head, 24) as usize);
+        checked.is_some_and(|checked| checksum(head, checked) == read_u32(head, 28))
     })
 }

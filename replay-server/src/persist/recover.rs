@@ -13,30 +13,30 @@ use driml_protocol::{BufferPool, Chunk, RecoveryProgress, Shutdown, codec};
 
 use super::{
     folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader},
-    journal::{Place, Segment},
-    record::{self, Broken, ORDINAL_MAX, Record, RecordKind},
-    snapshot::Note,
+    journal::{LogPosition, Segment},
+    record::{self, ORDINAL_MAX, Record, RecordError, RecordKind},
+    snapshot::ProcessEvent,
 };
 use crate::{replay::Replay, storage::pack::Packer};
 
 /// The file extension of a segment that cannot be used.
-const UNUSABLE: &str = "unusable";
+const UNUSABLE_EXTENSION: &str = "unusable";
 /// Period between log lines about the progress.
-const SAY: Duration = Duration::from_secs(5);
+const LOG_PERIOD: Duration = Duration::from_secs(5);
 
 /// The progress of reading a log, for clients that ask meanwhile, and a flag that stops the reading early. Threads share it by
 /// reference.
 #[derive(Debug)]
-pub struct Reading {
+pub struct RecoveryControl {
     started: Instant,
     bytes: AtomicU64,
     bytes_read: AtomicU64,
     stop: Shutdown,
 }
 
-impl Reading {
+impl RecoveryControl {
     /// Starts at nothing read. Raising `stop` stops the reading early.
-    pub fn begin(stop: Shutdown) -> Self {
+    pub fn new(stop: Shutdown) -> Self {
         Self {
             started: Instant::now(),
             bytes: AtomicU64::new(0),
@@ -57,7 +57,7 @@ impl Reading {
 
 /// The result of reading a log.
 #[derive(Clone, Debug, Default)]
-pub struct Recovery {
+pub struct RecoveryReport {
     /// Whether the folder held a replay.
     pub found: bool,
     /// Bytes of the log that were read.
@@ -66,27 +66,27 @@ pub struct Recovery {
     pub warnings: Vec<String>,
 }
 
-pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
-    let no_mark = || PersistError::NoMark(folder.segment(mark.0));
-    let numbers = folder.segments()?;
+pub(super) fn roll_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
+    let no_mark = || PersistError::NoMark(folder.segment_path(mark.0));
+    let numbers = folder.segment_numbers()?;
     if !numbers.contains(&mark.0) {
         return Err(no_mark());
     }
-    let bytes = folder.read(mark.0)?;
-    let first = record::first(&bytes).ok();
+    let bytes = folder.read_segment(mark.0)?;
+    let first = record::read_first(&bytes).ok();
     let first = first.filter(|it| it.kind == RecordKind::Segment);
     let first = first.ok_or_else(no_mark)?;
     // The newest first: if this is interrupted, the remaining log is valid and ends earlier.
     for later in numbers.into_iter().rev().filter(|it| *it > mark.0) {
-        folder.remove(later)?;
+        folder.remove_segment(later)?;
     }
-    folder.cut_off(mark.0, first.bytes())
+    folder.truncate_segment(mark.0, first.bytes())
 }
 
 /// Returns the identity of the log in `folder`, from the newest segment that can be read; `None` if none can.
 pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
-    for number in folder.segments()?.into_iter().rev() {
-        if let Ok(record) = record::first(&folder.read(number)?)
+    for number in folder.segment_numbers()?.into_iter().rev() {
+        if let Ok(record) = record::read_first(&folder.read_segment(number)?)
             && let Ok(header) = codec::decode_value::<SegmentHeader>(record.body)
         {
             return Ok(Some(header.log));
@@ -102,28 +102,28 @@ pub(super) fn recover(
     id: LogId,
     replay: &mut Replay,
     mark: Option<Mark>,
-    reading: &Reading,
-) -> Result<(Place, Recovery), PersistError> {
-    let numbers = folder.segments()?;
+    control: &RecoveryControl,
+) -> Result<(LogPosition, RecoveryReport), PersistError> {
+    let numbers = folder.segment_numbers()?;
     let packer = replay.packer();
     replay.is_recovering = true;
-    let mut reader = Reader {
+    let mut reader = LogReader {
         folder,
         id,
         replay,
         packer,
         pool: BufferPool::new(2),
-        place: Place {
+        position: LogPosition {
             number: numbers.last().map_or(0, |it| it + 1),
-            ..Place::default()
+            ..LogPosition::default()
         },
-        recovery: Recovery::default(),
+        recovery: RecoveryReport::default(),
         oldest: 0,
-        same_capacity: false,
+        has_same_capacity: false,
         mark,
-        aside: Vec::new(),
+        unusable: Vec::new(),
     };
-    let bytes = |&number| fs::metadata(folder.segment(number)).map_or(0, |it| it.len());
+    let bytes = |&number| fs::metadata(folder.segment_path(number)).map_or(0, |it| it.len());
     let total: u64 = numbers.iter().map(bytes).sum();
     let dir = folder.path.display();
     if let count @ 1.. = numbers.len() {
@@ -132,44 +132,44 @@ pub(super) fn recover(
             total >> 20
         );
     }
-    reading.bytes.store(total, Ordering::Relaxed);
-    let mut due = Instant::now() + SAY;
+    control.bytes.store(total, Ordering::Relaxed);
+    let mut next_log = Instant::now() + LOG_PERIOD;
     for (at, &number) in numbers.iter().enumerate() {
-        if Instant::now() > due {
-            due += SAY;
-            tracing::info!("reads the replay in {dir}: {}", reading.progress());
+        if Instant::now() > next_log {
+            next_log += LOG_PERIOD;
+            tracing::info!("reads the replay in {dir}: {}", control.progress());
         }
-        if reading.stop.is_set() {
+        if control.stop.is_set() {
             return Err(PersistError::Stopped);
         }
-        let segment = folder.read(number)?;
+        let segment = folder.read_segment(number)?;
         reader.read_segment(number, &segment, at + 1 == numbers.len())?;
         let bytes = segment.len() as u64;
-        reading.bytes_read.fetch_add(bytes, Ordering::Relaxed);
+        control.bytes_read.fetch_add(bytes, Ordering::Relaxed);
     }
     reader.finish()
 }
 
 /// Reads a log into a replay.
-struct Reader<'a> {
+struct LogReader<'a> {
     folder: &'a LogFolder,
     id: LogId,
     replay: &'a mut Replay,
     packer: Packer,
     pool: BufferPool,
-    place: Place,
-    recovery: Recovery,
+    position: LogPosition,
+    recovery: RecoveryReport,
     /// The oldest transition that was held, by the last snapshot.
     oldest: u64,
     /// Whether the ring has the capacity that it had before and no limit in bytes, so that the number stored tells which are held.
-    same_capacity: bool,
+    has_same_capacity: bool,
     /// The mark at which the log ends, if any: then all state is restored.
     mark: Option<Mark>,
     /// Segments that cannot be used. They are renamed once it is known that others can.
-    aside: Vec<PathBuf>,
+    unusable: Vec<PathBuf>,
 }
 
-impl Reader<'_> {
+impl LogReader<'_> {
     fn warn(&mut self, text: String) {
         self.recovery.warnings.push(text);
     }
@@ -180,11 +180,11 @@ impl Reader<'_> {
         bytes: &[u8],
         is_last: bool,
     ) -> Result<(), PersistError> {
-        let path = self.folder.segment(number);
+        let path = self.folder.segment_path(number);
         let name = file_name(&path);
-        let first = match record::first(bytes) {
+        let first = match record::read_first(bytes) {
             // The server died while it began this segment, which is empty.
-            Err(Broken::Torn) if is_last => return self.folder.remove(number),
+            Err(RecordError::Torn) if is_last => return self.folder.remove_segment(number),
             first => first.ok().filter(|it| it.kind == RecordKind::Segment),
         };
         let header = first.and_then(|first| {
@@ -192,7 +192,7 @@ impl Reader<'_> {
             header.ok().map(|it| (it, first.ordinal, first.bytes()))
         });
         let Some((header, ordinal, at)) = header else {
-            self.set_aside(path, "its beginning is damaged");
+            self.mark_unusable(path, "its beginning is damaged");
             return Ok(());
         };
         if header.log != self.id {
@@ -200,9 +200,9 @@ impl Reader<'_> {
             return Ok(());
         }
         let is_first = !self.recovery.found;
-        let follows = is_first || ordinal >= self.place.ordinal;
+        let follows = is_first || ordinal >= self.position.ordinal;
         if header.number != number || !follows {
-            self.set_aside(path, "it is not the segment that belongs here");
+            self.mark_unusable(path, "it is not the segment that belongs here");
             return Ok(());
         }
         let unusable =
@@ -214,28 +214,28 @@ impl Reader<'_> {
                 let why = "replay.sampling is another rule than it was".into();
                 return Err(unusable(why));
             }
-            self.place.mark = Some((Mark(number), snapshot.oldest));
+            self.position.mark = Some((Mark(number), snapshot.oldest));
         }
-        let (stored, first_row) = (self.replay.ring.inserted(), snapshot.inserted);
+        let (stored, first_transition) = (self.replay.ring.inserted(), snapshot.inserted);
         self.oldest = snapshot.oldest;
-        self.same_capacity = snapshot.capacity == self.replay.ring.capacity()
+        self.has_same_capacity = snapshot.capacity == self.replay.ring.capacity()
             && self.replay.config.compressed_bytes_max.is_none();
         self.replay.restore(snapshot).map_err(unusable)?;
-        if !is_first && first_row > stored {
+        if !is_first && first_transition > stored {
             self.warn(format!(
                 "the transitions {stored} to {} are gone: something before {name} is damaged or missing. All others are there, and all \
                  counts are right",
-                first_row - 1
+                first_transition - 1
             ));
         }
         self.recovery.found = true;
-        self.place.ordinal = ordinal + 1;
+        self.position.ordinal = ordinal + 1;
         let (at, ended) = self.read_records(bytes, at);
         let cut = bytes.len() - at;
         self.recovery.bytes += at as u64;
-        self.place.segments.push_back(Segment {
+        self.position.segments.push_back(Segment {
             number,
-            first_row,
+            first_transition,
             bytes: if is_last { at } else { bytes.len() } as u64,
             snapshot_bytes: 0,
         });
@@ -248,43 +248,43 @@ impl Reader<'_> {
                 "{name} is damaged at byte {at}: {cut} bytes of it are of no use"
             )),
             // No actor was told that this record is stored.
-            Err(Broken::Torn) => tracing::info!(
+            Err(RecordError::Torn) => tracing::info!(
                 "the last record of {name} was not written whole: its {cut} bytes are cut off"
             ),
-            Err(Broken::Damaged) => self.warn(format!(
+            Err(RecordError::Damaged) => self.warn(format!(
                 "{name} is damaged at byte {at}: the {cut} bytes from there on are cut off, as nothing after them can be trusted. What was stored \
                  and served then is lost"
             )),
         }
         match cut {
-            1.. if is_last => self.folder.cut_off(number, at),
+            1.. if is_last => self.folder.truncate_segment(number, at),
             _ => Ok(()),
         }
     }
 
-    fn set_aside(&mut self, path: PathBuf, why: &str) {
+    fn mark_unusable(&mut self, path: PathBuf, why: &str) {
         self.warn(format!("{} cannot be used, {why}", file_name(&path)));
-        self.aside.push(path);
+        self.unusable.push(path);
     }
 
     /// Applies the records of a segment from byte `at` on. Returns the end of the last usable record, and whether that record closes the
     /// segment, or why the rest is unusable.
-    fn read_records(&mut self, segment: &[u8], mut at: usize) -> (usize, Result<bool, Broken>) {
+    fn read_records(&mut self, bytes: &[u8], mut at: usize) -> (usize, Result<bool, RecordError>) {
         let mut is_closed = false;
-        while at < segment.len() {
-            let record = match record::first(&segment[at..]) {
+        while at < bytes.len() {
+            let record = match record::read_first(&bytes[at..]) {
                 Ok(record) => record,
-                Err(broken) => return (at, Err(broken)),
+                Err(error) => return (at, Err(error)),
             };
-            let applied = match !is_closed && record.ordinal == self.place.ordinal {
+            let applied = match !is_closed && record.ordinal == self.position.ordinal {
                 true => self.apply(&record),
                 false => Err("it is not the next one".into()),
             };
             if let Err(why) = applied {
                 tracing::debug!("record {}: {why}", record.ordinal);
-                return (at, Err(Broken::Damaged));
+                return (at, Err(RecordError::Damaged));
             }
-            self.place.ordinal += 1;
+            self.position.ordinal += 1;
             is_closed = record.kind == RecordKind::Closed;
             at += record.bytes();
         }
@@ -306,21 +306,21 @@ impl Reader<'_> {
                 self.replay.store(&packed);
                 Ok(())
             }
-            RecordKind::Note => {
+            RecordKind::Event => {
                 match codec::decode_value(record.body).map_err(|e| e.to_string())? {
-                    Note::ActorJoined(join) => self.replay.join_actor(join).map(drop),
-                    Note::Forgotten(actors) => {
+                    ProcessEvent::ActorJoined(join) => self.replay.join_actor(join).map(drop),
+                    ProcessEvent::Forgotten(actors) => {
                         self.replay.state.actors.forget(&actors);
                         Ok(())
                     }
-                    Note::Leave(leave) => self.replay.leave(&leave).map_or(Ok(()), Err),
-                    Note::LearnerJoined(join) => self.replay.join_learner(join).map(drop),
+                    ProcessEvent::Leave(leave) => self.replay.leave(&leave).map_or(Ok(()), Err),
+                    ProcessEvent::LearnerJoined(join) => self.replay.join_learner(join).map(drop),
                 }
             }
         }
     }
 
-    fn finish(mut self) -> Result<(Place, Recovery), PersistError> {
+    fn finish(mut self) -> Result<(LogPosition, RecoveryReport), PersistError> {
         let unusable = |why: String| {
             let why = format!("cannot be used: {why}; to begin a new replay there, remove them");
             Err(PersistError::Unusable(self.folder.path.clone(), why))
@@ -330,16 +330,16 @@ impl Reader<'_> {
             return unusable(format!("no segment can be read ({why})"));
         }
         // The records written next must be readable too.
-        if self.place.ordinal > ORDINAL_MAX / 2 {
-            let last = self.place.ordinal - 1;
+        if self.position.ordinal > ORDINAL_MAX / 2 {
+            let last = self.position.ordinal - 1;
             return unusable(format!(
                 "its records are numbered up to {last}, which no replay reaches"
             ));
         }
-        for path in std::mem::take(&mut self.aside) {
-            let (name, aside) = (file_name(&path), path.with_extension(UNUSABLE));
-            self.warn(match fs::rename(&path, &aside) {
-                Ok(()) => format!("{name} is now {}", file_name(&aside)),
+        for path in std::mem::take(&mut self.unusable) {
+            let (name, renamed) = (file_name(&path), path.with_extension(UNUSABLE_EXTENSION));
+            self.warn(match fs::rename(&path, &renamed) {
+                Ok(()) => format!("{name} is now {}", file_name(&renamed)),
                 Err(e) => format!("{name} stays there, as it cannot be renamed: {e}"),
             });
         }
@@ -347,7 +347,7 @@ impl Reader<'_> {
         let ring = &self.replay.ring;
         let (first, end) = (ring.first_index(), ring.inserted());
         let held_from = self.oldest.max(end.saturating_sub(ring.capacity()));
-        if self.same_capacity && held_from < first {
+        if self.has_same_capacity && held_from < first {
             self.warn(format!(
                 "the transitions {held_from} to {} are gone: the oldest segments are missing. All others are there, and all counts are right",
                 first - 1
@@ -360,7 +360,7 @@ impl Reader<'_> {
             replay.awaits_row_count = replay.state.learner.is_some();
             replay.state.set_rng_stream(replay.origin.shard, end);
         }
-        Ok((self.place, self.recovery))
+        Ok((self.position, self.recovery))
     }
 }
 

@@ -1,4 +1,4 @@
-//! The state of the replay without the transitions, as a value that is saved and restored, and the notes that change it between two chunks.
+//! The state of the replay without the transitions, as a value that is saved and restored, and the events that change it between two chunks.
 //! `upkeep` decides when to save a snapshot; `journal` decides where.
 
 use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec, codec};
@@ -21,7 +21,7 @@ const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
 
 /// A process that joined or left: the records of the log besides chunks and snapshots.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) enum Note {
+pub(crate) enum ProcessEvent {
     ActorJoined(ActorJoin),
     /// Actors that were forgotten to make room for others.
     Forgotten(Vec<u32>),
@@ -93,10 +93,10 @@ impl Snapshot {
         let (inserted, counts, state) = (self.inserted, &self.counts, &self.state);
         let (counted, expected) = (&state.statistics.counted, &ours.statistics.counted);
         let num_actions = expected.action_histogram.len();
-        let is_ours = state.affinity.is_for(num_actions as u32)
+        let fits_run = state.affinity.is_for(num_actions as u32)
             && counted.action_histogram.len() == num_actions
             && counted.k_histogram.len() == expected.k_histogram.len();
-        if !is_ours {
+        if !fits_run {
             return Err("a state of a run with other actions or another horizon");
         }
         let sum = |counts: &[u64]| counts.iter().copied().fold(0, u64::saturating_add);
@@ -113,10 +113,10 @@ impl Snapshot {
         if all.iter().any(|&count| count > COUNT_MAX) {
             return Err("a state with counts that no run reaches");
         }
-        let agrees = sum(&counted.action_histogram) == inserted
+        let is_consistent = sum(&counted.action_histogram) == inserted
             && inserted <= counts.this_shard.inserted + counts.refilled
             && self.oldest <= inserted;
-        if !agrees {
+        if !is_consistent {
             return Err("a state whose counts contradict each other");
         }
         state.actors.check(inserted)?;

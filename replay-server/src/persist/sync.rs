@@ -13,55 +13,55 @@ use std::{
 use driml_protocol::{LogLimiter, Shutdown, fail_point, lock};
 
 /// Maximum segments that wait for a flush. One more causes a flush before anything else is written.
-const WAITING_MAX: usize = 32;
+const UNFLUSHED_SEGMENTS_MAX: usize = 32;
 
-struct Unflushed {
+struct FlushState {
     segments: BTreeMap<u64, Arc<File>>,
     /// The folder, if a segment was created in it since the last flush.
     folder: Option<Arc<File>>,
     /// Segments of which a flush failed. The system says so once, and may then take what it has lost for written.
-    lost: BTreeSet<u64>,
+    failed: BTreeSet<u64>,
     /// Segments with smaller numbers were removed, perhaps during a flush.
     oldest: u64,
     /// When the last flush began that succeeded while no segment was lost.
-    flushed: Instant,
+    last_flush: Instant,
 }
 
-impl Unflushed {
+impl FlushState {
     fn forget_removed(&mut self) {
         self.segments = self.segments.split_off(&self.oldest);
-        self.lost = self.lost.split_off(&self.oldest);
+        self.failed = self.failed.split_off(&self.oldest);
     }
 }
 
-struct Shared {
-    unflushed: Mutex<Unflushed>,
+struct Flusher {
+    state: Mutex<FlushState>,
     /// Allows one flush at a time, so that a caller's flush is complete when it returns.
     flushing: Mutex<()>,
 }
 
-impl Shared {
+impl Flusher {
     fn flush(&self) -> io::Result<()> {
         let _one = lock(&self.flushing);
         let begun = Instant::now();
-        let mut unflushed = lock(&self.unflushed);
-        let segments = std::mem::take(&mut unflushed.segments);
-        let folder = unflushed.folder.take();
-        drop(unflushed);
-        let mut lost = None;
+        let mut state = lock(&self.state);
+        let segments = std::mem::take(&mut state.segments);
+        let folder = state.folder.take();
+        drop(state);
+        let mut failed = None;
         let flushed = segments
             .iter()
-            .try_for_each(|(&number, file)| file.sync_data().inspect_err(|_| lost = Some(number)))
+            .try_for_each(|(&number, file)| file.sync_data().inspect_err(|_| failed = Some(number)))
             .and_then(|()| folder.as_ref().map_or(Ok(()), |folder| folder.sync_all()));
-        let mut unflushed = lock(&self.unflushed);
+        let mut state = lock(&self.state);
         if flushed.is_err() {
             // To be flushed again next time.
-            unflushed.segments.extend(segments);
-            unflushed.folder = unflushed.folder.take().or(folder);
-            unflushed.lost.extend(lost);
-            unflushed.forget_removed();
-        } else if unflushed.lost.is_empty() {
-            unflushed.flushed = begun;
+            state.segments.extend(segments);
+            state.folder = state.folder.take().or(folder);
+            state.failed.extend(failed);
+            state.forget_removed();
+        } else if state.failed.is_empty() {
+            state.last_flush = begun;
         }
         flushed
     }
@@ -69,91 +69,91 @@ impl Shared {
 
 /// The thread that flushes. Dropping this ends the thread and flushes once more.
 pub(super) struct Syncer {
-    shared: Arc<Shared>,
+    flusher: Arc<Flusher>,
     folder: Arc<File>,
     stop: Shutdown,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Syncer {
-    /// Starts to flush every `period`, or, if `period` is zero, at each call of [`Syncer::written`].
+    /// Starts to flush every `period`, or, if `period` is zero, at each call of [`Syncer::after_write`].
     pub(super) fn start(folder: File, period: Duration) -> io::Result<Self> {
-        let shared = Arc::new(Shared {
-            unflushed: Mutex::new(Unflushed {
+        let flusher = Arc::new(Flusher {
+            state: Mutex::new(FlushState {
                 segments: BTreeMap::new(),
                 folder: None,
-                lost: BTreeSet::new(),
+                failed: BTreeSet::new(),
                 oldest: 0,
-                flushed: Instant::now(),
+                last_flush: Instant::now(),
             }),
             flushing: Mutex::default(),
         });
         let stop = Shutdown::default();
         let mut thread = None;
         if !period.is_zero() {
-            let (shared, stop) = (shared.clone(), stop.clone());
+            let (flusher, stop) = (flusher.clone(), stop.clone());
             let named = std::thread::Builder::new().name("replay-fsync".into());
-            thread = Some(named.spawn(move || work(&shared, &stop, period))?);
+            thread = Some(named.spawn(move || flush_periodically(&flusher, &stop, period))?);
         }
         Ok(Self {
-            shared,
+            flusher,
             folder: Arc::new(folder),
             stop,
             thread,
         })
     }
 
-    pub(super) fn opened(&self, number: u64, file: Arc<File>) {
-        let mut unflushed = lock(&self.shared.unflushed);
-        unflushed.segments.insert(number, file);
-        unflushed.folder = Some(self.folder.clone());
-        let too_many = unflushed.segments.len() > WAITING_MAX;
-        drop(unflushed);
+    pub(super) fn add_segment(&self, number: u64, file: Arc<File>) {
+        let mut state = lock(&self.flusher.state);
+        state.segments.insert(number, file);
+        state.folder = Some(self.folder.clone());
+        let too_many = state.segments.len() > UNFLUSHED_SEGMENTS_MAX;
+        drop(state);
         if too_many {
-            self.flush();
+            self.flush_or_warn();
         }
     }
 
     /// Returns the seconds since the last successful flush began; 0 if each write is flushed and none has failed.
-    pub(super) fn flushed_s(&self) -> f64 {
-        let unflushed = lock(&self.shared.unflushed);
-        match self.thread.is_none() && unflushed.segments.is_empty() {
+    pub(super) fn since_flush_s(&self) -> f64 {
+        let state = lock(&self.flusher.state);
+        match self.thread.is_none() && state.segments.is_empty() {
             true => 0.0,
-            false => unflushed.flushed.elapsed().as_secs_f64(),
+            false => state.last_flush.elapsed().as_secs_f64(),
         }
     }
 
     /// Segment `number`, the oldest, was removed and need not be flushed.
-    pub(super) fn removed(&self, number: u64) {
-        let mut unflushed = lock(&self.shared.unflushed);
-        unflushed.oldest = number + 1;
-        unflushed.forget_removed();
+    pub(super) fn forget_segment(&self, number: u64) {
+        let mut state = lock(&self.flusher.state);
+        state.oldest = number + 1;
+        state.forget_removed();
     }
 
     /// Whether a flush of segment `number` failed. Always false if each write is flushed, as a failed write is then repeated.
-    pub(super) fn has_lost(&self, number: u64) -> bool {
-        self.thread.is_some() && lock(&self.shared.unflushed).lost.contains(&number)
+    pub(super) fn has_failed(&self, number: u64) -> bool {
+        self.thread.is_some() && lock(&self.flusher.state).failed.contains(&number)
     }
 
     /// Notes a write to segment `number`. If each write is flushed, flushes it and returns the disk's error.
-    pub(super) fn written(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
-        let mut unflushed = lock(&self.shared.unflushed);
-        let segments = &mut unflushed.segments;
+    pub(super) fn after_write(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
+        let mut state = lock(&self.flusher.state);
+        let segments = &mut state.segments;
         segments.entry(number).or_insert_with(|| file.clone());
-        drop(unflushed);
+        drop(state);
         match self.thread {
             Some(_) => Ok(()),
-            None => self.shared.flush(),
+            None => self.flusher.flush(),
         }
     }
 
-    pub(super) fn flushed(&self) -> io::Result<()> {
-        self.shared.flush()
+    pub(super) fn try_flush(&self) -> io::Result<()> {
+        self.flusher.flush()
     }
 
     /// Flushes now. A failure is logged as a warning.
-    pub(super) fn flush(&self) {
-        if let Err(e) = self.flushed() {
+    pub(super) fn flush_or_warn(&self) {
+        if let Err(e) = self.try_flush() {
             tracing::warn!("the replay's log was not flushed: {e}");
         }
     }
@@ -165,16 +165,16 @@ impl Drop for Syncer {
         if let Some(Err(_)) = self.thread.take().map(JoinHandle::join) {
             tracing::error!("the thread that flushes the replay's log panicked");
         }
-        self.flush();
+        self.flush_or_warn();
     }
 }
 
-fn work(shared: &Shared, stop: &Shutdown, period: Duration) {
-    let mut said = LogLimiter::default();
+fn flush_periodically(flusher: &Flusher, stop: &Shutdown, period: Duration) {
+    let mut log_limiter = LogLimiter::default();
     while !stop.wait_timeout(period) {
         fail_point::reach("replay-fsync");
-        if let Err(e) = shared.flush()
-            && let Some(more) = said.due()
+        if let Err(e) = flusher.flush()
+            && let Some(more) = log_limiter.due()
         {
             tracing::error!(
                 "the replay's log was not flushed, a power cut may lose what was stored since: {e}{more}"
@@ -194,19 +194,19 @@ mod tests {
         let opened = File::open(folder.path()).unwrap();
         let syncer = Syncer::start(opened, Duration::from_secs(3600)).unwrap();
         let begun = Instant::now();
-        syncer.opened(1, file("/dev/null".as_ref()));
-        assert!(syncer.flushed().is_err());
+        syncer.add_segment(1, file("/dev/null".as_ref()));
+        assert!(syncer.try_flush().is_err());
         // The system reports the failure once.
-        syncer.opened(1, file(folder.path()));
-        assert!(syncer.flushed().is_ok());
+        syncer.add_segment(1, file(folder.path()));
+        assert!(syncer.try_flush().is_ok());
         let least = begun.elapsed().as_secs_f64();
-        assert!(syncer.flushed_s() >= least);
-        syncer.removed(1);
+        assert!(syncer.since_flush_s() >= least);
+        syncer.forget_segment(1);
         // As if the failing flush had begun before it was removed.
-        syncer.opened(1, file("/dev/null".as_ref()));
-        assert!(syncer.flushed().is_err());
+        syncer.add_segment(1, file("/dev/null".as_ref()));
+        assert!(syncer.try_flush().is_err());
         let asked = Instant::now();
-        assert!(syncer.flushed().is_ok());
-        assert!(syncer.flushed_s() <= asked.elapsed().as_secs_f64());
+        assert!(syncer.try_flush().is_ok());
+        assert!(syncer.since_flush_s() <= asked.elapsed().as_secs_f64());
     }
 }

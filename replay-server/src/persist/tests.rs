@@ -98,7 +98,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
         produced: 0,
     };
     replay.leave(&leave);
-    assert!(replay.is_refused_by_disk());
+    assert!(replay.is_disk_failing());
     replay.journal.as_mut().unwrap().file = file;
     // The learner's checkpoint begins the first segment after the disk accepts writes again.
     save_checkpoint(&mut replay);
@@ -143,7 +143,7 @@ fn a_segment_that_cannot_be_begun_stops_nothing() {
     fs::create_dir(&next).unwrap();
     for sequence in 0..80 {
         store(&mut replay, sequence);
-        assert!(!replay.is_refused_by_disk(), "what is stored is written");
+        assert!(!replay.is_disk_failing(), "what is stored is written");
     }
     fs::remove_dir(&next).unwrap();
     save_checkpoint(&mut replay);

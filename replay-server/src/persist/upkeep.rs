@@ -12,10 +12,10 @@ use driml_protocol::{
 };
 
 use super::{
-    folder::{FORMAT, LogFolder, LogId, Mark, PersistError},
+    folder::{LOG_FORMAT, LogFolder, LogId, Mark, PersistError},
     journal::{Journal, LogLimits},
-    recover::{Reading, Recovery, find_id, go_back, recover},
-    snapshot::{Note, ReplayState, Snapshot},
+    recover::{RecoveryControl, RecoveryReport, find_id, recover, roll_back},
+    snapshot::{ProcessEvent, ReplayState, Snapshot},
 };
 use crate::{
     config::{Config, SEGMENT_BYTES_MIN},
@@ -28,7 +28,7 @@ const FSYNC_DEFAULT: Duration = Duration::from_secs(1);
 /// Maximum segment size unless it is given: small enough that the log keeps little beyond the content of the ring.
 const SEGMENT_BYTES_MAX: u64 = 1 << 26;
 /// Number of segments that the ring or the disk budget should span at least.
-const SEGMENTS: u64 = 16;
+const SEGMENTS_MIN: u64 = 16;
 
 /// Where a replay is kept on disk, and which shard of the run it is.
 #[derive(Clone, Debug)]
@@ -50,28 +50,28 @@ impl Replay {
         spec: &RunSpec,
         config: &Config,
         batch_size: u32,
-    ) -> Result<(Self, Recovery), PersistError> {
+    ) -> Result<(Self, RecoveryReport), PersistError> {
         let empty = Self::shard(spec, config, batch_size, args.shard)?;
-        let kept = KeptReplay::find(args, spec, config)?;
-        kept.read(empty, &Reading::begin(Shutdown::default()))
+        let kept = ReplayFolder::open(args, spec, config)?;
+        kept.recover(empty, &RecoveryControl::new(Shutdown::default()))
     }
 }
 
 /// The folder of a replay of this run, locked for this process. Its log is not read yet.
-pub struct KeptReplay {
+pub struct ReplayFolder {
     mark: Option<Mark>,
     id: LogId,
     limits: LogLimits,
     folder: LogFolder,
 }
 
-impl KeptReplay {
+impl ReplayFolder {
     /// Locks the folder, and checks that a log in it belongs to this run. Does not read the log, which may take long.
-    pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
+    pub fn open(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
         config.check_on_disk()?;
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {
-            format: FORMAT,
+            format: LOG_FORMAT,
             identity: rand::random(),
             spec_hash: spec.hash(),
             shard: (args.shard, config.shards),
@@ -81,11 +81,11 @@ impl KeptReplay {
             None => find_id(&folder)?,
         };
         let id = known.unwrap_or(ours);
-        folder.check(&id, &ours)?;
+        folder.check_same_run(&id, &ours)?;
         Ok(Self {
             mark: args.mark,
             id,
-            limits: limits(args, spec, config),
+            limits: log_limits(args, spec, config),
             folder,
         })
     }
@@ -99,39 +99,39 @@ impl KeptReplay {
     /// # Errors
     /// The folder cannot be read or written, nothing in it is usable, or `reading` was stopped ([`PersistError::Stopped`]). Damage alone is
     /// not an error: the rest is used, and the warnings name the losses.
-    pub fn read(
+    pub fn recover(
         self,
         mut replay: Replay,
-        reading: &Reading,
-    ) -> Result<(Replay, Recovery), PersistError> {
+        control: &RecoveryControl,
+    ) -> Result<(Replay, RecoveryReport), PersistError> {
         let (folder, id) = (self.folder, self.id);
         if let Some(mark) = self.mark {
-            go_back(&folder, mark)?;
+            roll_back(&folder, mark)?;
         }
-        let (place, recovery) = recover(&folder, id, &mut replay, self.mark, reading)?;
+        let (position, recovery) = recover(&folder, id, &mut replay, self.mark, control)?;
         if !recovery.found {
             folder.write_id(&id)?;
         }
         let snapshot = replay.snapshot();
-        let journal = Journal::begin(folder, id, place, self.limits, &snapshot)?;
+        let journal = Journal::begin(folder, id, position, self.limits, &snapshot)?;
         replay.journal = Some(journal);
-        replay.tidy();
+        replay.rotate_and_prune();
         Ok((replay, recovery))
     }
 }
 
 /// Returns the size of a segment, the disk budget of the shard, and the period between flushes.
-fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> LogLimits {
+fn log_limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> LogLimits {
     let shards = u64::from(config.shards);
     let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
-    let row_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;
-    let ring = (config.capacity_transitions / shards).saturating_mul(row_bytes);
+    let transition_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;
+    let ring = (config.capacity_transitions / shards).saturating_mul(transition_bytes);
     let all = disk_bytes_max.map_or(ring, |max| max.min(ring));
-    let fitting = (all / SEGMENTS).clamp(SEGMENT_BYTES_MIN, SEGMENT_BYTES_MAX);
+    let fitting = (all / SEGMENTS_MIN).clamp(SEGMENT_BYTES_MIN, SEGMENT_BYTES_MAX);
     LogLimits {
         segment_bytes: args.segment_bytes.unwrap_or(fitting),
         disk_bytes_max,
-        fsync: config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis),
+        fsync_period: config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis),
     }
 }
 
@@ -144,13 +144,13 @@ pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
 
 /// Writing to the log.
 impl Replay {
-    /// Writes notes that the disk rejected before. Returns whether all are written; until then joins and `Leave`s get no reply.
+    /// Writes events that the disk rejected before. Returns whether all are written; until then joins and `Leave`s get no reply.
     pub(crate) fn write_pending(&mut self) -> bool {
         self.journal.as_mut().is_none_or(Journal::write_pending)
     }
 
     /// Whether the last write to the disk failed.
-    pub fn is_refused_by_disk(&self) -> bool {
+    pub fn is_disk_failing(&self) -> bool {
         self.journal.as_ref().is_some_and(Journal::is_failing)
     }
 
@@ -165,31 +165,31 @@ impl Replay {
 
     /// Gives up `mark`, as the checkpoint that should refer to it could not be saved. So it does not displace a mark to which a saved
     /// checkpoint refers.
-    pub fn give_up_mark(&mut self, mark: Mark) {
+    pub fn discard_mark(&mut self, mark: Mark) {
         if let Some(journal) = &mut self.journal {
-            journal.give_up(mark);
+            journal.discard_mark(mark);
         }
     }
 
-    pub(crate) fn note(&mut self, note: Note) {
+    pub(crate) fn append_to_log(&mut self, event: ProcessEvent) {
         if let Some(journal) = &mut self.journal {
-            journal.append_note(&note);
+            journal.append_event(&event);
         }
-        self.tidy();
+        self.rotate_and_prune();
     }
 
     /// Begins a new segment if the newest is full, and removes segments that are no longer needed.
-    pub(crate) fn tidy(&mut self) {
-        if self.journal.as_ref().is_some_and(Journal::is_full) {
-            self.next_segment();
+    pub(crate) fn rotate_and_prune(&mut self) {
+        if self.journal.as_ref().is_some_and(Journal::needs_rotation) {
+            self.begin_segment();
         }
         self.prune();
     }
 
     /// Begins a new segment. If the disk budget has no room for it, drops the oldest transitions first.
-    pub(crate) fn next_segment(&mut self) {
+    pub(crate) fn begin_segment(&mut self) {
         let journal = self.journal.as_ref();
-        if let Some(oldest) = journal.and_then(|journal| journal.over_budget(|| self.snapshot())) {
+        if let Some(oldest) = journal.and_then(|it| it.oldest_within_budget(|| self.snapshot())) {
             self.forget_before(oldest);
             self.prune();
         }
@@ -246,7 +246,7 @@ impl Replay {
         if is_empty || inserted - stored >= self.ring.capacity() {
             self.ring.restart_at(inserted);
         } else {
-            self.push_gone(inserted - stored);
+            self.push_placeholders(inserted - stored);
         }
         self.forget_before(oldest);
         self.limiter.counts = snapshot.counts;
@@ -259,7 +259,7 @@ impl Replay {
     }
 
     /// Fills the places of `count` lost transitions with steps that have no links and cannot be anchors.
-    fn push_gone(&mut self, count: u64) {
+    fn push_placeholders(&mut self, count: u64) {
         let chunk = Chunk::zeroed(ChunkHeader {
             streams: 1,
             steps: 1,

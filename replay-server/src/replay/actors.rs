@@ -8,7 +8,7 @@ use driml_protocol::{ActorJoin, Chunk, ChunkPoll, EndedEpisode, InsertReply, Lea
 use super::Replay;
 use crate::{
     ledger::actors::{ChunkOrder, Difference},
-    persist::{journal::Journal, snapshot::Note},
+    persist::{journal::Journal, snapshot::ProcessEvent},
     storage::{
         pack::{PackedChunk, Packer},
         ring::Step,
@@ -28,7 +28,7 @@ impl Replay {
         let before = self.actor_incarnation(join.actor);
         let earlier_incarnations = self.state.actors.join(join)?;
         if before != Some(join.incarnation) {
-            self.note(Note::ActorJoined(join));
+            self.append_to_log(ProcessEvent::ActorJoined(join));
         }
         Ok(earlier_incarnations)
     }
@@ -38,7 +38,7 @@ impl Replay {
         let absent = self.state.actors.forgettable(is_connected);
         if !absent.is_empty() {
             self.state.actors.forget(&absent);
-            self.note(Note::Forgotten(absent.clone()));
+            self.append_to_log(ProcessEvent::Forgotten(absent.clone()));
         }
         absent
     }
@@ -102,7 +102,7 @@ impl Replay {
             Err(why) => return InsertReply::Refused { why },
         }
         self.store(packed);
-        self.tidy();
+        self.rotate_and_prune();
         self.stored_reply()
     }
 
@@ -255,7 +255,7 @@ impl Replay {
         match result {
             Ok(Some(difference)) => {
                 self.count_difference(leave.actor, difference);
-                self.note(Note::Leave(*leave));
+                self.append_to_log(ProcessEvent::Leave(*leave));
             }
             Ok(None) => {}
             Err(_) => self.counters_mut().messages_refused += 1,

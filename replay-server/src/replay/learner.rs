@@ -10,7 +10,7 @@ use super::{Replay, VERSION_AHEAD_MAX};
 use crate::{
     config,
     ledger::requests::LastRequests,
-    persist::snapshot::{COUNT_MAX, Note},
+    persist::snapshot::{COUNT_MAX, ProcessEvent},
     sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
 
@@ -62,7 +62,7 @@ impl Replay {
         state.affinity.expect_another_source();
         self.awaits_row_count = false;
         self.requests = LastRequests::default();
-        self.note(Note::LearnerJoined(join));
+        self.append_to_log(ProcessEvent::LearnerJoined(join));
         Ok(repeated_updates)
     }
 
@@ -112,7 +112,7 @@ impl Replay {
             let has_saved = learned.saved_updates > self.state.learned.saved_updates;
             self.state.learned = learned;
             if has_saved {
-                self.next_segment();
+                self.begin_segment();
             }
         }
         Ok(())

@@ -22,7 +22,7 @@ use crate::{
 /// a restarted replay may not know all rows and weights.
 pub(crate) const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
-/// The state of the replay server. It is in memory, and with a log also on disk: see [`KeptReplay`](crate::KeptReplay).
+/// The state of the replay server. It is in memory, and with a log also on disk: see [`ReplayFolder`](crate::ReplayFolder).
 pub struct Replay {
     pub(crate) spec: RunSpec,
     pub(crate) config: Config,

@@ -30,7 +30,7 @@ use super::{
 };
 use crate::{
     config::Config,
-    persist::{KeptReplay, PersistArgs, PersistError, Reading, shard_dir},
+    persist::{PersistArgs, PersistError, RecoveryControl, ReplayFolder, shard_dir},
     replay::Replay,
 };
 
@@ -89,7 +89,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
             segment_bytes: None,
             mark: None,
         };
-        KeptReplay::find(&args, &spec, &config)
+        ReplayFolder::open(&args, &spec, &config)
     });
     let kept = kept.transpose()?;
     let transport: TransportConfig = settings.table("transport")?;
@@ -124,7 +124,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let admission = Arc::new(Admission {
         service: OnceLock::new(),
-        reading: Reading::begin(args.ending.clone()),
+        recovery: RecoveryControl::new(args.ending.clone()),
         config_toml: args.config_toml.clone(),
     });
     let answers = Queries::declare(&client, &admission, limits, &config.sampling);
@@ -135,7 +135,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         client.spec_hash()
     );
     let read = match kept {
-        Some(kept) => read(kept, empty, &admission.reading, spec.hash()),
+        Some(kept) => read(kept, empty, &admission.recovery, spec.hash()),
         None => Ok((empty, WeightsStore::default())),
     };
     let (mut replay, weights) = match read {
@@ -216,13 +216,13 @@ fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow
 
 /// Reads the kept replay into `empty`, and the newest weights kept with it. Logs what was found.
 fn read(
-    kept: KeptReplay,
+    kept: ReplayFolder,
     empty: Replay,
-    reading: &Reading,
+    control: &RecoveryControl,
     spec_hash: u64,
 ) -> Result<(Replay, WeightsStore), PersistError> {
     let (started, folder) = (Instant::now(), kept.dir().to_owned());
-    let (replay, recovery) = kept.read(empty, reading)?;
+    let (replay, recovery) = kept.recover(empty, control)?;
     let dir = folder.display();
     for warning in &recovery.warnings {
         tracing::warn!("{dir}: {warning}");

@@ -19,7 +19,7 @@ use super::{
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{persist::Reading, replay::Replay, storage::pack::Packer};
+use crate::{persist::RecoveryControl, replay::Replay, storage::pack::Packer};
 
 /// How long a thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);
@@ -143,14 +143,14 @@ impl State {
 pub(super) struct Admission {
     /// Set once the replay has been read back.
     pub(super) service: OnceLock<Arc<Service>>,
-    pub(super) reading: Reading,
+    pub(super) recovery: RecoveryControl,
     pub(super) config_toml: String,
 }
 
 impl Admission {
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {
-            progress: self.reading.progress(),
+            progress: self.recovery.progress(),
             config_toml: self.config_toml.clone(),
         }
     }

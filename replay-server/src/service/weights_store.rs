@@ -11,7 +11,7 @@ use driml_protocol::{
     PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, codec,
 };
 
-use crate::persist::journal::remove;
+use crate::persist::journal::try_remove;
 
 const FILE: &str = "weights.message";
 
@@ -42,7 +42,7 @@ impl WeightsStore {
     pub(super) fn kept_in(dir: &Path, spec_hash: u64, was_kept: bool) -> Self {
         let path = dir.join(FILE);
         if !was_kept {
-            remove(&path);
+            try_remove(&path);
         }
         let read = |bytes: &[u8]| {
             let (upload, safetensors) = codec::decode::<WeightsUpload>(bytes, Some(spec_hash))?;

@@ -8,7 +8,8 @@ use std::{
 
 use driml_protocol::{Batch, Buffer, Horizon, RequestId, RunSpec, Shutdown};
 use driml_replay_server::{
-    Compression, Config, KeptReplay, PersistArgs, PersistError, Reading, Recovery, Replay,
+    Compression, Config, PersistArgs, PersistError, RecoveryControl, RecoveryReport, Replay,
+    ReplayFolder,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -45,7 +46,7 @@ pub(crate) fn test_spec() -> RunSpec {
 pub(crate) fn open(
     args: &PersistArgs,
     config: &Config,
-) -> Result<(Replay, Recovery), PersistError> {
+) -> Result<(Replay, RecoveryReport), PersistError> {
     Replay::open(args, &test_spec(), config, ROWS)
 }
 
@@ -383,18 +384,18 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let (before, args, config) = (stored(&life.replay), life.args.clone(), life.config.clone());
     drop(life);
     let bytes = || bytes_in(root.path());
-    let find = || KeptReplay::find(&args, &test_spec(), &config).unwrap();
+    let find = || ReplayFolder::open(&args, &test_spec(), &config).unwrap();
     let empty = || Replay::new(&test_spec(), &config, ROWS).unwrap();
 
     let (kept, all, stop) = (find(), bytes(), Shutdown::default());
     stop.set();
-    let reading = Reading::begin(stop);
-    let broken_off = kept.read(empty(), &reading).map(drop);
+    let control = RecoveryControl::new(stop);
+    let broken_off = kept.recover(empty(), &control).map(drop);
     assert!(
         matches!(broken_off, Err(PersistError::Stopped)),
         "{broken_off:?}"
     );
-    let progress = reading.progress();
+    let progress = control.progress();
     assert_eq!((progress.bytes_read, progress.bytes), (0, all));
     assert_eq!(bytes(), all);
 
@@ -403,10 +404,10 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
         matches!(open(&args, &config), Err(PersistError::InUse(_))),
         "the folder is taken before it is read"
     );
-    let reading = Reading::begin(Shutdown::default());
-    let (replay, recovery) = kept.read(empty(), &reading).unwrap();
+    let control = RecoveryControl::new(Shutdown::default());
+    let (replay, recovery) = kept.recover(empty(), &control).unwrap();
     assert!(recovery.found && recovery.warnings.is_empty());
-    let progress = reading.progress();
+    let progress = control.progress();
     assert_eq!((progress.bytes_read, progress.bytes), (all, all));
     assert_eq!(stored(&replay), before);
 }

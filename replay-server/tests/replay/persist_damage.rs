@@ -8,7 +8,7 @@ use std::{
 use driml_protocol::{
     Buffer, Chunk, ChunkHeader, InsertReply, PROTOCOL_VERSION, RequestId, RunSpec,
 };
-use driml_replay_server::{Config, PersistArgs, Recovery, Replay};
+use driml_replay_server::{Config, PersistArgs, RecoveryReport, Replay};
 
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -57,7 +57,7 @@ impl Kept {
         segments(&self.args.dir)
     }
 
-    fn open(&self) -> (Replay, Recovery) {
+    fn open(&self) -> (Replay, RecoveryReport) {
         open(&self.args, &self.config).unwrap()
     }
 

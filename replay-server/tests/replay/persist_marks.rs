@@ -112,7 +112,7 @@ fn marks_that_are_given_up_leave_the_one_before_them() {
     for _ in 0..4 {
         store_some(&mut life);
         let mark = life.replay.mark().unwrap().unwrap();
-        life.replay.give_up_mark(mark);
+        life.replay.discard_mark(mark);
     }
     let (args, config) = life.end();
     let replay = at(&args, &config, kept).unwrap();

@@ -216,7 +216,7 @@ impl Lockstep {
         };
         let saved = self.save_at(mark, folder);
         if saved.is_err() {
-            self.replay.give_up_mark(mark);
+            self.replay.discard_mark(mark);
         }
         saved
     }
@@ -242,7 +242,7 @@ impl Lockstep {
                 InsertReply::Stored { .. } => break,
                 InsertReply::Wait { .. } => match self.replay.sample(self.batch_size) {
                     Ok(batch) => self.learn(&batch)?,
-                    Err(_) if self.replay.is_refused_by_disk() => {
+                    Err(_) if self.replay.is_disk_failing() => {
                         bail!(
                             "the run folder cannot be written (the log has the reason): make room, then use --resume"
                         )
