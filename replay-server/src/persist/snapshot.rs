@@ -1,4 +1,4 @@
-//! The state of the replay without the transitions, as a value that is saved and restored, and the events that change it between two chunks.
+//! The state of the replay without the transitions, as a value that is saved and restored, and the events that change it between chunks.
 //! `upkeep` decides when to save a snapshot; `journal` decides where.
 
 use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec, codec};

@@ -14,7 +14,7 @@ use super::{
 use crate::sampling::batch::PackedBatch;
 
 /// A parked request with its responder.
-type Parked = ParkedRequest<Responder<BatchReply>>;
+type ParkedBatchRequest = ParkedRequest<Responder<BatchReply>>;
 
 impl Service {
     pub(super) fn request(&self, incoming: Incoming<BatchRequest>) {
@@ -25,17 +25,17 @@ impl Service {
             return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         };
         let mut state = self.state();
-        if let Err(why) = self.note_learner(&mut state, &request) {
+        if let Err(why) = self.update_from_request(&mut state, &request) {
             let line = format!("a request for a batch was refused: {why}");
-            state.refuse("batch", &line);
+            state.reject("batch", &line);
             drop(state);
             return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         }
         let learner = Alive::learner(request.learner);
-        state.participants.seen(learner, None, Instant::now());
+        state.participants.mark_seen(learner, None, Instant::now());
         let parked = ParkedRequest {
             request,
-            question: responder,
+            query: responder,
             arrived: Instant::now(),
         };
         park_request(&mut state.requests, parked);
@@ -44,12 +44,12 @@ impl Service {
     }
 
     /// Takes the learner's progress and the counts of the other shards from a request. An error says why the request is rejected.
-    fn note_learner(&self, state: &mut State, request: &BatchRequest) -> Result<(), String> {
+    fn update_from_request(&self, state: &mut State, request: &BatchRequest) -> Result<(), String> {
         state.check_learner(request.learner)?;
-        let (rows, most) = (request.rows, self.limits.batch_rows);
-        if !(1..=most).contains(&rows) {
+        let (rows, rows_max) = (request.rows, self.limits.batch_rows_max);
+        if !(1..=rows_max).contains(&rows) {
             return Err(format!(
-                "a batch of {rows} rows; those of this run have {most} (learner.batch_size)"
+                "a batch of {rows} rows; those of this run have {rows_max} (learner.batch_size)"
             ));
         }
         state.replay.set_progress(request.learned)?;
@@ -67,14 +67,14 @@ impl Service {
     }
 
     /// Serves parked requests as the limiter allows them, until the shutdown. Each thread of this kind does nothing else.
-    pub(super) fn serve_parked(&self) {
+    pub(super) fn serve_parked_requests(&self) {
         while !self.shutdown.is_set() {
             fail_point::reach("sample");
             let mut state = self.state();
             let now = Instant::now();
-            let Some((parked, drawn)) = state.next_answer(now, &self.pool) else {
-                let due_in = state.requests.iter().map(|it| it.left(now)).min();
-                self.wait(state, due_in);
+            let Some((parked, drawn)) = state.take_answerable(now, &self.pool) else {
+                let due_in = state.requests.iter().map(|it| it.time_left(now)).min();
+                self.wait_changed(state, due_in);
                 continue;
             };
             let waited = now.saturating_duration_since(parked.arrived);
@@ -85,9 +85,9 @@ impl Service {
                 Ok(batch) => {
                     let (header, payload) = batch.into_payload();
                     let reply = BatchReply::Batch(header);
-                    parked.question.reply_with(&reply, payload.freeze());
+                    parked.query.reply_with(&reply, payload.freeze());
                 }
-                Err(not_ready) => parked.question.reply(&BatchReply::NotReady(not_ready)),
+                Err(not_ready) => parked.query.reply(&BatchReply::NotReady(not_ready)),
             }
         }
     }
@@ -95,11 +95,11 @@ impl Service {
 
 impl State {
     /// Removes the first parked request that can be answered now, and returns it with its answer, in memory of `pool`.
-    fn next_answer(
+    fn take_answerable(
         &mut self,
         now: Instant,
         pool: &BufferPool,
-    ) -> Option<(Parked, Result<PackedBatch, NotReady>)> {
+    ) -> Option<(ParkedBatchRequest, Result<PackedBatch, NotReady>)> {
         for at in 0..self.requests.len() {
             let parked = &self.requests[at];
             let request = parked.request;
@@ -108,7 +108,7 @@ impl State {
                 false => pool.take_own(bytes),
             };
             let drawn = self.replay.draw_for(request.id, request.rows, alloc);
-            if !matches!(drawn, Err(NotReady::Wait(_))) || parked.left(now).is_zero() {
+            if !matches!(drawn, Err(NotReady::Wait(_))) || parked.time_left(now).is_zero() {
                 let parked = self.requests.remove(at);
                 return parked.map(|parked| (parked, drawn));
             }

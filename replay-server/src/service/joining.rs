@@ -9,36 +9,36 @@ use driml_protocol::{
 use zenoh::sample::SampleKind;
 
 use super::{
-    limits::SHARED_LIVES_MAX,
+    limits::SHARED_INCARNATIONS_MAX,
     server::{Service, State},
 };
 
 impl Service {
-    pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
+    pub(super) fn update_connection(&self, who: Alive, kind: SampleKind) {
         let (mut state, now) = (self.state(), Instant::now());
         let is_connected = kind == SampleKind::Put;
-        state.participants.note_connected(who, is_connected, now);
+        state.participants.set_connected(who, is_connected, now);
         let joined = match who.process {
             ProcessName::Actor(actor) => state.replay.actor_incarnation(actor),
             ProcessName::Learner => state.replay.learner_id(),
         };
         // A process that joined before the server restarted with its replay does not join again.
         if joined.is_some_and(|number| Alive::of(who.process, number) == who) {
-            state.participants.joined(who, now);
+            state.participants.add_joined(who, now);
         }
-        state.count_actors();
+        state.update_actor_count();
     }
 
     pub(super) fn run_info(&self, incoming: Incoming<RunInfo>) {
         let state = self.state();
-        let lives = state.participants.actor_lives();
+        let incarnations = state.participants.actor_incarnations();
         let run_info = RunInfo {
             config_toml: self.config_toml.clone(),
             inserted_total: state.replay.inserted_total(),
             has_learner: state.replay.learner_id().is_some(),
             after_updates: state.replay.resumed_after_updates(),
             shard: self.shard,
-            shared_memory: self.shared_memory && lives < SHARED_LIVES_MAX,
+            shared_memory: self.reads_shared_memory && incarnations < SHARED_INCARNATIONS_MAX,
         };
         drop(state);
         incoming.into_responder().reply(&run_info);
@@ -59,7 +59,7 @@ impl Service {
         incoming: Incoming<J>,
         join: impl Fn(&mut State, J) -> Result<u32, JoinReply>,
     ) {
-        let weights_version = self.weights().version();
+        let weights_version = self.weights().newest_version();
         self.answer(incoming, |state, request| {
             let reply = match join(state, request) {
                 Ok(earlier_incarnations) => JoinReply::Welcome(Welcome {
@@ -73,7 +73,7 @@ impl Service {
                 return None;
             }
             if let JoinReply::Refused { why } = &reply {
-                state.refuse("join", &format!("a process was not admitted: {why}"));
+                state.reject("join", &format!("a process was not admitted: {why}"));
             }
             self.changed.notify_all();
             Some(reply)
@@ -81,12 +81,12 @@ impl Service {
     }
 }
 
-fn refused(why: String) -> JoinReply {
+fn refused_reply(why: String) -> JoinReply {
     JoinReply::Refused { why }
 }
 
 impl State {
-    fn count_actors(&mut self) {
+    fn update_actor_count(&mut self) {
         self.replay.counters_mut().actors = self.participants.actors_connected();
     }
 
@@ -106,8 +106,8 @@ impl State {
         let known = self.replay.actor_incarnation(actor);
         let other = known.filter(|&other| other != incarnation);
         let participants = &mut self.participants;
-        let is_connected = |actor, life| participants.is_connected(Alive::actor(actor, life));
-        if other.is_some_and(|life| is_connected(actor, life)) {
+        let is_connected = |actor, it| participants.is_connected(Alive::actor(actor, it));
+        if other.is_some_and(|it| is_connected(actor, it)) {
             let why = format!(
                 "another process is actor {actor} of this run: give each actor another number (--id)"
             );
@@ -116,9 +116,9 @@ impl State {
         // Otherwise a process that joins under one number after another would use up all numbers.
         let absent = self.replay.forget_absent(is_connected);
         participants.forget(&absent);
-        let earlier_incarnations = self.replay.join_actor(join).map_err(refused)?;
-        participants.joined(Alive::actor(actor, incarnation), Instant::now());
-        self.count_actors();
+        let earlier_incarnations = self.replay.join_actor(join).map_err(refused_reply)?;
+        participants.add_joined(Alive::actor(actor, incarnation), Instant::now());
+        self.update_actor_count();
         if other.is_some() {
             // Drops a parked chunk of the earlier incarnation.
             self.chunks.take(actor);
@@ -130,9 +130,9 @@ impl State {
         let (learner, updates) = (join.learner, join.updates);
         let served = self.replay.learner_id();
         let other = served.filter(|&other| other != learner);
-        if other.is_some() && self.participants.is_over() {
+        if other.is_some() && self.participants.is_run_over() {
             let done = self.replay.status().updates;
-            return Err(refused(format!(
+            return Err(refused_reply(format!(
                 "the run is finished, with {done} updates; to train on, resume it with more --frames"
             )));
         }
@@ -140,7 +140,7 @@ impl State {
             let why = "another learner takes part in this run, which has one alone".into();
             return Err(JoinReply::Taken { why });
         }
-        let repeated = self.replay.join_learner(join).map_err(refused)?;
+        let repeated = self.replay.join_learner(join).map_err(refused_reply)?;
         if repeated > 0 {
             tracing::warn!(
                 "the learner resumes from its checkpoint after {updates} updates; updates since then, to be learned again: {repeated}"
@@ -150,7 +150,7 @@ impl State {
             let requests = &mut self.requests;
             requests.retain(|it| it.request.learner == learner);
             self.participants
-                .joined(Alive::learner(learner), Instant::now());
+                .add_joined(Alive::learner(learner), Instant::now());
         }
         Ok(0)
     }

@@ -20,15 +20,15 @@ pub(super) struct Participants {
     waiting: (Waiting, Instant),
     /// All connected incarnations, including those that have not joined.
     connected: HashSet<Alive>,
-    processes: BTreeMap<ProcessName, Account>,
+    processes: BTreeMap<ProcessName, ProcessState>,
 }
 
 /// A participant, over all its incarnations.
-struct Account {
+struct ProcessState {
     alive: Alive,
-    lives: u32,
+    incarnations: u32,
     /// When the process last joined, connected or disconnected.
-    changed: Instant,
+    changed_at: Instant,
     last_seen: Option<Instant>,
     weights_version: Option<u64>,
     report: Option<(Report, Instant)>,
@@ -44,20 +44,20 @@ impl Participants {
         }
     }
 
-    pub(super) fn joined(&mut self, who: Alive, now: Instant) {
+    pub(super) fn add_joined(&mut self, who: Alive, now: Instant) {
         let earlier = self.processes.get(&who.process);
-        if earlier.is_some_and(|account| account.alive == who) {
+        if earlier.is_some_and(|process| process.alive == who) {
             return;
         }
-        let account = Account {
+        let process = ProcessState {
             alive: who,
-            lives: earlier.map_or(0, |account| account.lives) + 1,
-            changed: now,
+            incarnations: earlier.map_or(0, |process| process.incarnations) + 1,
+            changed_at: now,
             last_seen: None,
             weights_version: None,
             report: None,
         };
-        self.processes.insert(who.process, account);
+        self.processes.insert(who.process, process);
     }
 
     /// Forgets actors that no longer take part.
@@ -67,21 +67,19 @@ impl Participants {
         }
     }
 
-    /// Returns the account of this incarnation, if it has joined and was not replaced.
-    fn of(&mut self, who: Alive) -> Option<&mut Account> {
-        let account = self.processes.get_mut(&who.process)?;
-        (account.alive == who).then_some(account)
+    /// Returns the state of this incarnation, if it has joined and was not replaced.
+    fn current_mut(&mut self, who: Alive) -> Option<&mut ProcessState> {
+        let process = self.processes.get_mut(&who.process)?;
+        (process.alive == who).then_some(process)
     }
 
-    fn all(&self, learner: bool) -> impl Iterator<Item = &Account> {
-        let processes = self.processes.iter();
-        let processes =
-            processes.filter(move |(who, _)| (**who == ProcessName::Learner) == learner);
-        processes.map(|(_, account)| account)
+    fn by_role(&self, is_learner: bool) -> impl Iterator<Item = &ProcessState> {
+        let processes = self.processes.values();
+        processes.filter(move |it| (it.alive.process == ProcessName::Learner) == is_learner)
     }
 
-    pub(super) fn actor_lives(&self) -> u32 {
-        self.all(false).map(|account| account.lives).sum()
+    pub(super) fn actor_incarnations(&self) -> u32 {
+        self.by_role(false).map(|it| it.incarnations).sum()
     }
 
     /// Whether this incarnation of a process is connected, even if it has not joined.
@@ -89,47 +87,47 @@ impl Participants {
         self.connected.contains(&who)
     }
 
-    pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
+    pub(super) fn set_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
         let has_changed = match is_connected {
             true => self.connected.len() < CONNECTED_MAX && self.connected.insert(who),
             false => self.connected.remove(&who),
         };
-        if let Some(account) = self.of(who).filter(|_| has_changed) {
-            account.changed = now;
+        if let Some(process) = self.current_mut(who).filter(|_| has_changed) {
+            process.changed_at = now;
         }
     }
 
     pub(super) fn actors_connected(&self) -> u32 {
-        let connected = self.all(false).filter(|it| self.is_connected(it.alive));
+        let connected = self.by_role(false).filter(|it| self.is_connected(it.alive));
         connected.count() as u32
     }
 
-    pub(super) fn connected(&self) -> usize {
+    pub(super) fn connected_count(&self) -> usize {
         let processes = self.processes.values();
         processes.filter(|it| self.is_connected(it.alive)).count()
     }
 
     /// Notes that a chunk came from an actor, in which weights of this version acted, or a request from the learner.
-    pub(super) fn seen(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
-        if let Some(account) = self.of(who) {
-            account.last_seen = Some(now);
-            account.weights_version = weights_version.or(account.weights_version);
+    pub(super) fn mark_seen(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
+        if let Some(process) = self.current_mut(who) {
+            process.last_seen = Some(now);
+            process.weights_version = weights_version.or(process.weights_version);
         }
     }
 
     /// Stores the report of a process; `false` if the process has not joined.
-    pub(super) fn reported(&mut self, mut report: Report, now: Instant) -> bool {
-        let Some(account) = self.of(report.who.alive()) else {
+    pub(super) fn store_report(&mut self, mut report: Report, now: Instant) -> bool {
+        let Some(process) = self.current_mut(report.who.alive()) else {
             return false;
         };
         // A late report from before the end of the run does not undo `finished`.
-        let said = account.report.as_ref().and_then(|(it, _)| it.finished);
-        report.finished = report.finished.or(said);
-        account.report = Some((report, now));
+        let earlier = process.report.as_ref().and_then(|(it, _)| it.finished);
+        report.finished = report.finished.or(earlier);
+        process.report = Some((report, now));
         true
     }
 
-    pub(super) fn note_waiting(&mut self, waiting: Waiting, now: Instant) {
+    pub(super) fn set_waiting(&mut self, waiting: Waiting, now: Instant) {
         if discriminant(&self.waiting.0) != discriminant(&waiting) {
             self.waiting.1 = now;
         }
@@ -138,31 +136,31 @@ impl Participants {
 
     /// Returns which side waits at the limiter, and for how many seconds.
     pub(super) fn waiting(&self, now: Instant) -> (Waiting, f64) {
-        (self.waiting.0, seconds(now, self.waiting.1))
+        (self.waiting.0, elapsed_s(now, self.waiting.1))
     }
 
     /// Returns the seconds since the server started.
     pub(super) fn up_s(&self, now: Instant) -> f64 {
-        seconds(now, self.started)
+        elapsed_s(now, self.started)
     }
 
     /// Whether the learner has reported that it has learned from every batch and saved a checkpoint.
-    pub(super) fn is_over(&self) -> bool {
-        let mut reports = self.all(true).filter_map(|it| it.report.as_ref());
+    pub(super) fn is_run_over(&self) -> bool {
+        let mut reports = self.by_role(true).filter_map(|it| it.report.as_ref());
         reports.any(|(report, _)| report.finished.is_some())
     }
 
-    /// Returns the missing process that the run needs, as a text for a person; `finished` tells whether all transitions are stored.
-    pub(super) fn missing(&self, finished: bool) -> Option<&'static str> {
-        let lacks = |learner, gone, not_yet| {
-            let mut processes = self.all(learner).peekable();
+    /// Returns the missing process that the run needs, as a text for a person; `all_stored` tells whether all transitions are stored.
+    pub(super) fn missing_process(&self, all_stored: bool) -> Option<&'static str> {
+        let missing_in = |learner, gone, not_yet| {
+            let mut processes = self.by_role(learner).peekable();
             let missing = processes.peek().map_or(not_yet, |_| gone);
-            let is_there = processes.any(|it| self.is_connected(it.alive));
-            (!is_there).then_some(missing)
+            let is_connected = processes.any(|it| self.is_connected(it.alive));
+            (!is_connected).then_some(missing)
         };
-        let learner = lacks(true, "the learner is gone", "no learner has joined yet");
-        let actors = lacks(false, "all actors are gone", "no actor has joined yet");
-        learner.or(actors.filter(|_| !finished))
+        let learner = missing_in(true, "the learner is gone", "no learner has joined yet");
+        let actors = missing_in(false, "all actors are gone", "no actor has joined yet");
+        learner.or(actors.filter(|_| !all_stored))
     }
 
     /// Returns the status of all processes. `held_since` gives the time since which a process's chunk or request waits. Only the newest
@@ -172,21 +170,21 @@ impl Participants {
         now: Instant,
         held_since: impl Fn(ProcessName) -> Option<Instant>,
     ) -> Vec<ProcessStatus> {
-        let process = |(&who, account): (&ProcessName, &Account)| {
-            let report = account.report.as_ref();
-            let report = report.map(|(report, at)| (report, seconds(now, *at)));
+        let process = |(&who, process): (&ProcessName, &ProcessState)| {
+            let report = process.report.as_ref();
+            let report = report.map(|(report, at)| (report, elapsed_s(now, *at)));
             ProcessStatus {
                 who,
-                connected: self.is_connected(account.alive),
-                since_s: seconds(now, account.changed),
-                lives: account.lives,
-                last_seen_s: account.last_seen.map(|at| seconds(now, at)),
-                held_s: held_since(who).map(|at| seconds(now, at)),
-                weights_version: account.weights_version,
-                doing: report.map(|(it, said)| (it.doing.clone(), it.since_s + said, said)),
-                last_warning: report.and_then(|(report, said)| {
+                connected: self.is_connected(process.alive),
+                since_s: elapsed_s(now, process.changed_at),
+                lives: process.incarnations,
+                last_seen_s: process.last_seen.map(|at| elapsed_s(now, at)),
+                held_s: held_since(who).map(|at| elapsed_s(now, at)),
+                weights_version: process.weights_version,
+                doing: report.map(|(it, age_s)| (it.doing.clone(), it.since_s + age_s, age_s)),
+                last_warning: report.and_then(|(report, age_s)| {
                     let warning = report.last_warning.as_ref()?;
-                    Some(Warning::new(&warning.text, warning.age_s + said))
+                    Some(Warning::new(&warning.text, warning.age_s + age_s))
                 }),
             }
         };
@@ -203,7 +201,7 @@ impl Participants {
     }
 }
 
-fn seconds(now: Instant, since: Instant) -> f64 {
+fn elapsed_s(now: Instant, since: Instant) -> f64 {
     now.saturating_duration_since(since).as_secs_f64()
 }
 
@@ -224,22 +222,22 @@ mod tests {
         let start = Instant::now();
         let at = |seconds| start + Duration::from_secs(seconds);
         let mut participants = Participants::new(start);
-        participants.note_connected(actor(1), true, at(1));
+        participants.set_connected(actor(1), true, at(1));
         let processes = participants.processes(at(1), |_| None);
         assert_eq!(processes, [], "only who has joined takes part");
-        participants.joined(actor(1), at(2));
-        participants.joined(actor(1), at(5));
-        participants.seen(actor(1), Some(7), at(6));
-        participants.seen(actor(9), Some(8), at(7));
+        participants.add_joined(actor(1), at(2));
+        participants.add_joined(actor(1), at(5));
+        participants.mark_seen(actor(1), Some(7), at(6));
+        participants.mark_seen(actor(9), Some(8), at(7));
         let report = |incarnation| {
             let (actor, warning) = (3, Some(Warning::new("late", 1.0)));
             let who = Participant::Actor { actor, incarnation };
             Report::new(who, "plays", 2.0, warning)
         };
-        assert!(participants.reported(report(1), at(8)));
-        assert!(!participants.reported(report(9), at(8)));
-        participants.note_connected(actor(1), false, at(10));
-        participants.note_connected(actor(1), false, at(11));
+        assert!(participants.store_report(report(1), at(8)));
+        assert!(!participants.store_report(report(9), at(8)));
+        participants.set_connected(actor(1), false, at(10));
+        participants.set_connected(actor(1), false, at(11));
         let expected = ProcessStatus {
             who: ProcessName::Actor(3),
             connected: false,
@@ -254,15 +252,15 @@ mod tests {
         assert_eq!(participants.processes(at(12), |_| Some(at(11))), [expected]);
 
         assert_eq!(participants.actors_connected(), 0);
-        participants.note_connected(actor(2), true, at(20));
-        participants.joined(actor(2), at(20));
-        participants.joined(Alive::learner(1), at(20));
+        participants.set_connected(actor(2), true, at(20));
+        participants.add_joined(actor(2), at(20));
+        participants.add_joined(Alive::learner(1), at(20));
         assert_eq!(participants.actors_connected(), 1);
-        assert_eq!(participants.actor_lives(), 2);
+        assert_eq!(participants.actor_incarnations(), 2);
         let again = &participants.processes(at(21), |_| None)[1];
         assert!(again.lives == 2 && again.connected && again.last_seen_s.is_none());
         participants.forget(&[3, 4]);
-        assert_eq!(participants.actor_lives(), 0);
+        assert_eq!(participants.actor_incarnations(), 0);
     }
 
     #[test]
@@ -270,11 +268,11 @@ mod tests {
         let now = Instant::now();
         let mut participants = Participants::new(now);
         let mut check = |who, joins, connected, all_stored, missing| {
-            participants.note_connected(who, connected, now);
+            participants.set_connected(who, connected, now);
             if joins {
-                participants.joined(who, now);
+                participants.add_joined(who, now);
             }
-            assert_eq!(participants.missing(all_stored), missing);
+            assert_eq!(participants.missing_process(all_stored), missing);
         };
         let (learner, actor) = (Alive::learner(5), actor(1));
         let no_learner = Some("no learner has joined yet");
@@ -295,7 +293,7 @@ mod tests {
         let mut participants = Participants::new(start);
         let actors = Waiting::ActorsWaitForLearner;
         for (now, waiting, since) in [(1, warm_up(1), 1), (4, warm_up(50), 1), (6, actors, 6)] {
-            participants.note_waiting(waiting, at(now));
+            participants.set_waiting(waiting, at(now));
             let seconds = (8 - since) as f64;
             assert_eq!(participants.waiting(at(8)), (waiting, seconds));
         }
@@ -308,11 +306,11 @@ mod tests {
         for actor in 0..200 {
             let incarnation = 1;
             let who = Participant::Actor { actor, incarnation };
-            participants.joined(who.alive(), now);
+            participants.add_joined(who.alive(), now);
             // Warnings of actors with higher numbers are newer, and many have the same age.
             let age = f64::from((200 - actor) / 50);
             let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));
-            assert!(participants.reported(report, now));
+            assert!(participants.store_report(report, now));
         }
         let processes = participants.processes(now, |_| None);
         let passed = processes

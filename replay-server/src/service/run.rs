@@ -21,10 +21,10 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable, sample::SampleKind};
 
 use super::{
-    limits::{HEAD_BYTES_MAX, Limits, number, shared_memory_bytes},
+    limits::{HEAD_BYTES_MAX, MessageLimits, read_u32, shared_memory_bytes},
     parked::ParkedChunks,
     participants::Participants,
-    server::{Admission, Service, State},
+    server::{Service, ServiceGate, State},
     timings::Timings,
     weights_store::WeightsStore,
 };
@@ -40,12 +40,12 @@ const BATCH_THREADS: usize = 2;
 const WEIGHTS_THREADS: usize = 4;
 
 /// Maximum time that a query about a chunk is held before its reply.
-const HOLD_MAX: Duration = Duration::from_secs(2);
+const QUERY_HOLD_MAX: Duration = Duration::from_secs(2);
 
 /// Buffers kept for reuse by later chunks and batches.
-const SPARE_MAX: usize = 8;
+const SPARE_BUFFERS_MAX: usize = 8;
 
-const THREADS_END_MAX: Duration = Duration::from_secs(2);
+const THREADS_JOIN_MAX: Duration = Duration::from_secs(2);
 
 /// The arguments of a replay server process.
 #[derive(Clone, Debug)]
@@ -79,8 +79,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let spec: RunSpec = settings.table("run")?;
     spec.validate()?;
     let config: Config = settings.table("replay")?;
-    let batch_size = number(&settings, "learner", "batch_size")?;
-    let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
+    let batch_size = read_u32(&settings, "learner", "batch_size")?;
+    let ack_timeout = Duration::from_millis(read_u32(&settings, "actor", "ack_timeout_ms")?.into());
     let empty = Replay::shard(&spec, &config, batch_size, args.shard)?;
     let kept = args.dir.as_ref().map(|dir| {
         let args = PersistArgs {
@@ -99,15 +99,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let is_granted =
         transport.shared_memory && shared_memory::is_granted(shared_memory::check_room(needed));
     let pool = if is_granted {
-        BufferPool::shared(SPARE_MAX, POOL_BATCHES, batch.payload_bytes())
+        BufferPool::shared(SPARE_BUFFERS_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {
-        BufferPool::new(SPARE_MAX)
+        BufferPool::new(SPARE_BUFFERS_MAX)
     };
-    let slower =
+    let warn_slower =
         |why: &String| tracing::warn!("chunks come through sockets, which is slower: {why}");
-    let is_lockable = || shared_memory::check_lockable(needed).inspect_err(slower);
+    let is_lockable = || shared_memory::check_lockable(needed).inspect_err(warn_slower);
     let reads_shared_memory = is_granted && is_lockable().is_ok();
-    let limits = Limits::of(&settings, &spec, args.weights_bytes_max)?;
+    let limits = MessageLimits::from_settings(&settings, &spec, args.weights_bytes_max)?;
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints {
         listen: args.listen.clone(),
@@ -117,25 +117,25 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         &endpoints,
         &keys,
         args.credentials.as_deref(),
-        limits.largest(),
+        limits.largest_bytes(),
     )?;
     let client = RunClient::new(session, keys, spec.hash());
-    let declaring =
+    let declare_error =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
-    let admission = Arc::new(Admission {
+    let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
         recovery: RecoveryControl::new(args.ending.clone()),
         config_toml: args.config_toml.clone(),
     });
-    let answers = Queries::declare(&client, &admission, limits, &config.sampling);
-    let (queryables, mut threads) = answers.map_err(declaring)?;
+    let declared = Queries::declare(&client, &gate, limits, &config.sampling);
+    let (queryables, mut threads) = declared.map_err(declare_error)?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
         client.spec_hash()
     );
     let read = match kept {
-        Some(kept) => read(kept, empty, &admission.recovery, spec.hash()),
+        Some(kept) => recover_replay(kept, empty, &gate.recovery, spec.hash()),
         None => Ok((empty, WeightsStore::default())),
     };
     let (mut replay, weights) = match read {
@@ -158,8 +158,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         limits,
         shard: (args.shard, config.shards),
         config_toml: args.config_toml,
-        shared_memory: reads_shared_memory,
-        hold_max: HOLD_MAX.min(ack_timeout / 4),
+        reads_shared_memory,
+        hold_max: QUERY_HOLD_MAX.min(ack_timeout / 4),
         pool,
         packer: replay.packer(),
         state: Mutex::new(State {
@@ -168,18 +168,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
             chunks: ParkedChunks::new(),
             requests: VecDeque::new(),
             timings: Timings::default(),
-            said: HashMap::new(),
+            log_limiters: HashMap::new(),
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
-        announcements: client.announce().map_err(declaring)?,
+        announcements: client.announce().map_err(declare_error)?,
         shutdown: shutdown.clone(),
     });
-    let (alive, members) = watch_members(&client, &service)
+    let (subscriber, members) = watch_members(&client, &service)
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
-    let opened = admission.service.set(service.clone());
+    let opened = gate.service.set(service.clone());
     assert!(opened.is_ok(), "a replay is read back once");
-    threads.extend(service.clone().start_working()?);
+    threads.extend(service.clone().start_threads()?);
     threads.push(members);
     service.wait_until_over(&args.ending, args.keep_alive);
     // The threads of the service wait for this flag.
@@ -189,7 +189,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         "replay server stops with {} transitions stored",
         service.state().replay.inserted_total()
     );
-    drop(alive);
+    drop(subscriber);
     let closed = close(&client, queryables, threads);
     let mut state = service.state();
     if let Some(journal) = &mut state.replay.journal {
@@ -203,19 +203,19 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
             counts.repeated
         );
     }
-    closed.map(|()| state.participants.is_over())
+    closed.map(|()| state.participants.is_run_over())
 }
 
 /// Stops answering: without the queryables no query comes, without the session no reply to a slow client is sent, and the threads end.
 fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow::Result<()> {
     drop(queryables);
     let closed = client.session().close().wait();
-    join_within(threads, THREADS_END_MAX);
+    join_within(threads, THREADS_JOIN_MAX);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
 /// Reads the kept replay into `empty`, and the newest weights kept with it. Logs what was found.
-fn read(
+fn recover_replay(
     kept: ReplayFolder,
     empty: Replay,
     control: &RecoveryControl,
@@ -245,7 +245,7 @@ fn read(
     } else {
         tracing::info!("keeps the replay in {dir}");
     }
-    let weights = WeightsStore::kept_in(&folder, spec_hash, recovery.found);
+    let weights = WeightsStore::open(&folder, spec_hash, recovery.found);
     Ok((replay, weights))
 }
 
@@ -255,23 +255,23 @@ type Threads = Vec<JoinHandle<()>>;
 /// The queries that the replay server answers. Each kind of message has separate threads.
 struct Queries<'a> {
     client: &'a RunClient,
-    admission: &'a Arc<Admission>,
+    gate: &'a Arc<ServiceGate>,
     queryables: Queryables,
     threads: Threads,
 }
 
 impl<'a> Queries<'a> {
-    /// Declares all queries; `sampling` decides whether priorities are among them. Before `admission` has its service, every query is
+    /// Declares all queries; `sampling` decides whether priorities are among them. Before `gate` has its service, every query is
     /// answered with "retry". Dropping the queryables ends the threads.
     fn declare(
         client: &'a RunClient,
-        admission: &'a Arc<Admission>,
-        limits: Limits,
+        gate: &'a Arc<ServiceGate>,
+        limits: MessageLimits,
         sampling: &Sampling,
     ) -> zenoh::Result<(Queryables, Threads)> {
         let mut this = Self {
             client,
-            admission,
+            gate,
             queryables: Vec::new(),
             threads: Threads::new(),
         };
@@ -287,8 +287,8 @@ impl<'a> Queries<'a> {
         this.answer("join-actor", 1, small, Service::join_actor)?;
         this.answer("join-learner", 1, small, Service::join_learner)?;
         this.answer("leave", 1, small, Service::leave)?;
-        this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
-        this.answer("weights", WEIGHTS_THREADS, small, Service::give_weights)?;
+        this.answer("weights-upload", 1, limits.weights, Service::store_weights)?;
+        this.answer("weights", WEIGHTS_THREADS, small, Service::send_weights)?;
         this.answer("report", 1, small, Service::report)?;
         this.answer("status", 1, small, Service::status)?;
         this.answer("processes", 1, small, Service::processes)?;
@@ -304,18 +304,18 @@ impl<'a> Queries<'a> {
         bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
-        let (admission, spec_hash) = (self.admission.clone(), self.client.spec_hash());
-        let answer = move |incoming: Incoming<R>| match admission.service.get() {
+        let (gate, spec_hash) = (self.gate.clone(), self.client.spec_hash());
+        let answer = move |incoming: Incoming<R>| match gate.service.get() {
             Some(service) => answer(service, incoming),
-            None => incoming.into_responder().put_off(&admission.put_off()),
+            None => incoming.into_responder().put_off(&gate.recovering_reply()),
         };
         let workers = QueryWorkers::start(name, threads, spec_hash, answer)?;
-        let admission = self.admission.clone();
-        let refused = move |bytes| match admission.service.get() {
-            Some(service) => service.refuse_long(name, bytes, bytes_max),
+        let gate = self.gate.clone();
+        let reject_long = move |bytes| match gate.service.get() {
+            Some(service) => service.reject_too_long(name, bytes, bytes_max),
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };
-        let queryable = workers.declare(self.client, bytes_max, refused)?;
+        let queryable = workers.declare(self.client, bytes_max, reject_long)?;
         self.queryables.push(queryable);
         self.threads.extend(workers.into_threads());
         Ok(())
@@ -329,15 +329,15 @@ fn watch_members(
     service: &Arc<Service>,
 ) -> zenoh::Result<(Subscriber<()>, JoinHandle<()>)> {
     let (service, keys) = (service.clone(), client.keys().clone());
-    let (noted, members) = mpsc::channel::<(Alive, SampleKind)>();
+    let (sender, receiver) = mpsc::channel::<(Alive, SampleKind)>();
     let next = move || {
         fail_point::reach("members");
-        members.recv().ok()
+        receiver.recv().ok()
     };
     let thread = std::thread::Builder::new()
         .name("members".into())
         .spawn(move || {
-            std::iter::from_fn(next).for_each(|(who, kind)| service.note_alive(who, kind));
+            std::iter::from_fn(next).for_each(|(who, kind)| service.update_connection(who, kind));
         })?;
     let subscriber = client
         .session()
@@ -347,7 +347,7 @@ fn watch_members(
         .callback(move |sample| {
             if let Some(who) = keys.alive(sample.key_expr().as_str()) {
                 // The receiving thread ends only after this callback is dropped.
-                let _ = noted.send((who, sample.kind()));
+                let _ = sender.send((who, sample.kind()));
             }
         })
         .wait()?;
@@ -355,19 +355,19 @@ fn watch_members(
 }
 
 impl Service {
-    fn start_working(self: Arc<Self>) -> std::io::Result<Threads> {
-        let work = |name: &str, work: fn(&Self)| {
+    fn start_threads(self: Arc<Self>) -> std::io::Result<Threads> {
+        let spawn = |name: &str, work: fn(&Self)| {
             let service = self.clone();
             std::thread::Builder::new()
                 .name(name.into())
                 .spawn(move || work(&service))
         };
         let mut threads = vec![
-            work("admit", Self::admit_parked)?,
-            work("missing", Self::say_who_is_missing)?,
+            spawn("admit", Self::store_parked_chunks)?,
+            spawn("missing", Self::log_missing_processes)?,
         ];
         for i in 0..BATCH_THREADS {
-            threads.push(work(&format!("sample-{i}"), Self::serve_parked)?);
+            threads.push(spawn(&format!("sample-{i}"), Self::serve_parked_requests)?);
         }
         Ok(threads)
     }

@@ -13,7 +13,7 @@ use driml_protocol::{
 };
 
 use super::{
-    limits::Limits,
+    limits::MessageLimits,
     parked::{ParkedChunks, ParkedRequest},
     participants::Participants,
     timings::Timings,
@@ -22,13 +22,13 @@ use super::{
 use crate::{persist::RecoveryControl, replay::Replay, storage::pack::Packer};
 
 /// How long a thread sleeps when nothing is parked; it is woken when something is.
-const IDLE: Duration = Duration::from_secs(60);
+const IDLE_MAX: Duration = Duration::from_secs(60);
 
 pub(super) struct Service {
-    pub(super) limits: Limits,
+    pub(super) limits: MessageLimits,
     pub(super) shard: (u32, u32),
     pub(super) config_toml: String,
-    pub(super) shared_memory: bool,
+    pub(super) reads_shared_memory: bool,
     /// How long a query about a chunk is held before the reply `Wait`: far below the actors' time-out, so that an actor can tell a server
     /// that makes it wait from an unresponsive one.
     pub(super) hold_max: Duration,
@@ -47,16 +47,16 @@ pub(super) struct Service {
 pub(super) struct State {
     pub(super) replay: Replay,
     pub(super) participants: Participants,
-    pub(super) chunks: ParkedChunks<Question>,
+    pub(super) chunks: ParkedChunks<PendingQuery>,
     /// The parked requests, at most one per client: the newest attempt.
     pub(super) requests: VecDeque<ParkedRequest<Responder<BatchReply>>>,
     pub(super) timings: Timings,
     /// Rate limiters for log lines about rejected messages, by kind. Without them a foreign process could fill the log.
-    pub(super) said: HashMap<&'static str, LogLimiter>,
+    pub(super) log_limiters: HashMap<&'static str, LogLimiter>,
 }
 
 /// A query about a chunk that was not answered yet.
-pub(super) struct Question {
+pub(super) struct PendingQuery {
     pub(super) responder: Responder<InsertReply>,
     pub(super) arrived: Instant,
 }
@@ -67,26 +67,26 @@ impl Service {
     }
 
     /// Counts and logs a message that cannot be read.
-    pub(super) fn refuse(&self, what: &'static str, e: &CodecError) {
+    pub(super) fn reject_unreadable(&self, what: &'static str, e: &CodecError) {
         let line = format!("{what} was refused: {e}");
-        self.state().refuse(what, &line);
+        self.state().reject(what, &line);
     }
 
     /// Counts and logs a message that is longer than any valid message of its kind.
-    pub(super) fn refuse_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
+    pub(super) fn reject_too_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
         let line = format!(
             "a message of {bytes} bytes to {kind:?} was refused: it has more than a message of this kind can have in this run, {bytes_max}"
         );
-        self.state().refuse(kind, &line);
+        self.state().reject(kind, &line);
     }
 
     /// Reads a request without payload. If that fails, counts and logs the message as rejected.
     pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
-        let refuse = |e: &CodecError| {
+        let reject = |e: &CodecError| {
             let line = format!("a message of kind {} was refused: {e}", R::NAME);
-            self.state().refuse(R::NAME, &line);
+            self.state().reject(R::NAME, &line);
         };
-        incoming.read().inspect_err(refuse).ok()
+        incoming.read().inspect_err(reject).ok()
     }
 
     /// Answers a request without payload with the reply that `answer` returns, after unlocking the state. `None` sends no reply.
@@ -105,50 +105,50 @@ impl Service {
     }
 
     /// Waits until something has changed, or for `due_in`, the time until a parked item is due.
-    pub(super) fn wait(&self, mut state: MutexGuard<'_, State>, due_in: Option<Duration>) {
-        state.note_waiting(Instant::now());
-        let waited = self.changed.wait_timeout(state, due_in.unwrap_or(IDLE));
+    pub(super) fn wait_changed(&self, mut state: MutexGuard<'_, State>, due_in: Option<Duration>) {
+        state.update_waiting(Instant::now());
+        let waited = self.changed.wait_timeout(state, due_in.unwrap_or(IDLE_MAX));
         drop(waited.unwrap_or_else(PoisonError::into_inner));
     }
 }
 
 impl State {
-    fn note_waiting(&mut self, now: Instant) {
+    fn update_waiting(&mut self, now: Instant) {
         let waiting = self.replay.waiting();
-        self.participants.note_waiting(waiting, now);
+        self.participants.set_waiting(waiting, now);
     }
 
     /// Whether a chunk or a request is parked. If not, the threads that serve them need not wake, which saves six context switches per
     /// chunk. Notes which side waits, as those threads would do.
-    pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
-        self.note_waiting(now);
-        !self.chunks.line.is_empty() || !self.requests.is_empty()
+    pub(super) fn has_parked(&mut self, now: Instant) -> bool {
+        self.update_waiting(now);
+        !self.chunks.queue.is_empty() || !self.requests.is_empty()
     }
 
     /// Counts a rejected message, and logs a line of this kind.
-    pub(super) fn refuse(&mut self, kind: &'static str, line: &str) {
+    pub(super) fn reject(&mut self, kind: &'static str, line: &str) {
         self.replay.counters_mut().messages_refused += 1;
-        self.say(kind, line);
+        self.warn_limited(kind, line);
     }
 
     /// Logs a line of this kind, or only counts it if one was logged recently.
-    pub(super) fn say(&mut self, kind: &'static str, line: &str) {
-        if let Some(more) = self.said.entry(kind).or_default().due() {
+    pub(super) fn warn_limited(&mut self, kind: &'static str, line: &str) {
+        if let Some(more) = self.log_limiters.entry(kind).or_default().due() {
             tracing::warn!("{line}{more}");
         }
     }
 }
 
 /// Passes queries to the service. Until the replay is read back from disk, each query is answered with the progress.
-pub(super) struct Admission {
+pub(super) struct ServiceGate {
     /// Set once the replay has been read back.
     pub(super) service: OnceLock<Arc<Service>>,
     pub(super) recovery: RecoveryControl,
     pub(super) config_toml: String,
 }
 
-impl Admission {
-    pub(super) fn put_off(&self) -> Recovering {
+impl ServiceGate {
+    pub(super) fn recovering_reply(&self) -> Recovering {
         Recovering {
             progress: self.recovery.progress(),
             config_toml: self.config_toml.clone(),

@@ -14,19 +14,19 @@ use super::server::{Service, State};
 use crate::persist::journal::Journal;
 
 /// Period between checks for missing processes and for the end of the run.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_PERIOD: Duration = Duration::from_secs(1);
 /// How long a replay server waits for the other processes to leave when the run is over.
-const FAREWELL_MAX: Duration = Duration::from_secs(30);
+const LEAVE_WAIT_MAX: Duration = Duration::from_secs(30);
 /// The same if its launcher has died: the other processes notice that too and deliver their data.
-const ABANDONED_MAX: Duration = Duration::from_secs(10);
+const ORPHANED_WAIT_MAX: Duration = Duration::from_secs(10);
 /// How long a process may be missing before it is logged.
-const SILENT_MAX: Duration = Duration::from_secs(10);
+const MISSING_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
     pub(super) fn leave(&self, incoming: Incoming<Leave>) {
         self.answer(incoming, |state, leave| {
             if let Some(why) = state.replay.leave(&leave) {
-                state.say("leave", &format!("a `Leave` was refused: {why}"));
+                state.warn_limited("leave", &format!("a `Leave` was refused: {why}"));
             }
             // A rejected `Leave` is acknowledged too, as the actor exits anyway.
             state.replay.write_pending().then_some(Ack)
@@ -34,20 +34,20 @@ impl Service {
     }
 
     pub(super) fn affinity(&self, incoming: Incoming<AffinityUpdate>) {
-        self.take(incoming, "an affinity matrix was", |state, update| {
+        self.update_from_learner(incoming, "an affinity matrix was", |state, update| {
             state.check_learner(update.learner)?;
             state.replay.set_affinity(&update)
         });
     }
 
     pub(super) fn priorities(&self, incoming: Incoming<PriorityUpdate>) {
-        let most = self.limits.batch_rows as usize;
-        self.take(incoming, "priorities were", |state, update| {
+        let rows_max = self.limits.batch_rows_max as usize;
+        self.update_from_learner(incoming, "priorities were", |state, update| {
             state.check_learner(update.learner)?;
             // One priority per row of a batch.
-            if update.rows() > most {
+            if update.rows() > rows_max {
                 return Err(format!(
-                    "of {} rows; a batch of this run has {most} (learner.batch_size)",
+                    "of {} rows; a batch of this run has {rows_max} (learner.batch_size)",
                     update.rows()
                 ));
             }
@@ -56,7 +56,7 @@ impl Service {
     }
 
     /// Takes a message of the learner and acknowledges it, or counts and logs why it is rejected.
-    fn take<R: Request<Reply = Ack>>(
+    fn update_from_learner<R: Request<Reply = Ack>>(
         &self,
         incoming: Incoming<R>,
         what: &'static str,
@@ -65,7 +65,7 @@ impl Service {
         self.answer(incoming, |state, update| {
             let taken = take(state, update);
             if let Err(why) = &taken {
-                state.refuse(what, &format!("{what} refused: {why}"));
+                state.reject(what, &format!("{what} refused: {why}"));
             }
             taken.ok().map(|()| Ack)
         });
@@ -75,7 +75,7 @@ impl Service {
         self.answer(incoming, |state, report| {
             let finished = report.finished;
             // If not, the process was replaced or is about to join. It repeats a report of the end of the run until it gets an `Ack`.
-            let has_joined = state.participants.reported(report, Instant::now());
+            let has_joined = state.participants.store_report(report, Instant::now());
             if has_joined {
                 state.replay.raise_updates(finished.unwrap_or(0));
             } else {
@@ -86,11 +86,11 @@ impl Service {
     }
 
     pub(super) fn processes(&self, incoming: Incoming<ProcessesStatus>) {
-        let weights_version = self.weights().version();
+        let weights_version = self.weights().newest_version();
         let (state, now) = (self.state(), Instant::now());
         let (waiting, waiting_s) = state.participants.waiting(now);
         let held_since = |who| match who {
-            ProcessName::Actor(actor) => state.chunks.arrived(actor),
+            ProcessName::Actor(actor) => state.chunks.arrival(actor),
             ProcessName::Learner => state.requests.iter().map(|it| it.arrived).min(),
         };
         let status = ProcessesStatus {
@@ -98,7 +98,7 @@ impl Service {
             waiting,
             waiting_s,
             requests_waiting: state.requests.len() as u32,
-            chunks_waiting: state.chunks.line.len() as u32,
+            chunks_waiting: state.chunks.queue.len() as u32,
             chunk_bytes_waiting: state.chunks.bytes() as u64,
             weights_version,
             weights_age_s: state.timings.weights_age_s(now),
@@ -111,19 +111,19 @@ impl Service {
         incoming.into_responder().reply(&status);
     }
 
-    /// Logs which missing process the run waits for: after `SILENT_MAX`, then at doubling intervals. Its thread does nothing else until the
-    /// shutdown.
-    pub(super) fn say_who_is_missing(&self) {
+    /// Logs which missing process the run waits for: after `MISSING_MAX`, then at doubling intervals. Its thread does nothing else until
+    /// the shutdown.
+    pub(super) fn log_missing_processes(&self) {
         // The missing process, since when, and after how long it is logged next.
         let mut missing: Option<(&str, Instant, Duration)> = None;
-        while !self.shutdown.wait_timeout(LOOK) {
+        while !self.shutdown.wait_timeout(CHECK_PERIOD) {
             fail_point::reach("missing");
             let state = self.state();
             let all_stored = state.replay.limiter.all_stored();
-            let now = state.participants.missing(all_stored);
+            let now = state.participants.missing_process(all_stored);
             drop(state);
             if now != missing.map(|(before, ..)| before) {
-                missing = now.map(|now| (now, Instant::now(), SILENT_MAX));
+                missing = now.map(|now| (now, Instant::now(), MISSING_MAX));
             }
             if let Some((missing, since, due)) = &mut missing
                 && since.elapsed() > *due
@@ -139,27 +139,27 @@ impl Service {
     /// `keep_alive` the end of the run does not count.
     pub(super) fn wait_until_over(&self, ending: &Shutdown, keep_alive: bool) {
         let mut waits: Option<(bool, Instant)> = None;
-        while !self.shutdown.wait_timeout(LOOK) {
+        while !self.shutdown.wait_timeout(CHECK_PERIOD) {
             // Read once, as it may be raised at any moment.
             let is_ending = ending.is_set();
             let state = self.state();
-            let (is_over, connected) =
-                (state.participants.is_over(), state.participants.connected());
+            let is_run_over = state.participants.is_run_over();
+            let connected = state.participants.connected_count();
             drop(state);
-            if !is_ending && (keep_alive || !is_over) {
+            if !is_ending && (keep_alive || !is_run_over) {
                 waits = None;
                 continue;
             }
-            let (why, farewell_max) = match is_ending {
-                true => ("this process is to end", ABANDONED_MAX),
-                false => ("the run is over", FAREWELL_MAX),
+            let (why, wait_max) = match is_ending {
+                true => ("this process is to end", ORPHANED_WAIT_MAX),
+                false => ("the run is over", LEAVE_WAIT_MAX),
             };
             let since = match waits {
                 Some((before, since)) if before == is_ending => since,
                 _ => Instant::now(),
             };
             waits = Some((is_ending, since));
-            if connected == 0 || since.elapsed() > farewell_max {
+            if connected == 0 || since.elapsed() > wait_max {
                 return tracing::info!("{why}, and {connected} processes are left");
             }
         }
@@ -174,13 +174,13 @@ impl Service {
     pub(super) fn status(&self, incoming: Incoming<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
-        status.learner_finished = state.participants.is_over();
+        status.learner_finished = state.participants.is_run_over();
         // Actors that have delivered a chunk, including those that have exited.
         let mut acting: HashSet<u32> = state.replay.state.actors.acting().collect();
-        acting.extend(state.chunks.line.iter().map(|it| it.header().actor));
+        acting.extend(state.chunks.queue.iter().map(|it| it.header().actor));
         status.actors_acting = acting.len() as u32;
-        status.actors_waiting = state.chunks.line.len() as u32;
-        state.timings.report(&mut status);
+        status.actors_waiting = state.chunks.queue.len() as u32;
+        state.timings.fill_status(&mut status);
         drop(state);
         incoming.into_responder().reply(&status);
     }

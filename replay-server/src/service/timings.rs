@@ -17,15 +17,15 @@ const VERSIONS_MAX: usize = 4096;
 
 /// Distributions since the start; times in microseconds.
 pub(super) struct Timings {
-    answers: Histogram<u64>,
+    replies: Histogram<u64>,
     inserts: Histogram<u64>,
-    behind: Histogram<u64>,
-    behind_updates: Histogram<u64>,
+    weights_lag: Histogram<u64>,
+    weights_lag_updates: Histogram<u64>,
     /// The version of each weights upload, its number of updates, and when it arrived; oldest first.
     versions: VecDeque<(u64, u64, Instant)>,
 }
 
-fn empty() -> Histogram<u64> {
+fn empty_histogram() -> Histogram<u64> {
     Histogram::new_with_bounds(1, VALUE_MAX, DIGITS)
         .expect("bounds and digits that a histogram can have")
 }
@@ -39,30 +39,30 @@ fn quantiles(histogram: &Histogram<u64>, unit: f64) -> Option<Quantiles> {
     })
 }
 
-fn add(times: &mut Histogram<u64>, time: Duration) {
+fn record_time(times: &mut Histogram<u64>, time: Duration) {
     times.saturating_record(u64::try_from(time.as_micros()).unwrap_or(u64::MAX));
 }
 
 impl Default for Timings {
     fn default() -> Self {
         Self {
-            answers: empty(),
-            inserts: empty(),
-            behind: empty(),
-            behind_updates: empty(),
+            replies: empty_histogram(),
+            inserts: empty_histogram(),
+            weights_lag: empty_histogram(),
+            weights_lag_updates: empty_histogram(),
             versions: VecDeque::new(),
         }
     }
 }
 
 impl Timings {
-    pub(super) fn answered(&mut self, after: Duration) {
-        add(&mut self.answers, after);
+    pub(super) fn record_reply(&mut self, after: Duration) {
+        record_time(&mut self.replies, after);
     }
 
     /// Notes that a chunk was stored whose actions were chosen by weights of `version`.
-    pub(super) fn stored(&mut self, version: u64, arrived: Instant, now: Instant) {
-        add(&mut self.inserts, now.saturating_duration_since(arrived));
+    pub(super) fn record_insert(&mut self, version: u64, arrived: Instant, now: Instant) {
+        record_time(&mut self.inserts, now.saturating_duration_since(arrived));
         let Some(&(_, newest_updates, _)) = self.versions.back() else {
             return;
         };
@@ -71,13 +71,13 @@ impl Timings {
         let behind = replaced.map_or(Duration::ZERO, |&(_, _, at)| {
             now.saturating_duration_since(at)
         });
-        add(&mut self.behind, behind);
+        record_time(&mut self.weights_lag, behind);
         let acted = self.versions.get(newer.saturating_sub(1));
         let updates = acted.map_or(0, |&(_, updates, _)| newest_updates.saturating_sub(updates));
-        self.behind_updates.saturating_record(updates);
+        self.weights_lag_updates.saturating_record(updates);
     }
 
-    pub(super) fn weights_came(&mut self, weights: &WeightsHeader, now: Instant) {
+    pub(super) fn record_weights(&mut self, weights: &WeightsHeader, now: Instant) {
         if self.versions.len() == VERSIONS_MAX {
             self.versions.pop_front();
         }
@@ -87,16 +87,16 @@ impl Timings {
 
     /// Returns the seconds since the newest weights arrived.
     pub(super) fn weights_age_s(&self, now: Instant) -> Option<f64> {
-        let (_, _, came) = self.versions.back()?;
-        Some(now.saturating_duration_since(*came).as_secs_f64())
+        let (_, _, arrived) = self.versions.back()?;
+        Some(now.saturating_duration_since(*arrived).as_secs_f64())
     }
 
     /// Sets the timing fields of a status.
-    pub(super) fn report(&self, status: &mut ReplayStatus) {
-        status.answer_ms = quantiles(&self.answers, 1e3);
+    pub(super) fn fill_status(&self, status: &mut ReplayStatus) {
+        status.answer_ms = quantiles(&self.replies, 1e3);
         status.insert_ms = quantiles(&self.inserts, 1e3);
-        status.weights_behind_s = quantiles(&self.behind, 1e6);
-        status.weights_behind_updates = quantiles(&self.behind_updates, 1.0);
+        status.weights_behind_s = quantiles(&self.weights_lag, 1e6);
+        status.weights_behind_updates = quantiles(&self.weights_lag_updates, 1.0);
     }
 }
 
@@ -109,16 +109,16 @@ mod tests {
         let (mut timings, start) = (Timings::default(), Instant::now());
         let at = |seconds| start + Duration::from_secs(seconds);
         let stored = |timings: &mut Timings, version, after_ms, now| {
-            timings.stored(version, now - Duration::from_millis(after_ms), now);
+            timings.record_insert(version, now - Duration::from_millis(after_ms), now);
             let mut status = ReplayStatus::default();
-            timings.report(&mut status);
+            timings.fill_status(&mut status);
             status
         };
         let behind = stored(&mut timings, 1, 7, at(1)).weights_behind_s;
         assert_eq!(behind, None, "no weights came here");
         for version in 1..=3 {
             let weights = WeightsHeader::new(version, 8 * version, &[]);
-            timings.weights_came(&weights, at(10 * version));
+            timings.record_weights(&weights, at(10 * version));
         }
         for _ in 0..99 {
             stored(&mut timings, 3, 5, at(35));

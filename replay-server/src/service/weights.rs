@@ -14,22 +14,22 @@ impl Service {
         lock(&self.weights)
     }
 
-    pub(super) fn take_weights(&self, incoming: Incoming<WeightsUpload>) {
+    pub(super) fn store_weights(&self, incoming: Incoming<WeightsUpload>) {
         // Weights are kept for long, so they do not use the memory of the pool.
         let (upload, safetensors) = match incoming.receive(&BufferPool::new(0)) {
             Ok(read) => read,
-            Err(e) => return self.refuse("an upload of weights", &e),
+            Err(e) => return self.reject_unreadable("an upload of weights", &e),
         };
         let WeightsUpload { learner, weights } = upload;
         let allowed = self.state().check_learner(learner);
-        match allowed.and_then(|()| self.weights().put(weights, &safetensors)) {
+        match allowed.and_then(|()| self.weights().update(weights, &safetensors)) {
             Ok(true) => {
-                let keeper = self.weights().keeper();
-                if let Some(keep) = keeper {
-                    keep();
+                let disk_writer = self.weights().disk_writer();
+                if let Some(write_to_disk) = disk_writer {
+                    write_to_disk();
                 }
                 let now = Instant::now();
-                self.state().timings.weights_came(&weights, now);
+                self.state().timings.record_weights(&weights, now);
                 let version = weights.version;
                 if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
                     tracing::warn!("weights {version} were not announced: {why}");
@@ -39,13 +39,13 @@ impl Service {
             Ok(false) => {}
             Err(why) => {
                 let line = format!("weights were refused: {why}");
-                return self.state().refuse("weights", &line);
+                return self.state().reject("weights", &line);
             }
         }
         incoming.into_responder().reply(&Ack);
     }
 
-    pub(super) fn give_weights(&self, incoming: Incoming<WeightsRequest>) {
+    pub(super) fn send_weights(&self, incoming: Incoming<WeightsRequest>) {
         let Some(request) = self.read(&incoming) else {
             return;
         };

@@ -13,13 +13,13 @@ use driml_protocol::{
 
 use crate::persist::journal::try_remove;
 
-const FILE: &str = "weights.message";
+const FILE_NAME: &str = "weights.message";
 
 /// Maximum versions kept while actors pull them. At the limit, an actor that begins to pull gets the newest of these versions. So even many
 /// slow actors are served to the end, with slightly older weights.
-const KEPT_MAX: usize = 8;
+const PULLED_VERSIONS_MAX: usize = 8;
 /// How long a version is kept after the last request for a piece of it.
-const KEPT_FOR: Duration = Duration::from_secs(5);
+const PULL_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum increase of the version from one upload to the next. No learner reaches it.
 const VERSION_STEP_MAX: u64 = 1 << 20;
 /// Maximum version of the first upload. If a run is resumed without its replay, this may be any version that a run reaches.
@@ -39,8 +39,8 @@ impl WeightsStore {
     /// Returns a store that keeps the newest weights on disk beside the replay in `dir`. If the replay `was_kept`, reads the weights from
     /// there: actors that start after a restart need some before the learner publishes again. Otherwise removes old weights, as with them
     /// actors would store chunks before the learner joins.
-    pub(super) fn kept_in(dir: &Path, spec_hash: u64, was_kept: bool) -> Self {
-        let path = dir.join(FILE);
+    pub(super) fn open(dir: &Path, spec_hash: u64, was_kept: bool) -> Self {
+        let path = dir.join(FILE_NAME);
         if !was_kept {
             try_remove(&path);
         }
@@ -67,10 +67,10 @@ impl WeightsStore {
     }
 
     /// Returns a function that writes the newest weights to disk, if they are kept. It is slow: call it without a lock on this store.
-    pub(super) fn keeper(&self) -> Option<impl FnOnce() + use<>> {
+    pub(super) fn disk_writer(&self) -> Option<impl FnOnce() + use<>> {
         let ((path, spec_hash), weights) = (self.file.clone()?, self.newest.clone()?);
         Some(move || {
-            if let Err(e) = keep(&path, spec_hash, &weights) {
+            if let Err(e) = write_to_disk(&path, spec_hash, &weights) {
                 tracing::warn!(
                     "weights {} were not kept in {}: {e:#}",
                     weights.header.version,
@@ -81,13 +81,13 @@ impl WeightsStore {
     }
 
     /// Returns the version of the newest weights; 0 before the first.
-    pub(super) fn version(&self) -> u64 {
+    pub(super) fn newest_version(&self) -> u64 {
         self.newest.as_ref().map_or(0, |it| it.header.version)
     }
 
     /// Takes newer weights; an upload may be repeated. Returns whether the weights are new. An error says why they cannot follow the
     /// newest.
-    pub(super) fn put(
+    pub(super) fn update(
         &mut self,
         header: WeightsHeader,
         safetensors: &[u8],
@@ -114,16 +114,16 @@ impl WeightsStore {
         now: Instant,
     ) -> Result<(Arc<Weights>, usize), WeightsReply> {
         let (version, offset) = match request {
-            WeightsRequest::NewerThan(version) => (self.begin(version, now)?, 0),
+            WeightsRequest::NewerThan(version) => (self.version_to_pull(version, now)?, 0),
             WeightsRequest::Piece { version, offset } => {
                 (version, usize::try_from(offset).unwrap_or(usize::MAX))
             }
         };
         let mut kept = self.pulled.iter_mut();
-        let (weights, asked) = kept
+        let (weights, requested_at) = kept
             .find(|(weights, _)| weights.header.version == version)
             .ok_or(WeightsReply::Gone)?;
-        *asked = now;
+        *requested_at = now;
         if offset < weights.safetensors.len() && offset.is_multiple_of(PIECE_BYTES) {
             Ok((weights.clone(), offset))
         } else {
@@ -132,7 +132,7 @@ impl WeightsStore {
     }
 
     /// Returns the version that a client with `version` should pull.
-    fn begin(&mut self, version: u64, now: Instant) -> Result<u64, WeightsReply> {
+    fn version_to_pull(&mut self, version: u64, now: Instant) -> Result<u64, WeightsReply> {
         let newest = self.newest.as_ref();
         let newest = newest.filter(|it| it.header.version > version);
         let newest = newest.ok_or(WeightsReply::NoneNewer)?;
@@ -142,12 +142,12 @@ impl WeightsStore {
             return Ok(last);
         }
         self.pulled
-            .retain(|(_, asked)| now.saturating_duration_since(*asked) < KEPT_FOR);
-        if self.pulled.len() == KEPT_MAX {
+            .retain(|(_, at)| now.saturating_duration_since(*at) < PULL_TIMEOUT);
+        if self.pulled.len() == PULLED_VERSIONS_MAX {
             if last > version {
                 return Ok(last);
             }
-            let idle = (0..KEPT_MAX).min_by_key(|&at| self.pulled[at].1);
+            let idle = (0..PULLED_VERSIONS_MAX).min_by_key(|&at| self.pulled[at].1);
             idle.map(|at| self.pulled.remove(at));
         }
         self.pulled.push((newest.clone(), now));
@@ -157,17 +157,17 @@ impl WeightsStore {
 
 /// Replaces the weights on disk, without a flush: a checksum detects a file that a power cut has damaged, and the learner uploads newer
 /// weights.
-fn keep(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Result<()> {
+fn write_to_disk(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Result<()> {
     let upload = WeightsUpload {
         learner: 0,
         weights: weights.header,
     };
-    let beside = path.with_extension("new");
+    let new_path = path.with_extension("new");
     fs::write(
-        &beside,
+        &new_path,
         codec::encode(spec_hash, &upload, &weights.safetensors)?,
     )?;
-    fs::rename(&beside, path)?;
+    fs::rename(&new_path, path)?;
     Ok(())
 }
 
@@ -203,16 +203,16 @@ mod tests {
     #[test]
     fn versions_rise_by_sane_steps() {
         let mut store = WeightsStore::default();
-        assert_eq!(store.put(header(1), b"a"), Ok(true));
-        assert_eq!(store.put(header(1), b"a"), Ok(false), "sent again");
-        assert_eq!(store.put(header(3), b"b"), Ok(true));
+        assert_eq!(store.update(header(1), b"a"), Ok(true));
+        assert_eq!(store.update(header(1), b"a"), Ok(false), "sent again");
+        assert_eq!(store.update(header(3), b"b"), Ok(true));
         for version in [0, 2, 3, 4 + VERSION_STEP_MAX, u64::MAX] {
             let other = WeightsHeader::new(version, 9, &[]);
-            assert!(store.put(other, b"c").is_err(), "{version}");
+            assert!(store.update(other, b"c").is_err(), "{version}");
         }
-        assert_eq!(store.version(), 3);
+        assert_eq!(store.newest_version(), 3);
         // A run that is resumed without its replay may begin with any version.
-        let first = |version| WeightsStore::default().put(header(version), b"a");
+        let first = |version| WeightsStore::default().update(header(version), b"a");
         assert_eq!(first(2 << 20), Ok(true));
         assert!(first(FIRST_VERSION_MAX + 1).is_err());
     }
@@ -226,11 +226,11 @@ mod tests {
         assert_eq!(store.found(newer(0), start), none);
         for version in 1..20 {
             let now = at(version);
-            store.put(header(version), &file).unwrap();
+            store.update(header(version), &file).unwrap();
             assert_eq!(store.found(newer(version - 1), now), Ok((version, 0)));
             let slow = store.found(piece(1, PIECE_BYTES), now);
             assert_eq!(slow, Ok((1, PIECE_BYTES)));
-            assert!(store.pulled.len() <= KEPT_MAX);
+            assert!(store.pulled.len() <= PULLED_VERSIONS_MAX);
         }
         assert_eq!(store.found(newer(19), at(20)), none);
         // A version that was dropped, one that never existed, and offsets at which no piece begins.
@@ -243,9 +243,9 @@ mod tests {
     #[test]
     fn when_too_many_versions_are_pulled_those_who_begin_join_one() {
         let (mut store, now) = (WeightsStore::default(), Instant::now());
-        let last = KEPT_MAX as u64;
+        let last = PULLED_VERSIONS_MAX as u64;
         for version in 1..=last + 5 {
-            store.put(header(version), &[7]).unwrap();
+            store.update(header(version), &[7]).unwrap();
             let begun = store.found(newer(0), now);
             let newest_pulled = version.min(last);
             assert_eq!(begun, Ok((newest_pulled, 0)));
@@ -264,12 +264,12 @@ mod tests {
     #[test]
     fn weights_are_used_again_with_the_replay_that_they_were_kept_with() {
         let folder = tempfile::tempdir().unwrap();
-        let kept_in = |was_kept| WeightsStore::kept_in(folder.path(), 5, was_kept);
-        let mut store = kept_in(true);
-        store.put(WeightsHeader::new(7, 0, b"a"), b"a").unwrap();
-        store.keeper().unwrap()();
+        let open = |was_kept| WeightsStore::open(folder.path(), 5, was_kept);
+        let mut store = open(true);
+        store.update(WeightsHeader::new(7, 0, b"a"), b"a").unwrap();
+        store.disk_writer().unwrap()();
         for (was_kept, version) in [(true, 7), (false, 0), (true, 0)] {
-            assert_eq!(kept_in(was_kept).version(), version, "{was_kept}");
+            assert_eq!(open(was_kept).newest_version(), version, "{was_kept}");
         }
     }
 }
