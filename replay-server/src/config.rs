@@ -69,13 +69,13 @@ pub struct Config {
     /// The point from which `replay_ratio` holds. Set if a resume after the warm-up changed the ratio, the batch size or the warm-up.
     /// Default: the end of the warm-up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub since: Option<Since>,
+    pub since: Option<RatioStart>,
 }
 
 /// The counts of a run when it was resumed with other settings. `driml train --resume` writes them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Since {
+pub struct RatioStart {
     /// Transitions stored.
     pub transitions: u64,
     /// Rows learned.
@@ -85,16 +85,16 @@ pub struct Since {
 }
 
 /// Returns the environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
-pub(crate) fn reach(spec: &RunSpec) -> u32 {
+pub(crate) fn lookahead_steps(spec: &RunSpec) -> u32 {
     spec.n_step.max(spec.horizon.k_max())
 }
 
 impl Config {
     /// Returns the point from which `replay_ratio` holds.
-    pub fn ratio_start(&self) -> Since {
+    pub fn ratio_start(&self) -> RatioStart {
         let since = self.since.unwrap_or_default();
         let transitions = since.transitions.max(self.warmup_transitions);
-        Since {
+        RatioStart {
             transitions,
             ..since
         }
@@ -119,15 +119,15 @@ impl Config {
         }
     }
 
-    /// Checks that no disk setting is given for a replay in memory. `to_keep_it` names the flags that would keep the replay on disk.
-    pub fn check_in_memory(&self, to_keep_it: &str) -> Result<(), ConfigError> {
+    /// Checks that no disk setting is given for a replay in memory. `keep_flags` names the flags that would keep the replay on disk.
+    pub fn check_in_memory(&self, keep_flags: &str) -> Result<(), ConfigError> {
         for (key, set) in [
             ("replay.disk_bytes_max", self.disk_bytes_max),
             ("replay.fsync_ms", self.fsync_ms),
         ] {
             check(set.is_none(), key, set.unwrap_or(0), || {
                 format!(
-                    "this replay is in memory alone; add {to_keep_it} to keep it on disk, or leave the setting out"
+                    "this replay is in memory alone; add {keep_flags} to keep it on disk, or leave the setting out"
                 )
             })?;
         }
@@ -167,7 +167,7 @@ impl Config {
         check(fits, "replay.shards", self.shards, || {
             format!("a replay has 1 to {SHARDS_MAX} shards")
         })?;
-        let window = u64::from(reach(spec)) + u64::from(spec.frame_stack);
+        let window = u64::from(lookahead_steps(spec)) + u64::from(spec.frame_stack);
         let fits = capacity / u64::from(self.shards) >= window;
         check(fits, "replay.capacity_transitions", capacity, || {
             format!(
@@ -191,7 +191,7 @@ impl Config {
             })?;
         }
         if let Some(max) = self.disk_bytes_max {
-            let least = disk_bytes_least(spec, self);
+            let least = disk_bytes_min(spec, self);
             check(max >= least, "replay.disk_bytes_max", max, || {
                 format!(
                     "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
@@ -224,11 +224,11 @@ impl Config {
 }
 
 /// Returns the minimum disk budget: twice the transitions before the first batch, and four segments of minimum size per shard.
-fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
+fn disk_bytes_min(spec: &RunSpec, config: &Config) -> u64 {
     // A segment is at least four times as long as its snapshot, which has 8 bytes for each row with a priority.
-    let of_states = 4 * 8 * u64::from(config.sampling.is_prioritised());
-    let row_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64 + of_states;
-    let warmup = config.warmup_transitions.saturating_mul(row_bytes);
+    let priority_bytes = 4 * 8 * u64::from(config.sampling.is_prioritised());
+    let transition_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64 + priority_bytes;
+    let warmup = config.warmup_transitions.saturating_mul(transition_bytes);
     let segments = u64::from(config.shards) * 4 * SEGMENT_BYTES_MIN;
     warmup.saturating_mul(2).saturating_add(segments)
 }

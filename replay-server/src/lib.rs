@@ -56,7 +56,7 @@ mod sampling;
 mod service;
 mod storage;
 
-pub use config::{Compression, Config, Since};
+pub use config::{Compression, Config, RatioStart};
 pub use driml_protocol::NotReady;
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use persist::{Mark, PersistArgs, PersistError, RecoveryControl, RecoveryReport, ReplayFolder};
@@ -68,7 +68,7 @@ pub use sampling::{
     horizon,
     rows::{
         PriorityCounts,
-        prioritised::{CHANCE_ERROR, PRIORITY_MIN},
+        prioritised::{PRIORITY_MIN, PROBABILITY_ERROR},
     },
 };
 pub use service::{RunArgs, run, shared_memory_bytes};

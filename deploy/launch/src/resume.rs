@@ -19,7 +19,7 @@ use driml_machine::{
     resources::Machine,
 };
 use driml_protocol::Sampling;
-use driml_replay_server::Since;
+use driml_replay_server::RatioStart;
 use driml_settings::{
     config::RunConfig,
     flags::{Flags, Source},
@@ -229,7 +229,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         || before.replay.replay_ratio != config.replay.replay_ratio
         || before.replay.warmup_transitions != config.replay.warmup_transitions;
     if has_other_pace && updates > 0 {
-        config.replay.since = Some(Since {
+        config.replay.since = Some(RatioStart {
             transitions: frames,
             rows,
             updates,

@@ -302,14 +302,14 @@ impl RunView {
 mod tests {
     use super::*;
     use crate::testing::{config, with};
-    use driml_replay_server::Since;
+    use driml_replay_server::RatioStart;
 
     #[test]
     fn updates_are_those_of_the_batches_that_each_part_of_a_run_had() {
         let mut config = config("smoke", "chain", "c51", &["learner.batch_size=32"]);
         assert_eq!(updates_served(&config, 96_000), 3_000);
         let (transitions, rows, updates) = (9_000, 64_000, 1_000);
-        let since = Since {
+        let since = RatioStart {
             transitions,
             rows,
             updates,

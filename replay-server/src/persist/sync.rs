@@ -138,8 +138,7 @@ impl Syncer {
     /// Notes a write to segment `number`. If each write is flushed, flushes it and returns the disk's error.
     pub(super) fn after_write(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
         let mut state = lock(&self.flusher.state);
-        let segments = &mut state.segments;
-        segments.entry(number).or_insert_with(|| file.clone());
+        state.segments.entry(number).or_insert_with(|| file.clone());
         drop(state);
         match self.thread {
             Some(_) => Ok(()),

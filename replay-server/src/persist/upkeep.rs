@@ -206,7 +206,7 @@ impl Replay {
 
     fn forget_before(&mut self, oldest: u64) {
         self.ring.forget_before(oldest);
-        self.sampler.rows.forget(&self.ring);
+        self.sampler.rows.forget_overwritten(&self.ring);
     }
 }
 

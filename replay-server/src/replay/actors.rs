@@ -211,7 +211,7 @@ impl Replay {
             let (link, first) = (stream.link, self.ring.inserted());
             let frames = packed.stream_frames(number);
             stream.link = self.ring.push_steps(frames, rows.clone().map(step), link);
-            self.sampler.rows.stored(&self.ring, first, link);
+            self.sampler.rows.add_stored(&self.ring, first, link);
             for step in rows.map(step) {
                 statistics.counted.action_histogram[usize::from(step.action)] += 1;
                 if let Some(episode) = &mut stream.episode {

@@ -143,7 +143,8 @@ impl Replay {
     /// # Errors
     /// The run draws uniformly, or a transition was never stored; the reason, for a person. In these cases nothing has changed.
     pub fn set_priorities(&mut self, update: &PriorityUpdate) -> Result<(), String> {
-        self.sampler.rows.update(&self.ring, update, self.origin)
+        let rows = &mut self.sampler.rows;
+        rows.set_priorities(&self.ring, update, self.origin)
     }
 
     /// Returns what became of the priorities received; `None` if rows are drawn uniformly.

@@ -8,9 +8,9 @@ use driml_protocol::{Batch, BatchHeader, BatchStatesMut, Buffer, RunSpec, Sampli
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    episodes::{Assembler, Episodes, Window},
+    episodes::{AnchorRules, RowAssembler, Window},
     horizon::Affinity,
-    rows::{RowSampler, prioritised::Priorities, uniform::Uniform},
+    rows::{RowSampler, prioritised::PrioritisedSampler, uniform::UniformSampler},
 };
 use crate::storage::{
     frame_store::FrameStore,
@@ -21,8 +21,8 @@ use crate::storage::{
 /// The state that drawing needs besides the ring and the random generator.
 pub(crate) struct BatchSampler {
     pub(crate) rows: Box<dyn RowSampler>,
-    episodes: Episodes,
-    assembler: Assembler,
+    rules: AnchorRules,
+    assembler: RowAssembler,
     window: Window,
     layout: BlockLayout,
 }
@@ -30,17 +30,17 @@ pub(crate) struct BatchSampler {
 impl BatchSampler {
     /// Creates the sampler of a ring of `capacity` transitions. An error holds the bytes that the system does not grant.
     pub(crate) fn new(spec: &RunSpec, sampling: &Sampling, capacity: u64) -> Result<Self, u64> {
-        let episodes = Episodes::new(spec);
+        let rules = AnchorRules::new(spec);
         let rows: Box<dyn RowSampler> = match *sampling {
-            Sampling::Uniform {} => Box::new(Uniform::new(episodes)),
+            Sampling::Uniform {} => Box::new(UniformSampler::new(rules)),
             Sampling::Prioritised { alpha, .. } => {
-                Box::new(Priorities::new(alpha, capacity, episodes)?)
+                Box::new(PrioritisedSampler::new(alpha, capacity, rules)?)
             }
         };
         Ok(Self {
-            episodes,
+            rules,
             rows,
-            assembler: Assembler::new(spec),
+            assembler: RowAssembler::new(spec),
             window: Window::default(),
             layout: BlockLayout::new(spec.frame_bytes()),
         })
@@ -65,14 +65,14 @@ impl BatchSampler {
                 return None;
             }
             let window = &self.window;
-            let (of_row, bootstrap) = self.assembler.row(affinity, window, rng);
-            let ks = of_row.ks().map(|k| k as usize);
+            let (row_scalars, bootstrap) = self.assembler.assemble(affinity, window, rng);
+            let ks = row_scalars.ks().map(|k| k as usize);
             let steps = iter::once(0).chain(bootstrap).chain(ks);
             states.extend(steps.map(|i| RowState {
                 row,
                 index: window.index(i),
             }));
-            scalars.push(of_row);
+            scalars.push(row_scalars);
             anchors.push(window.index(0));
             age_total += ring.inserted() - 1 - window.index(0);
             let version = window.step(0).weights_version;
@@ -81,7 +81,7 @@ impl BatchSampler {
         }
         header.mean_age = age_total as f64 / rows as f64;
         let shared = header.stacked.as_mut().map(|stacked| {
-            let shared = SharedFrames::of(ring, &self.episodes, &states);
+            let shared = SharedFrames::collect(ring, &self.rules, &states);
             stacked.frames = shared.frames.len() as u32;
             shared
         });
@@ -103,19 +103,19 @@ impl BatchSampler {
                 states.into_iter().zip(numbers).map(frame).collect()
             }
             Some(SharedFrames { frames, stacks }) => {
-                let stacks = stacks.chunks_exact(self.episodes.frame_stack);
+                let stacks = stacks.chunks_exact(self.rules.frame_stack);
                 for (number, stack) in numbers.into_iter().zip(stacks) {
                     places.set_stack(number, stack);
                 }
                 frames
             }
         };
-        let packed = write_or_take(ring, &frames, &mut places);
+        let packed_frames = write_or_defer(ring, &frames, &mut places);
         let ks = scalars.iter().map(|row| row.ks().max().unwrap_or(0));
         Some(PackedBatch {
             batch,
             layout: self.layout,
-            packed,
+            packed_frames,
             ks: ks.collect(),
         })
     }
@@ -136,11 +136,11 @@ struct SharedFrames {
 }
 
 impl SharedFrames {
-    fn of(ring: &Ring, episodes: &Episodes, states: &[RowState]) -> Self {
+    fn collect(ring: &Ring, rules: &AnchorRules, states: &[RowState]) -> Self {
         let (mut frames, mut stacks) = (Vec::new(), Vec::new());
         let mut places = HashMap::new();
         for &RowState { row, index } in states {
-            for index in episodes.stack(ring, index) {
+            for index in rules.stack_indices(ring, index) {
                 let place = places.entry(index).or_insert_with(|| {
                     let place = frames.len();
                     frames.push(NeededFrame { row, index, place });
@@ -159,7 +159,7 @@ pub struct PackedBatch {
     pub(crate) batch: Batch,
     layout: BlockLayout,
     /// The frames to unpack, row by row; empty if the batch has all its frames.
-    packed: Vec<PackedFrame>,
+    packed_frames: Vec<PackedFrame>,
     /// The k of each row, the largest if there are several; 0 if there is none.
     pub(crate) ks: Vec<u32>,
 }
@@ -176,11 +176,11 @@ struct PackedFrame {
     row: usize,
     place: usize,
     block: Arc<Block>,
-    number: usize,
+    position: usize,
 }
 
 /// Writes plain frames to their places in the batch. Of compressed frames returns what is needed to write them later.
-fn write_or_take(
+fn write_or_defer(
     ring: &Ring,
     needed: &[NeededFrame],
     places: &mut BatchStatesMut<'_>,
@@ -195,12 +195,12 @@ fn write_or_take(
         }
         FrameStore::Compressed(frames) => {
             let packed = |&NeededFrame { row, index, place }: &NeededFrame| {
-                let (block, number) = frames.block(index);
+                let (block, position) = frames.block(index);
                 PackedFrame {
                     row,
                     place,
                     block: block.clone(),
-                    number,
+                    position,
                 }
             };
             needed.iter().map(packed).collect()
@@ -214,24 +214,24 @@ impl PackedBatch {
         let Self {
             mut batch,
             layout,
-            packed,
+            packed_frames,
             ..
         } = self;
         let mut places = batch.states_mut();
-        let mut unpacked = Unpacked {
+        let mut cache = UnpackCache {
             layout,
             parts: Vec::new(),
             bytes: Vec::new(),
         };
         // Unpacks a part once per row, as rows seldom share parts.
-        for row in packed.chunk_by(|one, next| one.row == next.row) {
-            unpacked.parts.clear();
+        for row in packed_frames.chunk_by(|one, next| one.row == next.row) {
+            cache.parts.clear();
             for frame in row {
-                let part = layout.part_of(frame.number);
+                let part = layout.part_of(frame.position);
                 let first = layout.frames_in_part(part, frame.block.frames).start;
-                let at = unpacked.part(&frame.block, part);
-                let at = at + (frame.number - first) * layout.frame_bytes;
-                let bytes = &unpacked.bytes[at..at + layout.frame_bytes];
+                let at = cache.part_offset(&frame.block, part);
+                let at = at + (frame.position - first) * layout.frame_bytes;
+                let bytes = &cache.bytes[at..at + layout.frame_bytes];
                 places.frame(frame.place).copy_from_slice(bytes);
             }
         }
@@ -240,41 +240,41 @@ impl PackedBatch {
 }
 
 /// A cache of unpacked parts of blocks.
-struct Unpacked<'a> {
+struct UnpackCache<'a> {
     layout: BlockLayout,
-    parts: Vec<Part<'a>>,
+    parts: Vec<UnpackedPart<'a>>,
     /// The unpacked parts, one after the other. May be longer, as rows reuse the buffer.
     bytes: Vec<u8>,
 }
 
-struct Part<'a> {
+struct UnpackedPart<'a> {
     block: &'a Block,
     number: usize,
-    place: Range<usize>,
+    range: Range<usize>,
 }
 
-impl<'a> Unpacked<'a> {
+impl<'a> UnpackCache<'a> {
     /// Returns where a part of a block begins in `bytes`, and unpacks the part if it is not there yet.
-    fn part(&mut self, block: &'a Block, number: usize) -> usize {
-        let is_it = |it: &&Part<'_>| std::ptr::eq(it.block, block) && it.number == number;
-        if let Some(known) = self.parts.iter().find(is_it) {
-            return known.place.start;
+    fn part_offset(&mut self, block: &'a Block, number: usize) -> usize {
+        let is_same = |it: &&UnpackedPart<'_>| std::ptr::eq(it.block, block) && it.number == number;
+        if let Some(known) = self.parts.iter().find(is_same) {
+            return known.range.start;
         }
         let frame_bytes = self.layout.frame_bytes;
-        let key = (number > 0).then(|| self.part(block, 0));
-        let start = self.parts.last().map_or(0, |it| it.place.end);
+        let key = (number > 0).then(|| self.part_offset(block, 0));
+        let start = self.parts.last().map_or(0, |it| it.range.end);
         let length = self.layout.frames_in_part(number, block.frames).len() * frame_bytes;
-        let place = start..start + length;
-        if self.bytes.len() < place.end {
-            self.bytes.resize(place.end, 0);
+        let range = start..start + length;
+        if self.bytes.len() < range.end {
+            self.bytes.resize(range.end, 0);
         }
         let (before, rest) = self.bytes.split_at_mut(start);
         let key = key.map_or(0..0, |at| at..at + frame_bytes);
         block.unpack(number, &before[key], &mut rest[..length]);
-        self.parts.push(Part {
+        self.parts.push(UnpackedPart {
             block,
             number,
-            place,
+            range,
         });
         start
     }

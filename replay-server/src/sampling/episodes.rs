@@ -11,7 +11,7 @@ use crate::{
     storage::ring::{Previous, Ring, Step},
 };
 
-/// An anchor t and the steps after it: t, .., t+m, where m is the reach, or the episode ends with step t+m.
+/// An anchor t and the steps after it: t, .., t+m, where m is `lookahead_steps`, or the episode ends with step t+m.
 #[derive(Default)]
 pub(crate) struct Window {
     steps: Vec<(u64, Step)>,
@@ -36,17 +36,17 @@ impl Window {
 
 /// The rules that decide which transitions can be anchors and which frames make a state.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Episodes {
+pub(crate) struct AnchorRules {
     /// Steps that must follow an anchor, unless its episode ends before.
-    pub(crate) reach: usize,
+    pub(crate) lookahead_steps: usize,
     pub(crate) frame_stack: usize,
     timeout: TimeoutRule,
 }
 
-impl Episodes {
+impl AnchorRules {
     pub(crate) fn new(spec: &RunSpec) -> Self {
         Self {
-            reach: config::reach(spec) as usize,
+            lookahead_steps: config::lookahead_steps(spec) as usize,
             frame_stack: spec.frame_stack as usize,
             timeout: spec.timeout,
         }
@@ -54,15 +54,15 @@ impl Episodes {
 
     /// Whether the held transition `t` can be an anchor; if so, `window` is its window.
     ///
-    /// `t` can be an anchor if its stack's frames are held, and `reach` steps follow it or its episode ends before. With
+    /// `t` can be an anchor if its stack's frames are held, and `lookahead_steps` steps follow it or its episode ends before. With
     /// `TimeoutRule::Bootstrap` a timed-out transition has no return, so it cannot be an anchor.
-    pub(crate) fn walk(&self, ring: &Ring, t: u64, window: &mut Window) -> bool {
+    pub(crate) fn find_window(&self, ring: &Ring, t: u64, window: &mut Window) -> bool {
         window.steps.clear();
         let mut index = t;
         loop {
             let step = *ring.step(index);
             window.steps.push((index, step));
-            if step.end.is_episode_end() || window.steps.len() > self.reach {
+            if step.end.is_episode_end() || window.steps.len() > self.lookahead_steps {
                 break;
             }
             match step.next() {
@@ -70,11 +70,11 @@ impl Episodes {
                 None => return false,
             }
         }
-        self.is_whole(ring, t)
+        self.has_return_and_stack(ring, t)
     }
 
     /// Whether the held transition `t` can be an anchor apart from the steps after it: it has a return, and its stack's frames are held.
-    pub(crate) fn is_whole(&self, ring: &Ring, t: u64) -> bool {
+    pub(crate) fn has_return_and_stack(&self, ring: &Ring, t: u64) -> bool {
         let timed_out = ring.step(t).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
         !timed_out && self.stack_is_held(ring, t)
     }
@@ -95,7 +95,7 @@ impl Episodes {
     ///
     /// At the start of a level, the level's first frame also takes the places of the frames before it. The stack must be held. That is true
     /// for every state of a window, as no state's stack reaches further back than the anchor's.
-    pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> impl Iterator<Item = u64> {
+    pub(crate) fn stack_indices(&self, ring: &Ring, mut index: u64) -> impl Iterator<Item = u64> {
         let mut indices = [index; FRAME_STACK_MAX as usize];
         for slot in (0..self.frame_stack - 1).rev() {
             match ring.previous(index) {
@@ -112,7 +112,7 @@ impl Episodes {
 }
 
 /// Computes the scalars of a row, among them the return and k. Its scratch space saves an allocation per row.
-pub(crate) struct Assembler {
+pub(crate) struct RowAssembler {
     horizon: Horizon,
     timeout: TimeoutRule,
     /// gamma^0 ..= gamma^n.
@@ -120,7 +120,7 @@ pub(crate) struct Assembler {
     actions: Vec<u8>,
 }
 
-impl Assembler {
+impl RowAssembler {
     pub(crate) fn new(spec: &RunSpec) -> Self {
         let powers = std::iter::successors(Some(1.0), |power| Some(power * spec.gamma));
         Self {
@@ -132,7 +132,7 @@ impl Assembler {
     }
 
     /// Computes the row of the anchor of `window`. Also returns the i of the state s_{t+i} to bootstrap from, if any.
-    pub(crate) fn row(
+    pub(crate) fn assemble(
         &mut self,
         affinity: &Affinity,
         window: &Window,
@@ -144,9 +144,9 @@ impl Assembler {
         } else {
             NO_ACTION
         };
-        let (n_step_return, follows) = n_step_return(&self.discounts, self.timeout, window.steps());
+        let (n_step_return, after) = n_step_return(&self.discounts, self.timeout, window.steps());
         // A bootstrap state with discount 0 is not sent.
-        let bootstrap = follows.filter(|&i| self.discounts[i] as f32 != 0.0);
+        let bootstrap = after.filter(|&i| self.discounts[i] as f32 != 0.0);
         self.actions.clear();
         let same_level = window.steps().take_while(|step| step.end == End::Running);
         let actions = same_level.map(|step| step.action);

@@ -147,8 +147,7 @@ impl State {
             );
         }
         if served != Some(learner) {
-            let requests = &mut self.requests;
-            requests.retain(|it| it.request.learner == learner);
+            self.requests.retain(|it| it.request.learner == learner);
             self.participants
                 .add_joined(Alive::learner(learner), Instant::now());
         }

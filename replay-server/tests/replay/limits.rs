@@ -5,7 +5,7 @@ use driml_protocol::{
     Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, ShardCounts, Waiting,
 };
 use driml_replay_server::{
-    ACTORS_MAX, Compression, Config, NotReady, RateLimiter, Replay, STREAMS_MAX, Since,
+    ACTORS_MAX, Compression, Config, NotReady, RateLimiter, RatioStart, Replay, STREAMS_MAX,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -263,7 +263,7 @@ proptest! {
             warmup_transitions: warmup,
             slack_transitions: slack,
             transitions_max: Some(max),
-            since: resumed.map(|_| Since { transitions, rows: rows_before, updates: 0 }),
+            since: resumed.map(|_| RatioStart { transitions, rows: rows_before, updates: 0 }),
             ..Config::unlimited(1)
         })
         .with_counts(counts(transitions, rows_before), ShardCounts::default());

@@ -2,7 +2,7 @@
 //! Resuming all processes together is an end-to-end test.
 
 use driml_protocol::LearnerJoin;
-use driml_replay_server::{Config, NotReady, Replay, Since};
+use driml_replay_server::{Config, NotReady, RatioStart, Replay};
 
 use crate::calls::{counts, header, insert, is_stored, learner, small_spec, stored};
 
@@ -36,7 +36,7 @@ fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
 /// 60 transitions warm up; 120 allow 480 rows, which are 60 updates of 8. Cases: the checkpoint, and the chunks and batches that remain.
 #[test]
 fn a_resumed_run_counts_on_and_fills_its_replay_first() {
-    let since = Some(Since {
+    let since = Some(RatioStart {
         transitions: 120,
         rows: 232,
         updates: 29,

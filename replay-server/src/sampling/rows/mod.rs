@@ -28,9 +28,9 @@ pub struct PriorityCounts {
 /// A rule that draws anchors. Methods that only prioritised rules need have a default.
 pub(crate) trait RowSampler: Send {
     /// Notes that consecutive transitions of one stream were stored, from index `first` on. `link` is the link of the first one.
-    fn stored(&mut self, _ring: &Ring, _first: u64, _link: Link) {}
+    fn add_stored(&mut self, _ring: &Ring, _first: u64, _link: Link) {}
 
-    fn forget(&mut self, _ring: &Ring) {}
+    fn forget_overwritten(&mut self, _ring: &Ring) {}
 
     /// Draws an anchor and writes its window to `window`. Returns false if no anchor exists.
     fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool;
@@ -42,7 +42,7 @@ pub(crate) trait RowSampler: Send {
 
     /// Sets the priorities that the learner found; rows that another `origin` drew change nothing. An error is the reason, for a person;
     /// nothing has changed then.
-    fn update(
+    fn set_priorities(
         &mut self,
         _ring: &Ring,
         _update: &PriorityUpdate,

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{PriorityCounts, RowSampler, RowsState, sum_tree::SumTree};
 use crate::{
-    sampling::episodes::{Episodes, Window},
+    sampling::episodes::{AnchorRules, Window},
     storage::ring::{Link, Ring},
 };
 
@@ -21,39 +21,39 @@ use crate::{
 pub const PRIORITY_MIN: f64 = 1e-10;
 
 /// Maximum relative error of a row's probability in a batch: half of an f32's last place. Probabilities below 1.2e-38 are sent as 1.2e-38.
-pub const CHANCE_ERROR: f64 = 6.1e-8;
+pub const PROBABILITY_ERROR: f64 = 6.1e-8;
 
 /// The highest priority before the first update, as in Dopamine. Any value would do, as all priorities are equal then.
-const FIRST_PRIORITY: f64 = 1.0;
+const INITIAL_PRIORITY: f64 = 1.0;
 
 /// The priorities of those transitions held that can be anchors.
-pub(crate) struct Priorities {
+pub(crate) struct PrioritisedSampler {
     alpha: f64,
     capacity: u64,
-    episodes: Episodes,
+    rules: AnchorRules,
     /// (priority + [`PRIORITY_MIN`])^alpha by slot, the index modulo the capacity; 0 for transitions that cannot be anchors.
     masses: SumTree,
     highest: f64,
     /// Transitions before this one have mass 0.
     oldest: u64,
     /// Transitions that still need steps after them, in the order of their episode. The key is the newest transition of the stream.
-    open: BTreeMap<u64, VecDeque<u64>>,
+    incomplete: BTreeMap<u64, VecDeque<u64>>,
     /// The learner that sent the last update, and the update's number.
     last: Option<(u64, u64)>,
     counts: PriorityCounts,
 }
 
-impl Priorities {
+impl PrioritisedSampler {
     /// Creates the priorities of an empty ring of `capacity` transitions. An error holds the bytes that the system does not grant.
-    pub(crate) fn new(alpha: f64, capacity: u64, episodes: Episodes) -> Result<Self, u64> {
+    pub(crate) fn new(alpha: f64, capacity: u64, rules: AnchorRules) -> Result<Self, u64> {
         Ok(Self {
             alpha,
             capacity,
-            episodes,
+            rules,
             masses: SumTree::new(capacity)?,
-            highest: FIRST_PRIORITY,
+            highest: INITIAL_PRIORITY,
             oldest: 0,
-            open: BTreeMap::new(),
+            incomplete: BTreeMap::new(),
             last: None,
             counts: PriorityCounts::default(),
         })
@@ -68,7 +68,7 @@ impl Priorities {
     }
 
     /// Converts a `mass` from another `alpha`. If that was 0, all masses were equal, and the priority becomes `highest`.
-    fn raised(&self, mass: f64, alpha: f64, highest: f64) -> f64 {
+    fn convert_mass(&self, mass: f64, alpha: f64, highest: f64) -> f64 {
         if mass == 0.0 || alpha == self.alpha {
             return mass;
         }
@@ -81,7 +81,7 @@ impl Priorities {
     }
 
     /// Sets the priorities of rows that were drawn from `ring`. If a transition was drawn twice, its last priority counts.
-    fn set(&mut self, ring: &Ring, part: &PriorityPart) {
+    fn set_part(&mut self, ring: &Ring, part: &PriorityPart) {
         for (&index, &priority) in part.transitions.iter().zip(&part.priorities) {
             let slot = self.slot(index);
             let is_held = (ring.oldest()..ring.inserted()).contains(&index);
@@ -98,33 +98,33 @@ impl Priorities {
     }
 }
 
-impl RowSampler for Priorities {
+impl RowSampler for PrioritisedSampler {
     /// Gives the highest priority seen to each transition that can be an anchor now.
-    fn stored(&mut self, ring: &Ring, first: u64, link: Link) {
-        self.forget(ring);
-        let waiting = link.previous().and_then(|after| self.open.remove(&after));
+    fn add_stored(&mut self, ring: &Ring, first: u64, link: Link) {
+        self.forget_overwritten(ring);
+        let waiting = link.previous().and_then(|it| self.incomplete.remove(&it));
         let mut waiting = waiting.unwrap_or_default();
         let mass = self.mass(self.highest);
         for index in first.max(ring.oldest())..ring.inserted() {
             waiting.push_back(index);
-            let followed = if ring.step(index).end.is_episode_end() {
+            let complete = if ring.step(index).end.is_episode_end() {
                 waiting.len()
             } else {
-                waiting.len().saturating_sub(self.episodes.reach)
+                waiting.len().saturating_sub(self.rules.lookahead_steps)
             };
-            for anchor in waiting.drain(..followed) {
-                if anchor >= ring.oldest() && self.episodes.is_whole(ring, anchor) {
+            for anchor in waiting.drain(..complete) {
+                if anchor >= ring.oldest() && self.rules.has_return_and_stack(ring, anchor) {
                     self.masses.set(self.slot(anchor), mass);
                 }
             }
         }
         if !waiting.is_empty() {
-            self.open.insert(ring.inserted() - 1, waiting);
+            self.incomplete.insert(ring.inserted() - 1, waiting);
         }
     }
 
     /// Zeroes the masses of transitions that are no longer held.
-    fn forget(&mut self, ring: &Ring) {
+    fn forget_overwritten(&mut self, ring: &Ring) {
         let oldest = ring.oldest();
         let from = self.oldest.max(oldest.saturating_sub(self.capacity));
         for index in from..oldest {
@@ -132,7 +132,7 @@ impl RowSampler for Priorities {
         }
         self.oldest = oldest;
         // Streams that stopped in the middle of an episode.
-        while let Some(stream) = self.open.first_entry()
+        while let Some(stream) = self.incomplete.first_entry()
             && *stream.key() < oldest
         {
             stream.remove();
@@ -143,7 +143,7 @@ impl RowSampler for Priorities {
         while let Some(slot) = self.masses.draw(rng) {
             let newest = ring.inserted() - 1;
             let behind = (self.slot(newest) + self.capacity as usize - slot) as u64 % self.capacity;
-            if self.episodes.walk(ring, newest - behind, window) {
+            if self.rules.find_window(ring, newest - behind, window) {
                 return true;
             }
             // The first frame of its stack was overwritten: it can never be an anchor again.
@@ -158,18 +158,18 @@ impl RowSampler for Priorities {
 
     /// A repeated update changes nothing, nor does a row whose transition has been overwritten: both are counted. Rows of other shards are
     /// ignored.
-    fn update(
+    fn set_priorities(
         &mut self,
         ring: &Ring,
         update: &PriorityUpdate,
         origin: Origin,
     ) -> Result<(), String> {
-        let own = || {
+        let own_parts = || {
             let parts = update.parts.iter();
             parts.filter(|part| part.origin.shard == origin.shard)
         };
         let stored = ring.inserted();
-        let drawn_here = own().filter(|part| part.origin == origin);
+        let drawn_here = own_parts().filter(|part| part.origin == origin);
         for index in drawn_here.flat_map(|part| &part.transitions) {
             if *index >= stored {
                 return Err(format!(
@@ -183,12 +183,12 @@ impl RowSampler for Priorities {
         if is_new {
             self.last = Some((learner, number));
         }
-        for part in own() {
+        for part in own_parts() {
             let rows = part.transitions.len() as u64;
             if !is_new {
                 self.counts.repeated += rows;
             } else if part.origin == origin {
-                self.set(ring, part);
+                self.set_part(ring, part);
             } else {
                 self.counts.gone += rows;
             }
@@ -229,9 +229,10 @@ impl RowSampler for Priorities {
                 continue;
             }
             // A transition whose following steps are gone cannot be an anchor any more.
-            let lacks_steps = self.masses.get(slot) == 0.0 && self.episodes.is_whole(ring, index);
+            let lacks_steps =
+                self.masses.get(slot) == 0.0 && self.rules.has_return_and_stack(ring, index);
             if !lacks_steps {
-                let mass = self.raised(mass, *alpha, *highest);
+                let mass = self.convert_mass(mass, *alpha, *highest);
                 self.masses.set(slot, mass);
             }
         }
@@ -241,17 +242,15 @@ impl RowSampler for Priorities {
     /// Checks that exactly the anchors have a mass, apart from transitions whose frame stack was overwritten in part.
     fn check_valid(&self, ring: &Ring) {
         self.masses.check_valid();
-        let episodes = self.episodes;
+        let rules = self.rules;
         let mut window = Window::default();
         let mut anchors = 0;
         for index in ring.oldest()..ring.inserted() {
             let mass = self.masses.get(self.slot(index));
-            let is_anchor = episodes.walk(ring, index, &mut window);
+            let is_anchor = rules.find_window(ring, index, &mut window);
             assert!(!is_anchor || mass > 0.0, "{index} is an anchor");
-            assert!(
-                is_anchor || mass == 0.0 || !episodes.is_whole(ring, index),
-                "{index} lacks steps"
-            );
+            let lacks_steps = !is_anchor && mass != 0.0 && rules.has_return_and_stack(ring, index);
+            assert!(!lacks_steps, "{index} lacks steps");
             anchors += usize::from(mass > 0.0);
         }
         let with_mass = (0..self.capacity as usize).filter(|&slot| self.masses.get(slot) > 0.0);

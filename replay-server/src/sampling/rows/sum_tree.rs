@@ -51,11 +51,11 @@ impl SumTree {
 
     /// Draws a place with a probability of its share of the sum, never a place with number 0. `None` if the sum is 0.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Option<usize> {
-        (self.total() > 0.0).then(|| self.place(rng.random()))
+        (self.total() > 0.0).then(|| self.place_at(rng.random()))
     }
 
     /// Returns the place at which the cumulative sum passes `share` of the total, which is not 0.
-    fn place(&self, share: f64) -> usize {
+    fn place_at(&self, share: f64) -> usize {
         let mut left_over = share * self.total();
         let mut node = 1;
         while node < self.leaves {
@@ -113,7 +113,7 @@ mod tests {
                 }
             }
             for edge in [0.0, 1.0 - f64::EPSILON] {
-                prop_assert!(tree.total() == 0.0 || numbers[tree.place(edge)] > 0.0);
+                prop_assert!(tree.total() == 0.0 || numbers[tree.place_at(edge)] > 0.0);
             }
         }
     }

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{RowSampler, RowsState};
 use crate::{
-    sampling::episodes::{Episodes, Window},
+    sampling::episodes::{AnchorRules, Window},
     storage::ring::Ring,
 };
 
@@ -14,73 +14,73 @@ use crate::{
 const TRIES_MAX: u32 = 64;
 
 /// Draws uniformly. Keeps the list of all valid anchors, once it was needed, as long as the ring does not change.
-pub(crate) struct Uniform {
-    episodes: Episodes,
-    valid: Vec<u64>,
-    /// Transitions that the ring had stored when `valid` was listed; 0 before the first listing.
-    listed_at: u64,
-    listed_from: u64,
+pub(crate) struct UniformSampler {
+    rules: AnchorRules,
+    anchors: Vec<u64>,
+    /// Transitions that the ring had stored when `anchors` was listed; 0 before the first listing.
+    listed_inserted: u64,
+    listed_oldest: u64,
 }
 
-impl Uniform {
-    pub(crate) const fn new(episodes: Episodes) -> Self {
+impl UniformSampler {
+    pub(crate) const fn new(rules: AnchorRules) -> Self {
         Self {
-            episodes,
-            valid: Vec::new(),
-            listed_at: 0,
-            listed_from: 0,
+            rules,
+            anchors: Vec::new(),
+            listed_inserted: 0,
+            listed_oldest: 0,
         }
     }
 
-    /// Whether `valid` lists the anchors of the ring's current content.
-    const fn are_listed(&self, ring: &Ring) -> bool {
-        self.listed_at == ring.inserted() && self.listed_from == ring.oldest()
+    /// Whether `anchors` lists the anchors of the ring's current content.
+    const fn is_list_current(&self, ring: &Ring) -> bool {
+        self.listed_inserted == ring.inserted() && self.listed_oldest == ring.oldest()
     }
 
-    fn list(&mut self, ring: &Ring) {
-        let (episodes, mut window) = (self.episodes, Window::default());
-        self.valid.clear();
+    fn list_anchors(&mut self, ring: &Ring) {
+        let (rules, mut window) = (self.rules, Window::default());
+        self.anchors.clear();
         let held = ring.oldest()..ring.inserted();
-        self.valid
-            .extend(held.filter(|&t| episodes.walk(ring, t, &mut window)));
-        (self.listed_at, self.listed_from) = (ring.inserted(), ring.oldest());
+        self.anchors
+            .extend(held.filter(|&t| rules.find_window(ring, t, &mut window)));
+        (self.listed_inserted, self.listed_oldest) = (ring.inserted(), ring.oldest());
     }
 }
 
-impl RowSampler for Uniform {
+impl RowSampler for UniformSampler {
     /// Draws by rejection; after [`TRIES_MAX`] misses from a list, which takes time proportional to the transitions held.
     fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
-        let episodes = self.episodes;
+        let rules = self.rules;
         if ring.oldest() == ring.inserted() {
             return false;
         }
-        if !self.are_listed(ring) {
+        if !self.is_list_current(ring) {
             for _ in 0..TRIES_MAX {
                 let t = rng.random_range(ring.oldest()..ring.inserted());
-                if episodes.walk(ring, t, window) {
+                if rules.find_window(ring, t, window) {
                     return true;
                 }
             }
-            self.list(ring);
+            self.list_anchors(ring);
         }
-        if self.valid.is_empty() {
+        if self.anchors.is_empty() {
             return false;
         }
-        let t = self.valid[rng.random_range(0..self.valid.len())];
-        let valid = episodes.walk(ring, t, window);
-        assert!(valid, "{t} was valid and the ring has not changed");
-        valid
+        let t = self.anchors[rng.random_range(0..self.anchors.len())];
+        let is_anchor = rules.find_window(ring, t, window);
+        assert!(is_anchor, "{t} was valid and the ring has not changed");
+        is_anchor
     }
 
     fn state(&self, ring: &Ring) -> RowsState {
         RowsState::Uniform {
-            are_listed: self.are_listed(ring),
+            are_listed: self.is_list_current(ring),
         }
     }
 
     fn restore(&mut self, ring: &Ring, _: u64, state: &RowsState) {
         if *state == (RowsState::Uniform { are_listed: true }) {
-            self.list(ring);
+            self.list_anchors(ring);
         }
     }
 }

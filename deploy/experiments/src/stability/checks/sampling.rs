@@ -4,10 +4,10 @@ use anyhow::Context;
 use driml_learner::importance::{WEIGHT_ERROR, importance_weights};
 use driml_protocol::{AffinityUpdate, End, PriorityPart, PriorityUpdate, RunSpec, Sampling};
 use driml_replay_server::{
-    CHANCE_ERROR, PRIORITY_MIN, Replay,
+    PRIORITY_MIN, PROBABILITY_ERROR, Replay,
     horizon::{
         Affinity,
-        nhg::{GO_ON_ERROR, draw_k},
+        nhg::{CONTINUE_ERROR, draw_k},
     },
 };
 use rand::RngCore;
@@ -30,12 +30,12 @@ pub(super) fn properties() -> Vec<Property> {
     let priorities = "priorities, which are C51 losses, 0 to 3.4e38; alpha 0 to 1";
     vec![
         Property::new("k by NHG", "A 0 to 1; k_max 1 to 1,000")
-            .promise("the probability of a step, beside A", GO_ON_ERROR)
+            .promise("the probability of a step, beside A", CONTINUE_ERROR)
             .promise("chi-square of k, in deviations", DEVIATIONS)
             .on(EVERY, Listed, probability_of_a_step)
             .on(WALKS, Listed, law_of_k),
         Property::new("prioritised draw", priorities)
-            .promise("a row's chance, as a share of it", CHANCE_ERROR)
+            .promise("a row's chance, as a share of it", PROBABILITY_ERROR)
             .promise("chi-square of the draws, in deviations", DEVIATIONS)
             .on(PRIORITIES, Listed, prioritised)
             .on("drawn", Drawn(0.01), prioritised),
