@@ -43,8 +43,8 @@ pub(super) struct Segment {
 pub(super) struct LogPosition {
     /// The usable segments.
     pub(super) segments: VecDeque<Segment>,
-    pub(super) number: u64,
-    pub(super) ordinal: u64,
+    pub(super) next_segment: u64,
+    pub(super) next_ordinal: u64,
     /// The mark to which the log was rolled back, and the oldest transition that was held then.
     pub(super) mark: Option<(Mark, u64)>,
 }
@@ -99,8 +99,8 @@ impl Journal {
         let syncer = File::open(&folder.path)
             .and_then(|opened| Syncer::start(opened, limits.fsync_period))
             .map_err(io_error("opening", &folder.path))?;
-        let (number, mut segments) = (position.number, position.segments);
-        let begun = create_segment(&folder, id, number, position.ordinal, snapshot);
+        let (number, mut segments) = (position.next_segment, position.segments);
+        let begun = create_segment(&folder, id, number, position.next_ordinal, snapshot);
         let (segment, file) = begun.map_err(io_error("writing", &folder.segment_path(number)))?;
         segments.push_back(segment);
         syncer.add_segment(number, file.clone());
@@ -109,7 +109,7 @@ impl Journal {
             id,
             segments,
             file,
-            ordinal: position.ordinal + 1,
+            ordinal: position.next_ordinal + 1,
             limits,
             largest: 0,
             syncer,

@@ -114,7 +114,7 @@ pub(super) fn recover(
         packer,
         pool: BufferPool::new(2),
         position: LogPosition {
-            number: numbers.last().map_or(0, |it| it + 1),
+            next_segment: numbers.last().map_or(0, |it| it + 1),
             ..LogPosition::default()
         },
         recovery: RecoveryReport::default(),
@@ -200,7 +200,7 @@ impl LogReader<'_> {
             return Ok(());
         }
         let is_first = !self.recovery.found;
-        let follows = is_first || ordinal >= self.position.ordinal;
+        let follows = is_first || ordinal >= self.position.next_ordinal;
         if header.number != number || !follows {
             self.mark_unusable(path, "it is not the segment that belongs here");
             return Ok(());
@@ -229,7 +229,7 @@ impl LogReader<'_> {
             ));
         }
         self.recovery.found = true;
-        self.position.ordinal = ordinal + 1;
+        self.position.next_ordinal = ordinal + 1;
         let (at, ended) = self.read_records(bytes, at);
         let cut = bytes.len() - at;
         self.recovery.bytes += at as u64;
@@ -276,7 +276,7 @@ impl LogReader<'_> {
                 Ok(record) => record,
                 Err(error) => return (at, Err(error)),
             };
-            let applied = match !is_closed && record.ordinal == self.position.ordinal {
+            let applied = match !is_closed && record.ordinal == self.position.next_ordinal {
                 true => self.apply(&record),
                 false => Err("it is not the next one".into()),
             };
@@ -284,7 +284,7 @@ impl LogReader<'_> {
                 tracing::debug!("record {}: {why}", record.ordinal);
                 return (at, Err(RecordError::Damaged));
             }
-            self.position.ordinal += 1;
+            self.position.next_ordinal += 1;
             is_closed = record.kind == RecordKind::Closed;
             at += record.bytes();
         }
@@ -330,8 +330,8 @@ impl LogReader<'_> {
             return unusable(format!("no segment can be read ({why})"));
         }
         // The records written next must be readable too.
-        if self.position.ordinal > ORDINAL_MAX / 2 {
-            let last = self.position.ordinal - 1;
+        if self.position.next_ordinal > ORDINAL_MAX / 2 {
+            let last = self.position.next_ordinal - 1;
             return unusable(format!(
                 "its records are numbered up to {last}, which no replay reaches"
             ));

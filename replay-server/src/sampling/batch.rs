@@ -95,8 +95,8 @@ impl BatchSampler {
         if let Some(draws) = draws.collect::<Option<Vec<_>>>() {
             batch.set_draws(&draws);
         }
-        let mut places = batch.states_mut();
-        let numbers: Vec<usize> = (0..rows).flat_map(|row| places.of_row(row)).collect();
+        let mut batch_states = batch.states_mut();
+        let numbers: Vec<usize> = (0..rows).flat_map(|row| batch_states.of_row(row)).collect();
         let frames: Vec<NeededFrame> = match shared {
             None => {
                 let frame = |(RowState { row, index }, place)| NeededFrame { row, index, place };
@@ -105,12 +105,12 @@ impl BatchSampler {
             Some(SharedFrames { frames, stacks }) => {
                 let stacks = stacks.chunks_exact(self.rules.frame_stack);
                 for (number, stack) in numbers.into_iter().zip(stacks) {
-                    places.set_stack(number, stack);
+                    batch_states.set_stack(number, stack);
                 }
                 frames
             }
         };
-        let packed_frames = write_or_defer(ring, &frames, &mut places);
+        let packed_frames = write_or_defer(ring, &frames, &mut batch_states);
         let ks = scalars.iter().map(|row| row.ks().max().unwrap_or(0));
         Some(PackedBatch {
             batch,
@@ -183,13 +183,13 @@ struct PackedFrame {
 fn write_or_defer(
     ring: &Ring,
     needed: &[NeededFrame],
-    places: &mut BatchStatesMut<'_>,
+    batch_states: &mut BatchStatesMut<'_>,
 ) -> Vec<PackedFrame> {
     match ring.frames() {
         FrameStore::Plain(frames) => {
             for &NeededFrame { index, place, .. } in needed {
                 let frame = frames.frame(ring.slot(index));
-                places.frame(place).copy_from_slice(frame);
+                batch_states.frame(place).copy_from_slice(frame);
             }
             Vec::new()
         }
@@ -217,7 +217,7 @@ impl PackedBatch {
             packed_frames,
             ..
         } = self;
-        let mut places = batch.states_mut();
+        let mut batch_states = batch.states_mut();
         let mut cache = UnpackCache {
             layout,
             parts: Vec::new(),
@@ -232,7 +232,7 @@ impl PackedBatch {
                 let at = cache.part_offset(&frame.block, part);
                 let at = at + (frame.position - first) * layout.frame_bytes;
                 let bytes = &cache.bytes[at..at + layout.frame_bytes];
-                places.frame(frame.place).copy_from_slice(bytes);
+                batch_states.frame(frame.place).copy_from_slice(bytes);
             }
         }
         batch

@@ -64,16 +64,16 @@ pub struct RunArgs {
     pub weights_bytes_max: usize,
     /// The folder of a replay that is kept on disk. Each of several shards has a subfolder in it.
     pub dir: Option<PathBuf>,
-    /// Whether to keep answering after the run is over, until `ending` or `shutdown`.
+    /// Whether to keep answering after the run is over, until `drain` or `shutdown`.
     pub keep_alive: bool,
     /// Raised when the launcher has died, which also stops the other processes. This process then waits up to 10 s until they have
     /// delivered their data and left, and exits. To stop at once, raise this and `shutdown`.
-    pub ending: Shutdown,
+    pub drain: Shutdown,
     /// The run's resolved settings, which it sends to each process that joins.
     pub config_toml: String,
 }
 
-/// Runs the replay server until its run is over, `args.ending` or `shutdown`, and returns whether the run is over.
+/// Runs the replay server until its run is over, `args.drain` or `shutdown`, and returns whether the run is over.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let settings = Settings::parse(&args.config_toml)?;
     let spec: RunSpec = settings.table("run")?;
@@ -124,7 +124,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
-        recovery: RecoveryControl::new(args.ending.clone()),
+        recovery: RecoveryControl::new(args.drain.clone()),
         config_toml: args.config_toml.clone(),
     });
     let declared = Queries::declare(&client, &gate, limits, &config.sampling);
@@ -181,7 +181,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     assert!(opened.is_ok(), "a replay is read back once");
     threads.extend(service.clone().start_threads()?);
     threads.push(members);
-    service.wait_until_over(&args.ending, args.keep_alive);
+    service.wait_until_over(&args.drain, args.keep_alive);
     // The threads of the service wait for this flag.
     shutdown.set();
     service.changed.notify_all();

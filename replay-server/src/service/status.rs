@@ -135,30 +135,30 @@ impl Service {
         }
     }
 
-    /// Waits for a shutdown, or until the run is over or `ending` is raised and the other processes have left, for a limited time. With
+    /// Waits for a shutdown, or until the run is over or `drain` is raised and the other processes have left, for a limited time. With
     /// `keep_alive` the end of the run does not count.
-    pub(super) fn wait_until_over(&self, ending: &Shutdown, keep_alive: bool) {
+    pub(super) fn wait_until_over(&self, drain: &Shutdown, keep_alive: bool) {
         let mut waits: Option<(bool, Instant)> = None;
         while !self.shutdown.wait_timeout(CHECK_PERIOD) {
             // Read once, as it may be raised at any moment.
-            let is_ending = ending.is_set();
+            let is_draining = drain.is_set();
             let state = self.state();
             let is_run_over = state.participants.is_run_over();
             let connected = state.participants.connected_count();
             drop(state);
-            if !is_ending && (keep_alive || !is_run_over) {
+            if !is_draining && (keep_alive || !is_run_over) {
                 waits = None;
                 continue;
             }
-            let (why, wait_max) = match is_ending {
+            let (why, wait_max) = match is_draining {
                 true => ("this process is to end", ORPHANED_WAIT_MAX),
                 false => ("the run is over", LEAVE_WAIT_MAX),
             };
             let since = match waits {
-                Some((before, since)) if before == is_ending => since,
+                Some((before, since)) if before == is_draining => since,
                 _ => Instant::now(),
             };
-            waits = Some((is_ending, since));
+            waits = Some((is_draining, since));
             if connected == 0 || since.elapsed() > wait_max {
                 return tracing::info!("{why}, and {connected} processes are left");
             }

@@ -49,7 +49,7 @@ impl Service {
         let Some(request) = self.read(&incoming) else {
             return;
         };
-        let found = self.weights().find(request, Instant::now());
+        let found = self.weights().find_piece(request, Instant::now());
         let (reply, piece) = match found {
             Ok((weights, offset)) => {
                 let rest = &weights.safetensors[offset..];

@@ -108,7 +108,7 @@ impl WeightsStore {
     }
 
     /// Returns the weights that `request` asks for, and the offset of the piece.
-    pub(super) fn find(
+    pub(super) fn find_piece(
         &mut self,
         request: WeightsRequest,
         now: Instant,
@@ -195,7 +195,7 @@ mod tests {
             request: WeightsRequest,
             now: Instant,
         ) -> Result<(u64, usize), WeightsReply> {
-            let found = self.find(request, now);
+            let found = self.find_piece(request, now);
             found.map(|(weights, offset)| (weights.header.version, offset))
         }
     }

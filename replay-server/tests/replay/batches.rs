@@ -229,7 +229,7 @@ proptest! {
             replay.check_valid();
         }
         for (actor, _) in known.values().filter(|(it, _)| it.next.sequence > 0) {
-            replay.leave(&actor.last_word());
+            replay.leave(&actor.leave());
         }
         let status = replay.status();
         let (episodes, mean_return) = history.episodes();

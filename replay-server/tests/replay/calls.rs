@@ -13,7 +13,7 @@ pub(crate) fn small_spec() -> RunSpec {
 }
 
 /// Creates a replay of `small_spec`, for batches of 8 rows.
-pub(crate) fn small(config: &Config) -> Replay {
+pub(crate) fn small_replay(config: &Config) -> Replay {
     Replay::new(&small_spec(), config, 8).unwrap()
 }
 
@@ -56,21 +56,21 @@ impl Actor {
         sent
     }
 
-    pub(crate) const fn last_word(&self) -> Leave {
+    pub(crate) const fn leave(&self) -> Leave {
         let next = &self.next;
-        last_word(next.actor, next.incarnation, next.first_transition)
+        leave(next.actor, next.incarnation, next.first_transition)
     }
 }
 
-pub(crate) const fn life(actor: u32, incarnation: u64) -> ActorJoin {
+pub(crate) const fn actor_join(actor: u32, incarnation: u64) -> ActorJoin {
     ActorJoin { actor, incarnation }
 }
 
 pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
-    replay.join_actor(life(actor, incarnation)).unwrap();
+    replay.join_actor(actor_join(actor, incarnation)).unwrap();
 }
 
-pub(crate) const fn last_word(actor: u32, incarnation: u64, produced: u64) -> Leave {
+pub(crate) const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
     Leave {
         actor,
         incarnation,

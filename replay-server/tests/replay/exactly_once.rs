@@ -12,8 +12,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     calls::{
-        affinity, header, insert, is_refused, join, last_word, learned, learner, life, small,
-        stored,
+        actor_join, affinity, header, insert, is_refused, join, learned, learner, leave,
+        small_replay, stored,
     },
     history::spec,
 };
@@ -23,7 +23,7 @@ proptest! {
     fn delays_repeats_and_drops_change_nothing(seed in any::<u64>(), actors in 1u32..4, chunks in 1u64..30) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         // The limiter blocks now and then; the learner below frees it.
-        let mut replay = small(&Config {
+        let mut replay = small_replay(&Config {
             replay_ratio: 1.0,
             slack_transitions: 16,
             ..Config::unlimited(10_000)
@@ -62,7 +62,7 @@ proptest! {
         }
         let produced: Vec<u64> = (0..actors).map(|actor| first(actor, chunks)).collect();
         for (actor, &produced) in produced.iter().enumerate() {
-            replay.leave(&last_word(actor as u32, 9, produced));
+            replay.leave(&leave(actor as u32, 9, produced));
         }
         let status = replay.status();
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
@@ -84,7 +84,7 @@ proptest! {
                 break;
             }
         }
-        let mut asked: Vec<_> = (0..clients).map(RequestId::first).collect();
+        let mut requests: Vec<_> = (0..clients).map(RequestId::first).collect();
         let mut ks = vec![0; 4];
         let (mut arrived, mut lost) = (0, 0);
         // The requests sent, including overtaken ones. They arrive in random order.
@@ -94,19 +94,19 @@ proptest! {
                 break;
             }
             let client_id = rng.random_range(0..clients) as usize;
-            asked[client_id] = asked[client_id].again();
-            in_flight.push(asked[client_id]);
+            requests[client_id] = requests[client_id].again();
+            in_flight.push(requests[client_id]);
             let at = rng.random_range(0..in_flight.len());
             let id = in_flight.remove(at);
             in_flight.truncate(20);
             let draft = replay.draw_for(id, 8, Buffer::zeroed);
             replay.check_valid();
-            let is_awaited = asked[id.client_id as usize] == id;
+            let is_awaited = requests[id.client_id as usize] == id;
             match draft {
                 Ok(draft) if is_awaited && rng.random_bool(0.7) => {
                     arrived += 1;
                     draft.unpack().ks().iter().for_each(|&k| ks[usize::from(k)] += 1);
-                    asked[id.client_id as usize] = id.next();
+                    requests[id.client_id as usize] = id.next();
                 }
                 Ok(_) => lost += 1,
                 Err(NotReady::Finished | NotReady::Wait(_)) => {}
@@ -167,15 +167,15 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
         (Sends(0, 2, 0, 0), (12, 0, 1), "the next life"),
     ];
     for story in [lost, duplicated, replaced] {
-        let mut replay = small(&Config::unlimited(1000));
-        for (said, expected, what) in story {
-            match *said {
-                Joins(actor, life) => join(&mut replay, actor, life),
-                Leaves(actor, life, produced) => {
-                    replay.leave(&last_word(actor, life, produced));
+        let mut replay = small_replay(&Config::unlimited(1000));
+        for (message, expected, what) in story {
+            match *message {
+                Joins(actor, incarnation) => join(&mut replay, actor, incarnation),
+                Leaves(actor, incarnation, produced) => {
+                    replay.leave(&leave(actor, incarnation, produced));
                 }
-                Sends(actor, life, sequence, first) => {
-                    insert(&mut replay, header(actor, life, sequence, first));
+                Sends(actor, incarnation, sequence, first) => {
+                    insert(&mut replay, header(actor, incarnation, sequence, first));
                 }
             }
             let status = replay.status();
@@ -191,24 +191,24 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
 
 #[test]
 fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
-    let mut replay = small(&Config::unlimited(1000));
+    let mut replay = small_replay(&Config::unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
-    replay.leave(&last_word(0, 1, 6));
+    replay.leave(&leave(0, 1, 6));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     let unknown = insert(&mut replay, header(0, 2, 0, 0));
     assert!(is_refused(&unknown), "a life that has not joined");
     // Nor does a `Leave` make the incarnation join.
-    replay.leave(&last_word(0, 2, 6));
+    replay.leave(&leave(0, 2, 6));
     join(&mut replay, 0, 2);
     let early = insert(&mut replay, header(0, 2, 1, 6));
     assert_eq!(early, InsertReply::OutOfOrder { expected: 0 });
     assert_eq!(insert(&mut replay, header(0, 2, 0, 0)), stored(12));
     let past = insert(&mut replay, header(0, 1, 0, 0));
     assert!(is_refused(&past), "a past life");
-    let again = replay.join_actor(life(0, 2));
+    let again = replay.join_actor(actor_join(0, 2));
     assert_eq!(again, Ok(1), "one life before it");
-    let back = replay.join_actor(life(0, 1));
+    let back = replay.join_actor(actor_join(0, 1));
     assert!(back.is_err(), "and it does not come back");
     let status = replay.status();
     assert_eq!((status.chunks_retried, status.transitions_lost), (1, 0));
@@ -217,7 +217,7 @@ fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
 
 #[test]
 fn a_poll_says_what_became_of_a_chunk() {
-    let mut replay = small(&Config {
+    let mut replay = small_replay(&Config {
         transitions_max: Some(12),
         ..Config::unlimited(1000)
     });
@@ -241,7 +241,7 @@ fn a_poll_says_what_became_of_a_chunk() {
 
 /// Returns a replay of ratio 4 after three chunks.
 fn with_three_chunks(transitions_max: Option<u64>) -> Replay {
-    let mut replay = small(&Config {
+    let mut replay = small_replay(&Config {
         replay_ratio: 4.0,
         slack_transitions: 100,
         transitions_max,

@@ -14,8 +14,8 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::check_rows,
     calls::{
-        Actor, affinity, counts, header, insert, is_refused, is_stored, join, last_word, life,
-        small, small_spec, stored, wait,
+        Actor, actor_join, affinity, counts, header, insert, is_refused, is_stored, join, leave,
+        small_replay, small_spec, stored, wait,
     },
     history::{History, spec},
 };
@@ -71,22 +71,22 @@ fn unfit_chunks_are_refused_with_a_reason() {
 
 #[test]
 fn actors_and_streams_are_bounded() {
-    let mut replay = small(&Config::unlimited(1 << 15));
+    let mut replay = small_replay(&Config::unlimited(1 << 15));
     for actor in 0..ACTORS_MAX as u32 {
         join(&mut replay, actor, 1);
         let reply = replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0)));
         assert!(is_stored(&reply), "{reply:?}");
     }
     let one_more = ACTORS_MAX as u32;
-    assert!(replay.join_actor(life(one_more, 1)).is_err());
+    assert!(replay.join_actor(actor_join(one_more, 1)).is_err());
     let reply = replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)));
     assert!(is_refused(&reply), "{reply:?}");
-    replay.leave(&last_word(one_more, 1, 6));
+    replay.leave(&leave(one_more, 1, 6));
     assert_eq!(replay.status().transitions_lost, 0);
     let last = insert(&mut replay, header(one_more - 1, 1, 1, 6));
     assert!(is_stored(&last), "the known ones continue");
     for (streams, is_fine) in [(STREAMS_MAX + 1, false), (STREAMS_MAX, true)] {
-        let mut replay = small(&Config::unlimited(1 << 15));
+        let mut replay = small_replay(&Config::unlimited(1 << 15));
         join(&mut replay, 0, 1);
         let wide = ChunkHeader {
             streams,
@@ -99,7 +99,7 @@ fn actors_and_streams_are_bounded() {
 
 #[test]
 fn the_run_ends_when_all_is_in_and_sampled() {
-    let mut replay = small(&Config {
+    let mut replay = small_replay(&Config {
         replay_ratio: 4.0,
         slack_transitions: 6,
         warmup_transitions: 6,
@@ -128,13 +128,13 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     assert_eq!(replay.waiting(), Waiting::Finished);
     // 48 rows for 12 transitions after the warm-up.
     assert_eq!(replay.status().replay_ratio(), Some(4.0));
-    replay.leave(&last_word(0, 1, 12));
+    replay.leave(&leave(0, 1, 12));
     assert_eq!(replay.status().transitions_lost, 0);
 }
 
 #[test]
 fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
-    let mut replay = small(&Config {
+    let mut replay = small_replay(&Config {
         replay_ratio: 4.0,
         slack_transitions: 2,
         ..Config::unlimited(1000)
@@ -204,7 +204,7 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
         transitions_max: Some(5000),
         ..Config::unlimited(1000)
     };
-    let mut replay = small(&config);
+    let mut replay = small_replay(&config);
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     // The limit of rows: 4 for each of 106 transitions stored, a capacity of 1000 and a slack of 100.
     for (lie, bound) in [
@@ -225,7 +225,7 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
 
 #[test]
 fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
-    let mut replay = small(&Config::unlimited(1000));
+    let mut replay = small_replay(&Config::unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.sample(8).unwrap();
     let affinity = |version| affinity(version, 5, vec![0.2; 25]);
@@ -327,7 +327,7 @@ proptest! {
     }
 }
 
-fn good() -> Config {
+fn valid() -> Config {
     Config {
         replay_ratio: 8.0,
         warmup_transitions: 1000,
@@ -337,7 +337,7 @@ fn good() -> Config {
     }
 }
 
-fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
+fn config_error(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
     let refused = Replay::new(spec, config, batch_size).map(drop);
     refused.unwrap_err().to_string()
 }
@@ -345,7 +345,7 @@ fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
 #[test]
 fn each_fault_names_its_key_and_a_way_out() {
     let spec = spec(3, 4, 7, Horizon::Nhg { k_max: 5 });
-    assert!(Replay::new(&spec, &good(), 256).is_ok());
+    assert!(Replay::new(&spec, &valid(), 256).is_ok());
     type Spoil = fn(&mut Config);
     let cases: [(Spoil, &str); 12] = [
         (|it| it.replay_ratio = 0.0, "replay_ratio = 0"),
@@ -371,14 +371,14 @@ fn each_fault_names_its_key_and_a_way_out() {
         (|it| it.transitions_max = Some(1031), "= 1032"),
     ];
     for (spoil, expected) in cases {
-        let mut config = good();
+        let mut config = valid();
         spoil(&mut config);
-        let text = refusal(&config, &spec, 256);
+        let text = config_error(&config, &spec, 256);
         assert!(text.starts_with("replay."), "{text}");
         assert!(text.contains(expected), "{text}");
     }
-    assert!(refusal(&good(), &spec, 0).contains("learner.batch_size = 0"));
-    assert!(refusal(&good(), &spec, u32::MAX).contains("a batch of this run has 1 to"));
+    assert!(config_error(&valid(), &spec, 0).contains("learner.batch_size = 0"));
+    assert!(config_error(&valid(), &spec, u32::MAX).contains("a batch of this run has 1 to"));
     let vast = RunSpec {
         frame_height: 4096,
         frame_width: 4096,
@@ -386,9 +386,9 @@ fn each_fault_names_its_key_and_a_way_out() {
         frame_stack: 16,
         ..spec.clone()
     };
-    assert!(refusal(&good(), &vast, 256).contains("4 GiB"));
+    assert!(config_error(&valid(), &vast, 256).contains("4 GiB"));
     let broken = RunSpec { gamma: 2.0, ..spec };
-    let refused = good().validate(&broken, 256).unwrap_err().to_string();
+    let refused = valid().validate(&broken, 256).unwrap_err().to_string();
     assert!(refused.starts_with("run.gamma = 2 "), "{refused}");
 }
 
@@ -398,9 +398,9 @@ fn the_least_capacity_works_and_a_smaller_one_is_refused() {
     for (n_step, stack) in [(1, 1), (1, 4), (2, 2), (7, 1), (8, 4), (1000, 4)] {
         let spec = spec(3, stack, n_step, Horizon::None {});
         let least = u64::from(n_step + stack);
-        let said = refusal(&Config::unlimited(least - 1), &spec, 4);
+        let error = config_error(&Config::unlimited(least - 1), &spec, 4);
         let named = format!("replay.capacity_transitions = {} ", least - 1);
-        assert!(said.starts_with(&named), "{said}");
+        assert!(error.starts_with(&named), "{error}");
         for capacity in least..least + 8 {
             let what = format!("n_step {n_step}, stack {stack}, capacity {capacity}");
             let mut replay = Replay::new(&spec, &Config::unlimited(capacity), 4).unwrap();

@@ -172,7 +172,7 @@ impl StoredReplay {
             17 => {
                 let actor = self.rng.random_range(0..2);
                 let left = &mut self.actors[actor as usize];
-                self.replay.leave(&left.last_word());
+                self.replay.leave(&left.leave());
                 let incarnation = left.next.incarnation + 1;
                 *left = Actor::new(actor, incarnation);
                 join(&mut self.replay, actor, incarnation);
@@ -198,16 +198,16 @@ fn record_end(bytes: &[u8], at: u64) -> u64 {
 }
 
 /// Uses a replay restored after a crash: the learner's report replaces the count of rows, and rows are right.
-fn check_continues(life: &StoredReplay, mut replay: Replay) {
-    let rows = life.replay.counts().rows_sampled;
+fn check_continues(setup: &StoredReplay, mut replay: Replay) {
+    let rows = setup.replay.counts().rows_sampled;
     replay.set_progress(learned(0, 0, rows)).unwrap();
-    assert_eq!(replay.counts(), life.replay.counts());
+    assert_eq!(replay.counts(), setup.replay.counts());
     for client in 0..6 {
         let id = RequestId::first(1000 + client);
         if let Ok(batch) = replay.draw_for(id, ROWS, Buffer::zeroed)
-            && is_held_by_number(&life.config)
+            && is_held_by_number(&setup.config)
         {
-            check_batch(&batch.unpack(), &life.history);
+            check_batch(&batch.unpack(), &setup.history);
         }
     }
     replay.check_valid();
@@ -235,21 +235,21 @@ proptest! {
         seed in any::<u64>(), config in configs(), segment_bytes in 500u64..20_000, actions in 1u32..120, cut in any::<u64>()
     ) {
         let root = tempfile::tempdir().unwrap();
-        let mut life = StoredReplay::begin(&root.path().join("living"), config, segment_bytes, seed);
+        let mut setup = StoredReplay::begin(&root.path().join("living"), config, segment_bytes, seed);
         for _ in 0..actions {
-            life.act();
+            setup.act();
         }
-        let (before, known) = (stored(&life.replay), segments(&life.args.dir));
+        let (before, known) = (stored(&setup.replay), segments(&setup.args.dir));
         let newest = known.last().unwrap().clone();
         let length = fs::metadata(&newest).unwrap().len();
-        life.act();
-        let after = stored(&life.replay);
-        life.replay.check_valid();
+        setup.act();
+        let after = stored(&setup.replay);
+        setup.replay.check_valid();
 
         // The process dies now; everything is on disk.
         let dead = root.path().join("dead");
-        copy(&life.args.dir, &dead);
-        let (replay, recovery) = open(&args(&dead, segment_bytes), &life.config).unwrap();
+        copy(&setup.args.dir, &dead);
+        let (replay, recovery) = open(&args(&dead, segment_bytes), &setup.config).unwrap();
         prop_assert!(recovery.found && recovery.warnings.is_empty(), "{:?}", recovery.warnings);
         prop_assert_eq!(stored(&replay), after.clone());
         replay.check_valid();
@@ -257,7 +257,7 @@ proptest! {
 
         // The process died while it wrote the last record, at any byte of it.
         let torn = root.path().join("torn");
-        copy(&life.args.dir, &torn);
+        copy(&setup.args.dir, &torn);
         let path = torn.join(newest.file_name().unwrap());
         if path.exists() && fs::metadata(&path).unwrap().len() > length {
             let bytes = fs::read(&path).unwrap();
@@ -274,16 +274,16 @@ proptest! {
                 let kept = torn.join(older.file_name().unwrap());
                 prop_assume!(kept.exists());
             }
-            let (replay, recovery) = open(&args(&torn, segment_bytes), &life.config).unwrap();
+            let (replay, recovery) = open(&args(&torn, segment_bytes), &setup.config).unwrap();
             prop_assert!(recovery.warnings.is_empty(), "{:?}", recovery.warnings);
             prop_assert_eq!(stored(&replay), before);
             replay.check_valid();
         }
 
         // The replay can be opened again after a recovery.
-        let (replay, _) = open(&args(&dead, segment_bytes), &life.config).unwrap();
+        let (replay, _) = open(&args(&dead, segment_bytes), &setup.config).unwrap();
         prop_assert_eq!(stored(&replay), after);
-        check_continues(&life, replay);
+        check_continues(&setup, replay);
     }
 }
 
@@ -291,12 +291,12 @@ proptest! {
 fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     let root = tempfile::tempdir().unwrap();
     let config = Config::unlimited(100);
-    let mut life = StoredReplay::begin(&root.path().join("ring"), config, 2_000, 5);
+    let mut setup = StoredReplay::begin(&root.path().join("ring"), config, 2_000, 5);
     for _ in 0..600 {
-        life.store(0);
+        setup.store(0);
     }
     // 100 transitions of 36 + 6 bytes each are held, and the newest segments are not full.
-    let bytes = bytes_in(&life.args.dir);
+    let bytes = bytes_in(&setup.args.dir);
     assert!(bytes < 20_000, "{bytes}");
 
     // The ring is larger than the budget: the oldest transitions leave the ring too.
@@ -304,21 +304,21 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
         disk_bytes_max: Some(4 << 20),
         ..Config::unlimited(1_000_000)
     };
-    let mut life = StoredReplay::begin(&root.path().join("budget"), config, 200_000, 5);
-    while life.history.inserted < 150_000 {
-        life.store(1);
+    let mut setup = StoredReplay::begin(&root.path().join("budget"), config, 200_000, 5);
+    while setup.history.inserted < 150_000 {
+        setup.store(1);
         // A checkpoint every 2,000 transitions: no segment is ever full.
-        let saved = life.history.inserted / 2000;
-        life.replay.set_progress(learned(saved, saved, 0)).unwrap();
-        let bytes = bytes_in(&life.args.dir);
+        let saved = setup.history.inserted / 2000;
+        setup.replay.set_progress(learned(saved, saved, 0)).unwrap();
+        let bytes = bytes_in(&setup.args.dir);
         assert!(bytes <= 4 << 20, "{bytes}");
     }
-    let held = life.replay.status().transitions_held;
+    let held = setup.replay.status().transitions_held;
     assert!((40_000..100_000).contains(&held), "{held}");
-    life.replay.check_valid();
-    assert!(life.draw(0).is_some());
-    let before = stored(&life.replay);
-    let (args, config) = life.end();
+    setup.replay.check_valid();
+    assert!(setup.draw(0).is_some());
+    let before = stored(&setup.replay);
+    let (args, config) = setup.end();
     let (replay, _) = open(&args, &config).unwrap();
     assert_eq!(stored(&replay), before);
     assert_eq!(replay.status().transitions_held, held);
@@ -332,18 +332,18 @@ fn a_resumed_run_continues_with_what_was_kept() {
         warmup_transitions: 10,
         ..Config::unlimited(1000)
     };
-    let mut life = StoredReplay::begin(root.path(), config, 4000, 5);
-    while life.history.inserted < 100 {
-        life.store(0);
+    let mut setup = StoredReplay::begin(root.path(), config, 4000, 5);
+    while setup.history.inserted < 100 {
+        setup.store(0);
     }
     let mut batches = 0;
-    while life.draw(0).is_some() {
-        life.requests[0] = life.requests[0].next();
+    while setup.draw(0).is_some() {
+        setup.requests[0] = setup.requests[0].next();
         batches += 1;
     }
     assert!(batches > 80);
-    let before = life.replay.status();
-    let (mut args, config) = life.end();
+    let before = setup.replay.status();
+    let (mut args, config) = setup.end();
 
     // The learner saved after 50 updates: rows beyond them are served again. Or the learner has done more updates than the log knows, as a
     // power cut lost the log's end.
@@ -377,12 +377,12 @@ fn a_resumed_run_continues_with_what_was_kept() {
 #[test]
 fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let root = tempfile::tempdir().unwrap();
-    let mut life = StoredReplay::begin(root.path(), Config::unlimited(200), 2_000, 5);
+    let mut setup = StoredReplay::begin(root.path(), Config::unlimited(200), 2_000, 5);
     for _ in 0..60 {
-        life.act();
+        setup.act();
     }
-    let (before, args, config) = (stored(&life.replay), life.args.clone(), life.config.clone());
-    drop(life);
+    let before = stored(&setup.replay);
+    let (args, config) = setup.end();
     let bytes = || bytes_in(root.path());
     let find = || ReplayFolder::open(&args, &test_spec(), &config).unwrap();
     let empty = || Replay::new(&test_spec(), &config, ROWS).unwrap();

@@ -22,7 +22,7 @@ use crate::{
 };
 
 /// A log of about a dozen segments with some transitions each, and a reference of its content.
-struct Kept {
+struct SavedLog {
     _root: tempfile::TempDir,
     args: PersistArgs,
     config: Config,
@@ -30,26 +30,26 @@ struct Kept {
     stored: Vec<u8>,
 }
 
-impl Kept {
+impl SavedLog {
     fn new(capacity: u64) -> Self {
         let root = tempfile::tempdir().unwrap();
         let (dir, config) = (root.path().join("log"), Config::unlimited(capacity));
-        let mut life = StoredReplay::begin(&dir, config, 4_000, 3);
+        let mut setup = StoredReplay::begin(&dir, config, 4_000, 3);
         // Until the newest segment has some transitions, too.
         let (mut newest, mut in_newest) = (None, 0);
-        while life.history.inserted < 800 || in_newest < 5 {
-            life.store(0);
-            life.draw(0);
-            let last = segments(&life.args.dir).pop();
+        while setup.history.inserted < 800 || in_newest < 5 {
+            setup.store(0);
+            setup.draw(0);
+            let last = segments(&setup.args.dir).pop();
             in_newest = if last == newest { in_newest + 1 } else { 0 };
             newest = last;
         }
         Self {
             _root: root,
-            stored: stored(&life.replay),
-            args: life.args,
-            config: life.config,
-            history: life.history,
+            stored: stored(&setup.replay),
+            args: setup.args,
+            config: setup.config,
+            history: setup.history,
         }
     }
 
@@ -62,10 +62,10 @@ impl Kept {
     }
 
     /// Opens the log, and checks that each of `words` is in a warning. Without words, no warning may come.
-    fn open_saying(&self, words: &[&str]) -> Replay {
+    fn open_with_warnings(&self, words: &[&str]) -> Replay {
         let (replay, recovery) = self.open();
-        let said = |words: &&str| recovery.warnings.iter().any(|it| it.contains(words));
-        assert!(words.iter().all(said), "{words:?}: {recovery:?}");
+        let is_warned = |words: &&str| recovery.warnings.iter().any(|it| it.contains(words));
+        assert!(words.iter().all(is_warned), "{words:?}: {recovery:?}");
         assert!(
             !words.is_empty() || recovery.warnings.is_empty(),
             "{recovery:?}"
@@ -119,7 +119,7 @@ proptest! {
     /// Whatever happens to the files, the server starts or gives a reason. The rows that it serves are right, and it can be opened again.
     #[test]
     fn whatever_is_damaged_what_is_served_is_right(seed in any::<u64>(), damages in 1usize..5, capacity in 300u64..2_000) {
-        let mut kept = Kept::new(capacity);
+        let mut kept = SavedLog::new(capacity);
         // If the end was cut off, older transitions are still held.
         kept.history.capacity = u64::MAX;
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -215,10 +215,10 @@ fn damage_costs_what_it_hits_and_is_said() {
         (0, forget_id, &[], All),
     ];
     for (number, (segment, spoil, words, left)) in cases.iter().enumerate() {
-        let kept = Kept::new(10_000);
+        let kept = SavedLog::new(10_000);
         let segments = kept.segments();
         spoil(&segments[*segment.min(&(segments.len() - 1))]);
-        let mut replay = kept.open_saying(words);
+        let mut replay = kept.open_with_warnings(words);
         let status = replay.status();
         assert_eq!(status.transitions_lost, 0, "case {number}");
         let inserted = kept.history.inserted;
@@ -242,8 +242,8 @@ fn damage_costs_what_it_hits_and_is_said() {
         assert_eq!(says_gone, is_within, "case {number}: {recovery:?}");
     }
     // No warning comes if the oldest segments were removed with their transitions.
-    let kept = Kept::new(100);
-    let mut replay = kept.open_saying(&[]);
+    let kept = SavedLog::new(100);
+    let mut replay = kept.open_with_warnings(&[]);
     assert_eq!(stored(&replay), kept.stored);
     kept.check(&mut replay);
 }
@@ -251,10 +251,10 @@ fn damage_costs_what_it_hits_and_is_said() {
 /// Lost chunks that were acknowledged are never sent again. The actor's next chunk is accepted, and the loss is counted.
 #[test]
 fn after_a_loss_an_actor_continues_and_the_loss_is_counted() {
-    let kept = Kept::new(10_000);
+    let kept = SavedLog::new(10_000);
     let newest = kept.segments().pop().unwrap();
     flip(&newest, |length| length * 3 / 4);
-    let mut replay = kept.open_saying(&["are cut off"]);
+    let mut replay = kept.open_with_warnings(&["are cut off"]);
     let before = replay.status();
     let lost = kept.history.inserted - before.transitions_inserted;
     assert!(lost > 0);
@@ -279,14 +279,14 @@ fn after_a_loss_an_actor_continues_and_the_loss_is_counted() {
     replay.check_valid();
     let after = stored(&replay);
     drop(replay);
-    let replay = kept.open_saying(&[]);
+    let replay = kept.open_with_warnings(&[]);
     assert_eq!(stored(&replay), after);
 }
 
 #[test]
 fn a_chunk_that_overtook_others_before_they_came_is_not_stored_ahead_of_the_next() {
-    let kept = Kept::new(10_000);
-    let mut replay = kept.open_saying(&[]);
+    let kept = SavedLog::new(10_000);
+    let mut replay = kept.open_with_warnings(&[]);
     let mut insert = |sequence| {
         let header = header(0, 1, sequence, kept.history.inserted);
         replay.insert(&Chunk::zeroed(header))
@@ -302,21 +302,21 @@ fn a_chunk_that_overtook_others_before_they_came_is_not_stored_ahead_of_the_next
 
 #[test]
 fn a_segment_of_another_log_is_left_alone() {
-    let (kept, other) = (Kept::new(10_000), Kept::new(10_000));
+    let (kept, other) = (SavedLog::new(10_000), SavedLog::new(10_000));
     let foreign = kept.args.dir.join("segment-000000000500.log");
     fs::copy(&other.segments()[3], &foreign).unwrap();
-    let replay = kept.open_saying(&["segment-000000000500.log is not of this log"]);
+    let replay = kept.open_with_warnings(&["segment-000000000500.log is not of this log"]);
     assert_eq!(stored(&replay), kept.stored);
     assert!(foreign.exists());
 }
 
 #[test]
 fn a_folder_is_one_servers_and_one_runs() {
-    let kept = Kept::new(10_000);
+    let kept = SavedLog::new(10_000);
     let check_refused = |args: &PersistArgs, spec: &RunSpec, config: &Config, words| {
         let opened = Replay::open(args, spec, config, ROWS).map(drop);
-        let said = opened.unwrap_err().to_string();
-        assert!(said.contains(words), "{said}");
+        let error = opened.unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
     };
     let (own, spec, config) = (&kept.args, &test_spec(), &kept.config);
     let (replay, _) = kept.open();
@@ -349,7 +349,7 @@ fn a_folder_is_one_servers_and_one_runs() {
 /// Opens the log with other settings of the same run, which determine what is held.
 #[test]
 fn a_run_may_go_on_with_another_capacity() {
-    let kept = Kept::new(10_000);
+    let kept = SavedLog::new(10_000);
     for capacity in [100, 50_000] {
         let config = Config::unlimited(capacity);
         let (mut replay, recovery) = open(&kept.args, &config).unwrap();
@@ -360,7 +360,7 @@ fn a_run_may_go_on_with_another_capacity() {
         replay.sample(ROWS).unwrap();
     }
     // Also if more transitions are gone than the ring holds.
-    let kept = Kept::new(10_000);
+    let kept = SavedLog::new(10_000);
     let segments = kept.segments();
     segments[1..segments.len() - 2]
         .iter()

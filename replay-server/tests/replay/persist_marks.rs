@@ -32,21 +32,21 @@ fn next_draws(replay: &mut Replay) -> Vec<Batch> {
 
 /// Returns a replay that has stored more than its ring of 60 holds, with segments that are full after a few chunks.
 fn begin(folder: &Path, config: Config, seed: u64) -> StoredReplay {
-    let mut life = StoredReplay::begin(folder, config, 600, seed);
+    let mut setup = StoredReplay::begin(folder, config, 600, seed);
     for _ in 0..30 {
-        life.act();
+        setup.act();
     }
-    life
+    setup
 }
 
-fn store_some(life: &mut StoredReplay) {
+fn store_some(setup: &mut StoredReplay) {
     for _ in 0..12 {
-        life.store(0);
-        life.store(1);
+        setup.store(0);
+        setup.store(1);
     }
 }
 
-fn at(args: &PersistArgs, config: &Config, mark: Mark) -> Result<Replay, PersistError> {
+fn open_at(args: &PersistArgs, config: &Config, mark: Mark) -> Result<Replay, PersistError> {
     let args = PersistArgs {
         mark: Some(mark),
         ..args.clone()
@@ -65,22 +65,22 @@ fn a_log_goes_back_to_its_last_two_marks() {
             true => prioritised(60, 0.5),
             false => Config::unlimited(60),
         };
-        let mut life = begin(folder.path(), config, seed);
-        life.replay.mark().unwrap().unwrap();
+        let mut setup = begin(folder.path(), config, seed);
+        setup.replay.mark().unwrap().unwrap();
         let mut marks = Vec::new();
         for _ in 0..2 {
-            store_some(&mut life);
-            next_draws(&mut life.replay);
-            life.store(1);
-            let mark = life.replay.mark().unwrap().unwrap();
-            let before = state(&life.replay);
-            marks.push((mark, before, next_draws(&mut life.replay)));
+            store_some(&mut setup);
+            next_draws(&mut setup.replay);
+            setup.store(1);
+            let mark = setup.replay.mark().unwrap().unwrap();
+            let before = state(&setup.replay);
+            marks.push((mark, before, next_draws(&mut setup.replay)));
         }
         for _ in 0..12 {
-            life.store(1);
-            next_draws(&mut life.replay);
+            setup.store(1);
+            next_draws(&mut setup.replay);
         }
-        let (args, config) = life.end();
+        let (args, config) = setup.end();
         for (mark, before, draws) in &marks {
             let copied = tempfile::tempdir().unwrap();
             copy(folder.path(), copied.path());
@@ -89,15 +89,15 @@ fn a_log_goes_back_to_its_last_two_marks() {
                 ..args.clone()
             };
             for _ in 0..2 {
-                let mut replay = at(&args, &config, *mark).unwrap();
+                let mut replay = open_at(&args, &config, *mark).unwrap();
                 replay.check_valid();
                 assert!(state(&replay) == *before, "seed {seed}");
                 assert!(next_draws(&mut replay) == *draws, "seed {seed}");
             }
         }
         // Rolling back to the older mark removes the newer one.
-        at(&args, &config, marks[0].0).unwrap();
-        let gone = at(&args, &config, marks[1].0).map(drop).unwrap_err();
+        open_at(&args, &config, marks[0].0).unwrap();
+        let gone = open_at(&args, &config, marks[1].0).map(drop).unwrap_err();
         assert!(matches!(gone, PersistError::NoMark(_)), "{gone}");
     }
 }
@@ -106,27 +106,27 @@ fn a_log_goes_back_to_its_last_two_marks() {
 #[test]
 fn marks_that_are_given_up_leave_the_one_before_them() {
     let folder = tempfile::tempdir().unwrap();
-    let mut life = begin(folder.path(), Config::unlimited(60), 1);
-    let kept = life.replay.mark().unwrap().unwrap();
-    let before = state(&life.replay);
+    let mut setup = begin(folder.path(), Config::unlimited(60), 1);
+    let kept = setup.replay.mark().unwrap().unwrap();
+    let before = state(&setup.replay);
     for _ in 0..4 {
-        store_some(&mut life);
-        let mark = life.replay.mark().unwrap().unwrap();
-        life.replay.discard_mark(mark);
+        store_some(&mut setup);
+        let mark = setup.replay.mark().unwrap().unwrap();
+        setup.replay.discard_mark(mark);
     }
-    let (args, config) = life.end();
-    let replay = at(&args, &config, kept).unwrap();
+    let (args, config) = setup.end();
+    let replay = open_at(&args, &config, kept).unwrap();
     assert!(state(&replay) == before);
 }
 
 #[test]
 fn a_log_with_marks_holds_no_more_than_these_need() {
     let folder = tempfile::tempdir().unwrap();
-    let mut life = begin(folder.path(), Config::unlimited(60), 1);
+    let mut setup = begin(folder.path(), Config::unlimited(60), 1);
     let mut most = 0;
     for round in 0..40 {
-        store_some(&mut life);
-        life.replay.mark().unwrap();
+        store_some(&mut setup);
+        setup.replay.mark().unwrap();
         if round == 9 {
             most = segments(folder.path()).len();
         }
