@@ -52,7 +52,7 @@ impl Actor {
     }
 
     /// Whether a chunk has the actor's number of streams, or is the first.
-    fn fits(&self, header: &ChunkHeader) -> bool {
+    fn fits_streams(&self, header: &ChunkHeader) -> bool {
         self.streams.is_empty() || self.streams.len() == header.streams as usize
     }
 }
@@ -163,7 +163,7 @@ impl Actors {
         if header.sequence > expected {
             return Ok(ChunkOrder::OutOfOrder { expected });
         }
-        if header.sequence > 0 && !actor.fits(header) {
+        if header.sequence > 0 && !actor.fits_streams(header) {
             return Err(format!(
                 "actor {number} sends {streams} streams after {}; their number must not change before it starts anew",
                 actor.streams.len()
@@ -175,7 +175,7 @@ impl Actors {
     /// Checks that a chunk can be counted: its incarnation is current, and its number of streams fits. The error says why not.
     pub(crate) fn check_sender(&self, header: &ChunkHeader) -> Result<(), String> {
         let actor = self.current_actor(header.actor, header.incarnation)?;
-        if header.sequence == 0 || actor.fits(header) {
+        if header.sequence == 0 || actor.fits_streams(header) {
             return Ok(());
         }
         let (streams, before) = (header.streams, actor.streams.len());
@@ -190,7 +190,7 @@ impl Actors {
         let actor = self.actors.get_mut(&header.actor);
         actor.is_some_and(|actor| {
             self.restored
-                && actor.fits(header)
+                && actor.fits_streams(header)
                 && actor.gap_sequence.replace(header.sequence) == Some(header.sequence)
         })
     }

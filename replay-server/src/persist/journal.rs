@@ -83,7 +83,7 @@ pub(crate) struct Journal {
     /// When a new segment could not be begun; `None` if one was begun since.
     rotate_failed_at: Option<Instant>,
     log_limiter: LogLimiter,
-    /// The last two marks that were not given up, newest last, each with the oldest transition held then. Segments that they need are kept.
+    /// The last two marks not discarded, newest last, each with the oldest transition held then. Segments that they need are kept.
     marks: VecDeque<(Mark, u64)>,
 }
 
@@ -317,7 +317,7 @@ impl Journal {
         Ok(mark)
     }
 
-    /// Gives up `mark`: the log will not be rolled back to it.
+    /// Discards `mark`: the log will not be rolled back to it.
     pub(super) fn discard_mark(&mut self, mark: Mark) {
         self.marks.retain(|(it, _)| *it != mark);
     }

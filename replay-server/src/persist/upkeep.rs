@@ -155,7 +155,7 @@ impl Replay {
     }
 
     /// Marks this moment in the log, flushed to disk. The log can be opened at the mark even after it has grown, which restores the replay
-    /// bit for bit. The last two marks are kept, not counting those given up. `None` if the replay is in memory.
+    /// bit for bit. The last two marks are kept, not counting those discarded. `None` if the replay is in memory.
     pub fn mark(&mut self) -> Result<Option<Mark>, PersistError> {
         let snapshot = self.snapshot();
         let marked = self.journal.as_mut().map(|journal| journal.mark(&snapshot));
@@ -163,7 +163,7 @@ impl Replay {
         marked.transpose()
     }
 
-    /// Gives up `mark`, as the checkpoint that should refer to it could not be saved. So it does not displace a mark to which a saved
+    /// Discards `mark`, as the checkpoint that should refer to it could not be saved. So it does not displace a mark to which a saved
     /// checkpoint refers.
     pub fn discard_mark(&mut self, mark: Mark) {
         if let Some(journal) = &mut self.journal {

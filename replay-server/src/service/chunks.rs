@@ -146,7 +146,7 @@ impl State {
             return Replies::new();
         }
         parked.packed.chunk.to_mut().header.leaving = true;
-        let parked = self.chunks.take(poll.actor);
+        let parked = self.chunks.remove(poll.actor);
         let answer = parked.and_then(|parked| {
             let reply = self.replay.insert_packed(&parked.packed);
             self.unparked_reply(parked, reply)
@@ -172,7 +172,7 @@ impl State {
         replies
     }
 
-    /// Returns the reply about a chunk that has left the line, and records its times if it was stored.
+    /// Returns the reply about a chunk that has left the queue, and records its times if it was stored.
     fn unparked_reply(
         &mut self,
         parked: ParkedChunk<PendingQuery>,

@@ -121,7 +121,7 @@ impl State {
         self.update_actor_count();
         if other.is_some() {
             // Drops a parked chunk of the earlier incarnation.
-            self.chunks.take(actor);
+            self.chunks.remove(actor);
         }
         Ok(earlier_incarnations)
     }

@@ -91,7 +91,7 @@ impl<Q> ParkedChunks<Q> {
         self.queue.iter_mut().find(|it| key(it.header()) == polled)
     }
 
-    pub(super) fn take(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
+    pub(super) fn remove(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
         self.queue.remove(self.position_of(actor)?)
     }
 
@@ -100,7 +100,7 @@ impl<Q> ParkedChunks<Q> {
         let parked = self.queue[self.position_of(stored.actor)?].header();
         let is_copy =
             parked.incarnation == stored.incarnation && parked.sequence <= stored.sequence;
-        is_copy.then(|| self.take(stored.actor)).flatten()
+        is_copy.then(|| self.remove(stored.actor)).flatten()
     }
 
     /// Removes the queries that have been held for `hold_max`. Their chunks stay.
@@ -201,7 +201,7 @@ mod tests {
             assert_eq!(taken.and_then(|it| it.query), copy);
         }
         for (actor, query) in [(2, Some("b")), (2, None), (1, Some("a again"))] {
-            let taken = parked.take(actor);
+            let taken = parked.remove(actor);
             assert_eq!(taken.and_then(|it| it.query), query);
         }
         assert_eq!((parked.queue.len(), parked.bytes()), (0, 0));
