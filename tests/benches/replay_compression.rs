@@ -93,7 +93,7 @@ fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: &mut usize) 
 }
 
 /// Makes `batches` batches on two threads, as the replay server does: drawn with the replay locked, unpacked without the lock.
-fn on_two_threads(replay: &Mutex<Replay>, batches: u64) -> Duration {
+fn time_on_two_threads(replay: &Mutex<Replay>, batches: u64) -> Duration {
     let make = |count| {
         for _ in 0..count {
             let draft = replay.lock().unwrap().draw(ROWS, Buffer::zeroed).unwrap();
@@ -148,7 +148,7 @@ fn bench(criterion: &mut Criterion) {
             });
             let shared = Mutex::new(replay);
             group.bench_function(BenchmarkId::new("the same on two threads", &how), |b| {
-                b.iter_custom(|batches| on_two_threads(&shared, batches));
+                b.iter_custom(|batches| time_on_two_threads(&shared, batches));
             });
             group.finish();
         }

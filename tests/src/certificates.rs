@@ -27,10 +27,10 @@ impl Certificates {
         run(Command::new(script)
             .arg(&folder)
             .args(args.split_whitespace()));
-        Self::at(folder)
+        Self::in_folder(folder)
     }
 
-    pub(crate) const fn at(folder: PathBuf) -> Self {
+    pub(crate) const fn in_folder(folder: PathBuf) -> Self {
         Self { folder }
     }
 
@@ -45,7 +45,7 @@ impl Certificates {
     }
 
     /// Copies the files to a new folder, where a test can make them invalid.
-    pub fn copy(&self, to: PathBuf) -> Self {
+    pub fn copy_to(&self, to: PathBuf) -> Self {
         fs::create_dir(&to).unwrap();
         for entry in fs::read_dir(&self.folder).unwrap() {
             let entry = entry.unwrap();
@@ -55,7 +55,7 @@ impl Certificates {
     }
 
     /// Replaces the certificate and key of `as_role` by those of `role`.
-    pub fn pass_off(&self, role: &str, as_role: &str) {
+    pub fn replace_role(&self, role: &str, as_role: &str) {
         for ending in ["pem", "key"] {
             let file = |role| self.path(&format!("{role}.{ending}"));
             fs::copy(file(role), file(as_role)).unwrap();

@@ -17,7 +17,7 @@ use crate::waiting::wait_for;
 
 /// The default prefix of a run's keys.
 pub(crate) const NAMESPACE: &str = "driml";
-const ANSWER_MAX: Duration = Duration::from_secs(20);
+const REPLY_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// An open session, and the run's settings as the replay server sent them.
 #[derive(Debug)]
@@ -97,34 +97,34 @@ impl Client {
     ///
     /// # Errors
     /// No process answered.
-    pub fn ask(&self, key: &str, payload: Vec<u8>) -> Result<Vec<u8>, SessionError> {
+    pub fn request(&self, key: &str, payload: Vec<u8>) -> Result<Vec<u8>, SessionError> {
         session::ask(
             &self.session,
             key,
             payload.into(),
             Priority::Data,
-            ANSWER_MAX,
+            REPLY_TIMEOUT,
         )
-        .map(|answer| answer.to_bytes().into_owned())
+        .map(|reply| reply.to_bytes().into_owned())
     }
 
     /// Returns the session, the keys and the spec's hash, as a process of the run holds them.
-    pub fn run(&self) -> RunClient {
+    pub fn run_client(&self) -> RunClient {
         RunClient::new(self.session.clone(), self.keys.clone(), self.spec.hash())
     }
 
     /// Requests the replay server's status; `None` if the server does not answer.
-    pub fn replay(&self) -> Option<ReplayStatus> {
-        self.fetch()
+    pub fn replay_status(&self) -> Option<ReplayStatus> {
+        self.fetch_status()
     }
 
     /// Requests the learner's status; `None` if no learner answers.
-    pub fn learner(&self) -> Option<LearnerStatus> {
-        self.fetch()
+    pub fn learner_status(&self) -> Option<LearnerStatus> {
+        self.fetch_status()
     }
 
-    fn fetch<M: Keyed>(&self) -> Option<M> {
-        match self.run().fetch(ANSWER_MAX) {
+    fn fetch_status<M: Keyed>(&self) -> Option<M> {
+        match self.run_client().fetch(REPLY_TIMEOUT) {
             Err(e @ SessionError::Unreadable { .. }) => panic!("{e}"),
             fetched => fetched.ok(),
         }
@@ -136,7 +136,7 @@ impl Client {
         what: &str,
         wanted: impl Fn(&ReplayStatus) -> bool,
     ) -> ReplayStatus {
-        wait_for(what, || self.replay().filter(&wanted))
+        wait_for(what, || self.replay_status().filter(&wanted))
     }
 
     /// Waits until the replay server has stored more than `transitions` transitions.
@@ -151,7 +151,7 @@ impl Client {
         what: &str,
         wanted: impl Fn(&LearnerStatus) -> bool,
     ) -> LearnerStatus {
-        wait_for(what, || self.learner().filter(&wanted))
+        wait_for(what, || self.learner_status().filter(&wanted))
     }
 
     /// Waits until the learner has made more than `updates` updates.
@@ -168,7 +168,7 @@ impl Client {
     /// Requests the replay server's status, checks it with [`check_nothing_lost`], and returns it.
     #[track_caller]
     pub fn check_nothing_lost(&self) -> ReplayStatus {
-        let replay = self.replay().unwrap();
+        let replay = self.replay_status().unwrap();
         check_nothing_lost(&replay);
         replay
     }
@@ -177,24 +177,24 @@ impl Client {
     pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
         let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
-        join::take_part(&self.run(), &join, &never).unwrap();
+        join::take_part(&self.run_client(), &join, &never).unwrap();
     }
 
     /// Joins the run as a learner that has made no update yet.
     pub fn join_as_learner(&self, learner: u64) {
         let never = Shutdown::default();
-        join::take_part(&self.run(), &new_learner(learner), &never).unwrap();
+        join::take_part(&self.run_client(), &new_learner(learner), &never).unwrap();
     }
 
     /// Encodes a chunk as a process of the run would send it.
-    pub fn seal(&self, chunk: &Chunk) -> Vec<u8> {
+    pub fn encode_chunk(&self, chunk: &Chunk) -> Vec<u8> {
         codec::encode(self.spec.hash(), &chunk.header, chunk.payload()).unwrap()
     }
 
     /// Sends a chunk as an actor would, and returns the reply.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
         let key = self.keys.of_actor::<ChunkHeader>(chunk.header.actor);
-        let reply = self.ask(&key, self.seal(chunk));
+        let reply = self.request(&key, self.encode_chunk(chunk));
         let reply = reply.expect("chunks are always answered");
         codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }

@@ -16,14 +16,14 @@ pub struct Network {
 }
 
 /// Runs `ip` with these arguments.
-fn ip(words: &str) -> Result<(), String> {
-    let said = Command::new("ip").args(words.split_whitespace()).output();
-    let said = said.map_err(|e| format!("{words}: {e}"))?;
-    match said.status.success() {
+fn ip(args: &str) -> Result<(), String> {
+    let output = Command::new("ip").args(args.split_whitespace()).output();
+    let output = output.map_err(|e| format!("{args}: {e}"))?;
+    match output.status.success() {
         true => Ok(()),
         false => Err(format!(
-            "{words}: {}",
-            String::from_utf8_lossy(&said.stderr).trim()
+            "{args}: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
         )),
     }
 }
@@ -56,7 +56,7 @@ impl Network {
         );
         for (number, machine) in self.machines.iter().enumerate() {
             let namespace = self.namespace(machine);
-            let (inner, outer) = (format!("{}i{number}", self.name), self.device(machine));
+            let (inner, outer) = (format!("{}i{number}", self.name), self.router_end(machine));
             commands += &format!(
                 "
                 netns add {namespace}
@@ -72,7 +72,7 @@ impl Network {
         commands.lines().map(str::trim).try_for_each(ip)
     }
 
-    fn number(&self, machine: &str) -> usize {
+    fn machine_index(&self, machine: &str) -> usize {
         let found = self.machines.iter().position(|it| it == machine);
         found.unwrap_or_else(|| panic!("there is no machine {machine}"))
     }
@@ -82,40 +82,40 @@ impl Network {
     }
 
     /// The router's end of a machine's link.
-    fn device(&self, machine: &str) -> String {
-        format!("{}o{}", self.name, self.number(machine))
+    fn router_end(&self, machine: &str) -> String {
+        format!("{}o{}", self.name, self.machine_index(machine))
     }
 
     /// A machine's address.
     pub fn address(&self, machine: &str) -> String {
-        format!("10.77.{}.2", self.number(machine))
+        format!("10.77.{}.2", self.machine_index(machine))
     }
 
     /// Returns the prefix that runs a command on a machine, or on the `router`, which can reach every machine.
-    pub fn on(&self, machine: &str) -> String {
+    pub fn exec_prefix(&self, machine: &str) -> String {
         format!("ip netns exec {}", self.namespace(machine))
     }
 
     /// Disconnects a machine: packets in flight are lost, and neither side gets an error.
-    pub fn cut(&self, machine: &str) {
-        self.set(machine, "down");
+    pub fn disconnect(&self, machine: &str) {
+        self.set_link(machine, "down");
     }
 
     /// Reconnects a machine.
-    pub fn mend(&self, machine: &str) {
-        self.set(machine, "up");
+    pub fn reconnect(&self, machine: &str) {
+        self.set_link(machine, "up");
     }
 
-    fn set(&self, machine: &str, state: &str) {
-        let (router, device) = (self.namespace("router"), self.device(machine));
+    fn set_link(&self, machine: &str, state: &str) {
+        let (router, device) = (self.namespace("router"), self.router_end(machine));
         ip(&format!("-n {router} link set {device} {state}")).unwrap();
     }
 
     /// Limits a machine's link to `kbit` kbit/s in each direction. Returns false if the kernel does not support it.
-    pub fn narrow(&self, machine: &str, kbit: u32) -> bool {
-        let inner = format!("{}i{}", self.name, self.number(machine));
+    pub fn limit_rate(&self, machine: &str, kbit: u32) -> bool {
+        let inner = format!("{}i{}", self.name, self.machine_index(machine));
         let ends = [
-            (self.namespace("router"), self.device(machine)),
+            (self.namespace("router"), self.router_end(machine)),
             (self.namespace(machine), inner),
         ];
         ends.iter().all(|(namespace, device)| {

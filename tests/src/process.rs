@@ -21,13 +21,13 @@ use crate::waiting::{wait_for, wait_until};
 pub struct Process {
     name: String,
     child: Child,
-    stdout: Output,
-    stderr: Output,
+    stdout: PipeReader,
+    stderr: PipeReader,
 }
 
 /// How a process ended, and all its output.
 #[derive(Clone, Debug)]
-pub struct Ended {
+pub struct Exit {
     /// The exit code; `None` if a signal ended the process.
     pub code: Option<i32>,
     /// The signal that ended the process, if any.
@@ -40,13 +40,13 @@ pub struct Ended {
 
 /// The text read from one pipe so far, and the thread that keeps reading.
 #[derive(Debug)]
-struct Output {
+struct PipeReader {
     text: Arc<Mutex<String>>,
     reader: JoinHandle<()>,
 }
 
-impl Output {
-    fn read(pipe: impl Read + Send + 'static) -> Self {
+impl PipeReader {
+    fn start(pipe: impl Read + Send + 'static) -> Self {
         let text = Arc::<Mutex<String>>::default();
         let sink = text.clone();
         let reader = thread::spawn(move || {
@@ -60,7 +60,7 @@ impl Output {
         Self { text, reader }
     }
 
-    fn so_far(&self) -> String {
+    fn text_so_far(&self) -> String {
         self.text.lock().unwrap().clone()
     }
 }
@@ -76,8 +76,8 @@ pub fn check_has(text: &str, all: &[&str]) {
 /// Runs a command other than the program under test, which must succeed, and returns its standard output.
 pub(crate) fn run(command: &mut Command) -> String {
     let output = command.output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{command:?}: {said}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command:?}: {stderr}");
     String::from_utf8(output.stdout).unwrap()
 }
 
@@ -91,8 +91,8 @@ impl Process {
         let mut child = command
             .spawn()
             .unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
-        let stdout = Output::read(child.stdout.take().expect("it is piped"));
-        let stderr = Output::read(child.stderr.take().expect("it is piped"));
+        let stdout = PipeReader::start(child.stdout.take().expect("it is piped"));
+        let stderr = PipeReader::start(child.stderr.take().expect("it is piped"));
         Self {
             name,
             child,
@@ -113,7 +113,7 @@ impl Process {
 
     /// Standard error so far.
     pub fn stderr(&self) -> String {
-        self.stderr.so_far()
+        self.stderr.text_so_far()
     }
 
     /// Waits until standard error holds `words`.
@@ -122,11 +122,11 @@ impl Process {
             // Check for the end first, so that output written just before the end is not missed.
             let ended =
                 self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
-            let said = self.stderr.so_far();
-            let found = said.contains(words);
+            let stderr = self.stderr.text_so_far();
+            let found = stderr.contains(words);
             assert!(
                 found || !ended,
-                "{} ended without saying {words:?}:\n{said}",
+                "{} ended without saying {words:?}:\n{stderr}",
                 self.name
             );
             found
@@ -139,30 +139,30 @@ impl Process {
     }
 
     /// Waits until the process ends. At the deadline, panics and thereby kills the process.
-    pub fn wait(mut self) -> Ended {
+    pub fn wait(mut self) -> Exit {
         let what = format!("the end of {}", self.name);
         let status = wait_for(&what, || self.child.try_wait().unwrap());
         // The pipes close when the process ends, because no child of the process holds them.
         wait_until(&format!("the last output of {}", self.name), || {
             self.stdout.reader.is_finished() && self.stderr.reader.is_finished()
         });
-        Ended {
+        Exit {
             code: status.code(),
             signal: status.signal(),
-            stdout: self.stdout.so_far(),
-            stderr: self.stderr.so_far(),
+            stdout: self.stdout.text_so_far(),
+            stderr: self.stderr.text_so_far(),
         }
     }
 
     /// Waits until the process ends and checks that it succeeded.
     #[track_caller]
-    pub fn wait_ok(self) -> Ended {
+    pub fn wait_ok(self) -> Exit {
         self.wait().expect_code(0)
     }
 
     /// Waits until the process ends and checks that it failed with `words` on standard error.
     #[track_caller]
-    pub fn fails(self, words: &str) -> Ended {
+    pub fn fails(self, words: &str) -> Exit {
         self.wait().expect_error(words)
     }
 
@@ -173,20 +173,20 @@ impl Process {
     }
 
     /// Sends SIGINT, as Ctrl-C does, and waits until the process ends.
-    pub fn interrupt(self) -> Ended {
+    pub fn interrupt(self) -> Exit {
         self.signal(Signal::SIGINT);
         self.wait()
     }
 
     /// Sends SIGTERM and waits until the process ends.
-    pub fn stop(self) -> Ended {
+    pub fn stop(self) -> Exit {
         self.signal(Signal::SIGTERM);
         self.wait()
     }
 
     /// Sends SIGTERM, waits until the process exits, and checks for code 0 (its run is over) or 130.
     #[track_caller]
-    pub fn stop_ok(self) -> Ended {
+    pub fn stop_ok(self) -> Exit {
         let ended = self.stop();
         let code = if ended.code == Some(130) { 130 } else { 0 };
         ended.expect_code(code)
@@ -202,14 +202,14 @@ impl Drop for Process {
             println!(
                 "--- {}\n{}{}",
                 self.name,
-                self.stdout.so_far(),
-                self.stderr.so_far()
+                self.stdout.text_so_far(),
+                self.stderr.text_so_far()
             );
         }
     }
 }
 
-impl Ended {
+impl Exit {
     /// Checks the exit code, and that no thread panicked.
     #[track_caller]
     pub fn expect_code(self, code: i32) -> Self {
@@ -227,26 +227,26 @@ impl Ended {
     /// Checks for exit code 1 and `words` on standard error.
     #[track_caller]
     pub fn expect_error(self, words: &str) -> Self {
-        self.expect_code(1).expect_said(words)
+        self.expect_code(1).expect_stderr(words)
     }
 
     /// Parses standard output as JSON.
     #[track_caller]
     pub fn json(&self) -> serde_json::Value {
-        let said = serde_json::from_str(&self.stdout);
-        said.unwrap_or_else(|e| panic!("{e}: {}", self.stdout))
+        let json = serde_json::from_str(&self.stdout);
+        json.unwrap_or_else(|e| panic!("{e}: {}", self.stdout))
     }
 
     /// Checks that standard error contains `words`.
     #[track_caller]
-    pub fn expect_said(self, words: &str) -> Self {
+    pub fn expect_stderr(self, words: &str) -> Self {
         check_has(&self.stderr, &[words]);
         self
     }
 
     /// Checks that standard output contains `words`.
     #[track_caller]
-    pub fn expect_printed(self, words: &str) -> Self {
+    pub fn expect_stdout(self, words: &str) -> Self {
         check_has(&self.stdout, &[words]);
         self
     }

@@ -13,13 +13,13 @@ sys.exit(f'{sys.executable} has no {missing}: name one that has with DRIML_TEST_
 
 /// Returns the Python that `DRIML_TEST_PYTHON` names, or `python3`, if it has all these modules. Otherwise returns `None` and reports the
 /// test as skipped.
-pub fn python_with(modules: &[&str]) -> Option<String> {
+pub fn find_python(modules: &[&str]) -> Option<String> {
     let python = std::env::var("DRIML_TEST_PYTHON").unwrap_or_else(|_| "python3".into());
     succeeds(Command::new(&python).args(["-c", FIND]).args(modules)).then_some(python)
 }
 
 /// Runs `script` with `args` in a Python, and returns what it prints.
-pub fn run(python: &str, script: &[&str], args: &[&str]) -> String {
+pub fn run_script(python: &str, script: &[&str], args: &[&str]) -> String {
     let mut command = Command::new(python);
     // Write no `__pycache__` beside the scripts.
     command.env("PYTHONDONTWRITEBYTECODE", "1");

@@ -37,7 +37,7 @@ pub struct RunFolder {
 }
 
 /// Returns the number of updates in the name of a checkpoint's folder.
-pub fn updates_of(checkpoint: &Path) -> u64 {
+pub fn checkpoint_updates(checkpoint: &Path) -> u64 {
     let name = checkpoint.file_name().unwrap().to_str().unwrap();
     let updates = name.strip_prefix("checkpoint-").unwrap();
     updates.parse().unwrap()
@@ -100,7 +100,7 @@ impl RunFolder {
 
     /// Returns one column of `metrics.csv` as numbers; no cell may be empty.
     #[track_caller]
-    pub fn numbers(&self, name: &str) -> Vec<f64> {
+    pub fn numeric_column(&self, name: &str) -> Vec<f64> {
         let cells = self.column(name);
         cells.iter().map(|it| it.parse().unwrap()).collect()
     }
@@ -159,7 +159,7 @@ impl RunFolder {
 
     /// Returns the number of updates in the newest checkpoint.
     pub fn saved_updates(&self) -> u64 {
-        updates_of(&self.newest_checkpoint())
+        checkpoint_updates(&self.newest_checkpoint())
     }
 
     /// Returns the SHA-256 of the newest checkpoint's weights as actors receive them: only torso and head, as a safetensors file.
@@ -177,11 +177,11 @@ impl RunFolder {
     #[track_caller]
     pub fn check(&self, outcome: Outcome) -> Summary {
         let summary = self.summary();
-        let (replay, said) = (&summary.replay, format!("{summary:#?}"));
-        assert_eq!(summary.outcome, outcome, "{said}");
+        let (replay, details) = (&summary.replay, format!("{summary:#?}"));
+        assert_eq!(summary.outcome, outcome, "{details}");
         check_nothing_lost(replay);
-        assert_eq!(replay.messages_refused, 0, "{said}");
-        assert_eq!(summary.frames, replay.transitions_inserted, "{said}");
+        assert_eq!(replay.messages_refused, 0, "{details}");
+        assert_eq!(summary.frames, replay.transitions_inserted, "{details}");
         // A replay that was kept on disk has counted k over the whole run.
         let before = match self.path.join("replay").is_dir() {
             true => 0,
@@ -192,9 +192,9 @@ impl RunFolder {
         let served = replay.rows_sampled + replay.rows_unlearned;
         // A killed server has lost its counts of k since its last snapshot.
         let may_lack = summary.resumed_after_updates > 0 || summary.replay_servers_restarted > 0;
-        assert!(known == served || may_lack && known < served, "{said}");
+        assert!(known == served || may_lack && known < served, "{details}");
         let is_timed = summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0;
-        assert!(is_timed, "{said}");
+        assert!(is_timed, "{details}");
 
         self.check_episodes(&summary);
         for name in ["metrics.csv", "episodes.csv"] {
@@ -217,7 +217,7 @@ impl RunFolder {
     #[track_caller]
     pub fn check_finished(&self) -> Summary {
         let summary = self.check(Outcome::Finished);
-        let said = format!("{summary:#?}");
+        let details = format!("{summary:#?}");
         let [rows, warmup, planned, period] = [
             "learner.batch_size",
             "replay.warmup_transitions",
@@ -225,12 +225,12 @@ impl RunFolder {
             "learner.publish_period_updates",
         ]
         .map(|name| self.setting(name) as u64);
-        assert!(summary.frames >= planned, "{said}");
+        assert!(summary.frames >= planned, "{details}");
         let learned = summary.updates * rows;
-        assert_eq!(summary.replay.rows_sampled, learned, "{said}");
+        assert_eq!(summary.replay.rows_sampled, learned, "{details}");
         let ratio = self.setting("replay.replay_ratio");
         let allowed = ratio * (summary.frames - warmup) as f64 / rows as f64;
-        assert_eq!(summary.updates, allowed as u64, "{said}");
+        assert_eq!(summary.updates, allowed as u64, "{details}");
         // One version is published before the first update, and one for updates after the last full period. A resumed run skips the
         // versions that may have been published since its checkpoint.
         let publications = summary.updates / period;
@@ -239,7 +239,7 @@ impl RunFolder {
             _ => u64::MAX,
         };
         let allowed = publications + 1..=most;
-        assert!(allowed.contains(&summary.weights_version), "{said}");
+        assert!(allowed.contains(&summary.weights_version), "{details}");
         summary
     }
 }

@@ -9,7 +9,7 @@ use std::{io::Write, process::Command, thread};
 pub fn skip(why: &str) {
     let test = thread::current();
     let name = test.name().unwrap_or("a test");
-    note(&format!("skipped: {name} ({why})"));
+    print_line(&format!("skipped: {name} ({why})"));
 }
 
 /// Returns whether a command that a test needs succeeds. If not, reports the test as skipped; the caller must then return.
@@ -24,7 +24,7 @@ pub fn succeeds(command: &mut Command) -> bool {
 }
 
 /// Writes a line to stderr that the test runner does not capture.
-pub fn note(line: &str) {
+pub fn print_line(line: &str) {
     std::io::stderr()
         .write_all(format!("{line}\n").as_bytes())
         .expect("stderr is there while tests run");

@@ -13,8 +13,8 @@ use nix::{
 };
 
 /// The durations for which the process runs and is stopped, in turn.
-const RUNS: Duration = Duration::from_millis(2);
-const STANDS: Duration = Duration::from_millis(98);
+const RUN_DURATION: Duration = Duration::from_millis(2);
+const STOP_DURATION: Duration = Duration::from_millis(98);
 
 /// Keeps a process slow until this value is dropped.
 #[derive(Debug)]
@@ -34,9 +34,9 @@ impl SlowMachine {
         let work = move || {
             loop {
                 signal(Signal::SIGSTOP);
-                let is_done = until.wait_timeout(STANDS);
+                let is_done = until.wait_timeout(STOP_DURATION);
                 signal(Signal::SIGCONT);
-                if is_done || until.wait_timeout(RUNS) {
+                if is_done || until.wait_timeout(RUN_DURATION) {
                     return;
                 }
             }

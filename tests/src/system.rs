@@ -20,7 +20,7 @@ use nix::{
 use crate::{
     certificates::Certificates,
     client::{Client, NAMESPACE, connect, quic_endpoint},
-    process::{Ended, Process},
+    process::{Exit, Process},
     run_folder::{Outcome, RunFolder, Summary},
     skipped::succeeds,
     waiting::{wait_for, wait_until},
@@ -40,17 +40,17 @@ pub struct TestSystem {
     /// The flag that makes processes use TLS; empty without TLS.
     tls: &'static str,
     /// The number of updates after which newly started learners pause; with [`NEVER`] they do not pause.
-    held_at: AtomicU64,
+    pause_at_updates: AtomicU64,
 }
 
 /// More updates than any learner makes.
 const NEVER: u64 = u64::MAX;
-/// The file whose creation releases held learners.
-const GO: &str = "go";
+/// The file whose creation releases paused learners.
+const GO_FILE: &str = "go";
 
 /// A process of a system that is still running.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Survivor {
+pub struct RunningProcess {
     /// The process ID.
     pub pid: i32,
     /// The arguments after the program's name.
@@ -73,12 +73,12 @@ impl TestSystem {
             folder,
             mark: format!("{}-{count}", std::process::id()),
             tls: "",
-            held_at: AtomicU64::new(NEVER),
+            pause_at_updates: AtomicU64::new(NEVER),
         }
     }
 
     /// Returns this system with another endpoint for its processes.
-    pub fn at(mut self, endpoint: String) -> Self {
+    pub fn with_endpoint(mut self, endpoint: String) -> Self {
         self.endpoint = endpoint;
         self
     }
@@ -91,24 +91,24 @@ impl TestSystem {
         }
         Certificates::make(self.path("tls"), "--actors 3");
         self.tls = " --tls-dir tls";
-        Some(self.at(quic_endpoint()))
+        Some(self.with_endpoint(quic_endpoint()))
     }
 
     /// Returns the certificates of a system that uses TLS.
     pub fn certificates(&self) -> Certificates {
-        Certificates::at(self.path("tls"))
+        Certificates::in_folder(self.path("tls"))
     }
 
-    /// Makes learners that start from now on pause after `updates` updates, and report no more, until [`Self::let_go`]. The run thus cannot
-    /// end before a slow test has finished its checks.
-    pub fn hold_at(&self, updates: u64) {
-        assert!(!self.path(GO).exists(), "learners were let go before");
-        self.held_at.store(updates, Ordering::Relaxed);
+    /// Makes learners that start from now on pause after `updates` updates, and report no more, until [`Self::release_learners`]. The run
+    /// thus cannot end before a slow test has finished its checks.
+    pub fn pause_learners_at(&self, updates: u64) {
+        assert!(!self.path(GO_FILE).exists(), "learners were let go before");
+        self.pause_at_updates.store(updates, Ordering::Relaxed);
     }
 
-    /// Releases the held learners; learners that start later are not held.
-    pub fn let_go(&self) {
-        fs::write(self.path(GO), "").unwrap();
+    /// Releases the paused learners; learners that start later do not pause.
+    pub fn release_learners(&self) {
+        fs::write(self.path(GO_FILE), "").unwrap();
     }
 
     /// A path in the system's folder.
@@ -123,7 +123,7 @@ impl TestSystem {
     }
 
     /// Returns the names of the entries of a folder in the system's folder.
-    pub fn names(&self, folder: &str) -> Vec<String> {
+    pub fn file_names(&self, folder: &str) -> Vec<String> {
         let entries = fs::read_dir(self.path(folder)).unwrap();
         let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
         names.collect()
@@ -136,8 +136,8 @@ impl TestSystem {
 
     /// Checks that no process is left and that the run in the folder `run` has this outcome. Returns the run's summary.
     #[track_caller]
-    pub fn check_over(&self, outcome: Outcome) -> Summary {
-        assert_eq!(self.survivors(), []);
+    pub fn check_outcome(&self, outcome: Outcome) -> Summary {
+        assert_eq!(self.running_processes(), []);
         let summary = self.run_folder("run").summary();
         assert_eq!(summary.outcome, outcome, "{summary:#?}");
         summary
@@ -149,22 +149,22 @@ impl TestSystem {
     }
 
     /// Returns the endpoint of a unix socket in the system's folder.
-    pub fn socket(&self, name: &str) -> String {
+    pub fn socket_endpoint(&self, name: &str) -> String {
         format!("unixsock-stream/{}", self.path(name).display())
     }
 
     /// Returns the arguments of a `local` run in the folder `run` at this system's endpoint.
-    pub fn local(&self, flags: &str) -> String {
-        self.listening(&format!("local {flags} --run-dir run"))
+    pub fn local_args(&self, flags: &str) -> String {
+        self.listen_args(&format!("local {flags} --run-dir run"))
     }
 
     /// Returns the arguments of a command that listens at this system's endpoint.
-    pub fn listening(&self, command: &str) -> String {
+    pub fn listen_args(&self, command: &str) -> String {
         format!("{command} --listen {}{}", self.endpoint, self.tls)
     }
 
     /// Returns the arguments of a command that connects to this system's replay server.
-    pub fn connected(&self, command: &str) -> String {
+    pub fn connect_args(&self, command: &str) -> String {
         format!("{command} --connect {}{}", self.endpoint, self.tls)
     }
 
@@ -189,23 +189,29 @@ impl TestSystem {
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
             .env_remove("DRIML_LOG");
-        let updates = self.held_at.load(Ordering::Relaxed);
+        let updates = self.pause_at_updates.load(Ordering::Relaxed);
         if updates != NEVER {
-            let go = self.path(GO);
+            let go = self.path(GO_FILE);
             command.env(fail_point::HOLD, format!("{updates} {}", go.display()));
         }
         command
     }
 
     /// Runs the program until it exits.
-    pub fn run(&self, args: &str) -> Ended {
+    pub fn run(&self, args: &str) -> Exit {
         self.start(args).wait()
     }
 
     /// Runs the program and checks that it succeeds.
     #[track_caller]
-    pub fn run_ok(&self, args: &str) -> Ended {
+    pub fn run_ok(&self, args: &str) -> Exit {
         self.run(args).expect_code(0)
+    }
+
+    /// Runs the program, checks that it succeeds, and parses its standard output as JSON.
+    #[track_caller]
+    pub fn run_json(&self, args: &str) -> serde_json::Value {
+        self.run_ok(args).json()
     }
 
     /// Runs `local` with the run folder `run_dir` until it exits. Returns the summary, checked by [`RunFolder::check_finished`].
@@ -217,22 +223,22 @@ impl TestSystem {
 
     /// Runs the program and checks that it fails with `words` on standard error.
     #[track_caller]
-    pub fn fails(&self, args: &str, words: &str) -> Ended {
+    pub fn fails(&self, args: &str, words: &str) -> Exit {
         self.run(args).expect_error(words)
     }
 
     /// Runs the program and checks that it rejects its configuration (exit code 64) with `words` on standard error.
     #[track_caller]
-    pub fn refuses(&self, args: &str, words: &str) -> Ended {
-        self.run(args).expect_code(64).expect_said(words)
+    pub fn rejects(&self, args: &str, words: &str) -> Exit {
+        self.run(args).expect_code(64).expect_stderr(words)
     }
 
-    /// Checks a table of calls with [`Self::refuses`]. Each line holds a call, ` => `, and the words that standard error must contain.
+    /// Checks a table of calls with [`Self::rejects`]. Each line holds a call, ` => `, and the words that standard error must contain.
     #[track_caller]
-    pub fn refuses_each(&self, table: &str) {
+    pub fn rejects_each(&self, table: &str) {
         for line in table.trim().lines() {
             let (call, words) = line.split_once(" => ").expect("a call => words");
-            self.refuses(call.trim(), words);
+            self.rejects(call.trim(), words);
         }
     }
 
@@ -244,13 +250,13 @@ impl TestSystem {
 
     /// Returns the arguments of a replay server at this system's endpoint, with the settings in `flags`. Like the learner, the server keeps
     /// answering requests after the run is over.
-    pub fn replay_server(&self, flags: &str) -> String {
-        self.listening(&format!("replay-server --keep-alive {flags}"))
+    pub fn replay_server_args(&self, flags: &str) -> String {
+        self.listen_args(&format!("replay-server --keep-alive {flags}"))
     }
 
     /// Starts such a replay server. With TLS, waits until the server listens.
     pub fn start_replay_server(&self, flags: &str) -> Process {
-        let mut server = self.start_process(&self.replay_server(flags));
+        let mut server = self.start_process(&self.replay_server_args(flags));
         if !self.tls.is_empty() {
             server.wait_for_stderr("replay server listens");
         }
@@ -259,12 +265,12 @@ impl TestSystem {
 
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.
     pub fn start_learner(&self, run_dir: &str) -> Process {
-        self.start_process(&self.connected(&format!("learner --keep-alive --run-dir {run_dir}")))
+        self.start_process(&self.connect_args(&format!("learner --keep-alive --run-dir {run_dir}")))
     }
 
     /// Starts an actor.
     pub fn start_actor(&self, id: u32) -> Process {
-        self.start_process(&self.connected(&format!("actor --id {id}")))
+        self.start_process(&self.connect_args(&format!("actor --id {id}")))
     }
 
     /// Connects a client to the run at this system's endpoint once its replay server answers. With TLS, the client is an observer.
@@ -286,7 +292,7 @@ impl TestSystem {
     }
 
     /// Returns every process of this system that still runs, including children of processes that have ended.
-    pub fn survivors(&self) -> Vec<Survivor> {
+    pub fn running_processes(&self) -> Vec<RunningProcess> {
         let mark = format!("{MARK}={}", self.mark);
         let processes = fs::read_dir("/proc").unwrap().flatten();
         let carries_mark = |folder: &Path| {
@@ -295,7 +301,7 @@ impl TestSystem {
                 .split(|&byte| byte == 0)
                 .any(|variable| variable == mark.as_bytes())
         };
-        let survivor = |entry: fs::DirEntry| {
+        let running = |entry: fs::DirEntry| {
             let pid = entry.file_name().to_str()?.parse().ok()?;
             // A process that has ended but was not waited for (a zombie) has no environment any more.
             carries_mark(&entry.path()).then_some(())?;
@@ -307,27 +313,27 @@ impl TestSystem {
             let args = words
                 .map(|word| String::from_utf8_lossy(word).into_owned())
                 .collect();
-            Some(Survivor { pid, args })
+            Some(RunningProcess { pid, args })
         };
-        processes.filter_map(survivor).collect()
+        processes.filter_map(running).collect()
     }
 
     /// Waits for a process with this `role` (`learner`, `actor`, `replay-server`) and returns it.
-    pub fn find_process(&self, role: &str) -> Survivor {
+    pub fn find_process(&self, role: &str) -> RunningProcess {
         wait_for(&format!("a process {role}"), || self.find_process_now(role))
     }
 
     /// Returns the first process with this `role` that runs now, if any.
-    pub fn find_process_now(&self, role: &str) -> Option<Survivor> {
-        let is_process = |it: &Survivor| it.args.first().is_some_and(|first| first == role);
-        self.survivors().into_iter().find(is_process)
+    pub fn find_process_now(&self, role: &str) -> Option<RunningProcess> {
+        let is_process = |it: &RunningProcess| it.args.first().is_some_and(|first| first == role);
+        self.running_processes().into_iter().find(is_process)
     }
 
     /// Kills every process of this system, launchers first.
     pub fn kill_all(&self) {
         // A dying launcher may start a child while the list is made; the next list contains that child.
         for _ in 0..10 {
-            let mut left = self.survivors();
+            let mut left = self.running_processes();
             if left.is_empty() {
                 return;
             }
@@ -340,11 +346,12 @@ impl TestSystem {
 
     /// Waits until no process of this system is left.
     pub fn wait_until_all_have_ended(&self) {
-        wait_until("the end of all processes", || self.survivors().is_empty());
+        let all_ended = || self.running_processes().is_empty();
+        wait_until("the end of all processes", all_ended);
     }
 }
 
-impl Survivor {
+impl RunningProcess {
     /// Returns a number from `/proc/PID/status`, such as `VmRSS`.
     pub fn status(&self, name: &str) -> u64 {
         let text = fs::read_to_string(format!("/proc/{}/status", self.pid)).unwrap();

@@ -7,23 +7,24 @@ use std::{
 
 /// The time-out of each wait. The longest waits are for experiments of many runs: three minutes if four other processes share the same two
 /// cores. The time-out of a CI job is longer.
-const DEADLINE: Duration = Duration::from_secs(600);
+const TIMEOUT: Duration = Duration::from_secs(600);
 /// Limits of the pause between two checks of a condition. The pause is as long as a check, because a check may start a process.
-const LOOK_AGAIN: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(200)];
+const POLL_INTERVAL: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(200)];
 
-/// Waits until `look` returns a value, and returns it. Panics at the deadline.
-pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+/// Waits until `poll` returns a value, and returns it. Panics at the deadline.
+pub fn wait_for<T>(what: &str, mut poll: impl FnMut() -> Option<T>) -> T {
     let started = Instant::now();
     loop {
-        let looked = Instant::now();
-        if let Some(seen) = look() {
-            return seen;
+        let polled_at = Instant::now();
+        if let Some(value) = poll() {
+            return value;
         }
         assert!(
-            started.elapsed() < DEADLINE,
-            "waited {DEADLINE:?} for: {what}"
+            started.elapsed() < TIMEOUT,
+            "waited {TIMEOUT:?} for: {what}"
         );
-        thread::sleep(looked.elapsed().clamp(LOOK_AGAIN[0], LOOK_AGAIN[1]));
+        let [shortest, longest] = POLL_INTERVAL;
+        thread::sleep(polled_at.elapsed().clamp(shortest, longest));
     }
 }
 
@@ -33,7 +34,7 @@ pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
 }
 
 /// Calls `work` for all items at the same time, one thread each. Meant for work that mostly waits.
-pub fn at_once<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(T) + Sync) {
+pub fn in_parallel<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(T) + Sync) {
     let work = &work;
     thread::scope(|scope| {
         for item in items {

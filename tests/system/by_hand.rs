@@ -10,13 +10,14 @@ use nix::sys::signal::Signal::{SIGHUP, SIGINT, SIGTERM};
 use crate::{LONG, SHORT, closed_terminal::skipped_under_nohup, system};
 
 /// Starts a run by hand, and checks that its processes find each other and exit in order.
-fn finds_each_other_and_ends_in_order(system: &TestSystem) {
+fn check_whole_run(system: &TestSystem) {
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
     let learner = system.start_learner("run");
     // Actors learn from the replay server that the run is complete, and exit.
     for (id, actor) in [0, 2].map(|id| (id, system.start_actor(id))) {
-        actor.wait_ok().expect_said(&format!("actor {id} leaves: "));
+        let leaves = format!("actor {id} leaves: ");
+        actor.wait_ok().expect_stderr(&leaves);
     }
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
@@ -30,31 +31,27 @@ fn finds_each_other_and_ends_in_order(system: &TestSystem) {
     let run = system.run_folder("run");
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
-    learner
-        .stop()
-        .expect_code(0)
-        .expect_said("finished after 540 updates");
+    let exit = learner.stop().expect_code(0);
+    exit.expect_stderr("finished after 540 updates");
     // The learner's run folder can be evaluated like that of a launched run.
     system.run_ok("evaluate --run run --episodes 5");
     // The learner stayed alive after the end of the run, so its stop does not make the run unfinished.
     client.wait_for_replay("the end of the run", |it| it.learner_finished);
     drop(client);
-    server
-        .stop()
-        .expect_code(0)
-        .expect_said("stops with 1280 transitions stored");
-    assert_eq!(system.survivors(), []);
+    let exit = server.stop().expect_code(0);
+    exit.expect_stderr("stops with 1280 transitions stored");
+    assert_eq!(system.running_processes(), []);
 }
 
 #[test]
 fn processes_find_each_other_and_end_in_order() {
-    finds_each_other_and_ends_in_order(&system());
+    check_whole_run(&system());
 }
 
 #[test]
 fn so_they_do_over_tls() {
     if let Some(system) = system().over_tls() {
-        finds_each_other_and_ends_in_order(&system);
+        check_whole_run(&system);
     }
 }
 
@@ -63,7 +60,7 @@ fn processes_end_by_themselves_when_the_run_is_over() {
     for shards in [1, 2] {
         let system = system();
         let endpoints: Vec<_> = (0..shards)
-            .map(|shard| system.socket(&format!("{shard}.sock")))
+            .map(|shard| system.socket_endpoint(&format!("{shard}.sock")))
             .collect();
         let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
         let mut calls = Vec::new();
@@ -79,7 +76,7 @@ fn processes_end_by_themselves_when_the_run_is_over() {
         for process in processes {
             process.wait_ok();
         }
-        assert_eq!(system.survivors(), []);
+        assert_eq!(system.running_processes(), []);
         system.run_ok("evaluate --run run --episodes 2");
     }
 }
@@ -103,7 +100,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         client.wait_for_replay("both actors", |replay| replay.actors == 2);
         let ends = |process: Process, says: &str| {
             process.signal(signal);
-            process.wait().expect_code(130).expect_said(says)
+            process.wait().expect_code(130).expect_stderr(says)
         };
         for (id, actor) in (0..).zip(actors) {
             ends(actor, &format!("actor {id} leaves: "));
@@ -118,7 +115,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         client.wait_for_replay("a waiting learner", |replay| {
             replay.waiting == Waiting::LearnerWaitsForActors
         });
-        ends(learner, "saved run/checkpoints/checkpoint-").expect_said("finished after ");
+        ends(learner, "saved run/checkpoints/checkpoint-").expect_stderr("finished after ");
         assert!(!system.run_folder("run").checkpoints().is_empty());
         drop(client);
         ends(server, "replay server stops");
@@ -128,8 +125,8 @@ fn processes_that_are_told_to_stop_lose_nothing() {
 #[test]
 fn an_actor_killed_and_started_again_continues() {
     let system = system();
-    // Hold the learner, so that the first actor cannot finish the run before it is killed.
-    system.hold_at(100);
+    // Pause the learner, so that the first actor cannot finish the run before it is killed.
+    system.pause_learners_at(100);
     let flags = "--env chain --preset smoke --frames 4008 --set replay.warmup_transitions=2000";
     let _server = system.start_replay_server(&format!(
         "--agent driml-ada {flags} --set replay.replay_ratio=2"
@@ -142,7 +139,7 @@ fn an_actor_killed_and_started_again_continues() {
     let before = client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
     assert!(!before.finished);
 
-    system.let_go();
+    system.release_learners();
     let again = system.start_actor(3);
     again.wait_ok();
     client.wait_for_the_last_update();
@@ -157,7 +154,7 @@ fn an_actor_killed_and_started_again_continues() {
 #[test]
 fn a_process_by_hand_settles_its_environment() {
     let system = system();
-    let server = system.replay_server("--env chain --preset smoke");
+    let server = system.replay_server_args("--env chain --preset smoke");
     let variables = "env -u MALLOC_ARENA_MAX CANDLE_NUM_THREADS=3";
     let mut server = system.start_process(&format!("{variables} DRIML {server}"));
     server.wait_for_stderr("replay server listens on ");

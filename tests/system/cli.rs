@@ -16,7 +16,7 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
     fs::create_dir(&used).unwrap();
     fs::write(used.join("metrics.csv"), "old").unwrap();
     fs::write(system.path("odd.toml"), "[run]\nworld = \"chain\"\n").unwrap();
-    let said = |call: &str| {
+    let stderr_of = |call: &str| {
         let mut command = system.command(call);
         // The usage text contains the name by which the program was called.
         command.arg0("driml");
@@ -26,7 +26,7 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
     };
     let rows = include_str!("snapshots/refusals.txt").lines();
     let answered = rows.filter_map(|row| match row.strip_prefix("$ driml ") {
-        Some(call) => Some(format!("{row}\n{}", said(call))),
+        Some(call) => Some(format!("{row}\n{}", stderr_of(call))),
         None => row.starts_with('#').then(|| format!("{row}\n")),
     });
     expect_file!["snapshots/refusals.txt"].assert_eq(&answered.collect::<String>());
@@ -39,7 +39,7 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
 fn a_call_that_asks_for_help_or_leaves_the_command_out_prints_it() {
     let system = system();
     for call in ["", "bench", "experiment"] {
-        system.refuses(call, "Usage: ");
+        system.rejects(call, "Usage: ");
     }
     for call in ["--help", "--version", "local --help", "presets"] {
         let ended = system.run_ok(call);
@@ -92,9 +92,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
         ("learner --kernels --precision bf16", 6, 6),
         ("replay", 17, 0),
     ] {
-        let report = system
-            .run_ok(&format!("bench {bench} --quick --json -"))
-            .json();
+        let report = system.run_json(&format!("bench {bench} --quick --json -"));
         let figures = report["figures"].as_array().unwrap();
         assert!(bench.starts_with(report["bench"].as_str().unwrap()));
         assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
@@ -119,7 +117,7 @@ fn completions_and_pages() {
         ("fish", "complete -c driml"),
     ] {
         let ended = system.run_ok(&format!("completions {shell}"));
-        ended.expect_printed(text).expect_printed("eval-interval");
+        ended.expect_stdout(text).expect_stdout("eval-interval");
     }
     system.run_ok("man man1");
     let page = system.read("man1/driml-train.1");

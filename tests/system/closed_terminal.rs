@@ -20,7 +20,7 @@ use nix::{
     sys::signal::Signal,
 };
 
-use crate::{LONG, PROCESSES, launched, system};
+use crate::{LONG, PROCESSES, start_run, system};
 
 /// A terminal whose window a test can close. Until then a thread reads the terminal's output, as a window does.
 struct Window {
@@ -76,17 +76,17 @@ impl Window {
 }
 
 /// Starts the program with the arguments `run`, with standard output and standard error redirected to `out` and `err`.
-fn start(system: &TestSystem, run: &str, out: impl Into<Stdio>, err: impl Into<Stdio>) -> Child {
+fn spawn(system: &TestSystem, run: &str, out: impl Into<Stdio>, err: impl Into<Stdio>) -> Child {
     let mut command = system.command(run);
     command.stdin(Stdio::null()).stdout(out).stderr(err);
     command.spawn().unwrap()
 }
 
 /// Checks that the launcher exits as after an interrupt: everything is saved, and no process is left.
-fn check_saved(system: &TestSystem, mut launcher: Child) {
+fn check_ended_saved(system: &TestSystem, mut launcher: Child) {
     let ended = wait_for("the launcher's end", || launcher.try_wait().unwrap());
     assert_eq!(ended.code(), Some(130), "{ended}");
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
     let summary = system.run_folder("run").check(Outcome::Interrupted);
     assert!(summary.updates > 100, "{summary:#?}");
 }
@@ -95,14 +95,14 @@ fn check_saved(system: &TestSystem, mut launcher: Child) {
 fn a_closed_window_saves_the_run() {
     let system = system();
     let (window, terminal) = Window::open();
-    let run = system.local(&format!("--agent driml-ada {LONG}"));
-    let launcher = start(&system, &run, terminal.try_clone().unwrap(), terminal);
+    let run = system.local_args(&format!("--agent driml-ada {LONG}"));
+    let launcher = spawn(&system, &run, terminal.try_clone().unwrap(), terminal);
     system.connect().wait_for_updates(100);
     wait_until("the progress bar", || {
         window.shown().contains("replay ratio 7")
     });
     window.close();
-    check_saved(&system, launcher);
+    check_ended_saved(&system, launcher);
 }
 
 #[test]
@@ -110,14 +110,14 @@ fn a_pipe_closed_after_two_lines_saves_the_run() {
     let system = system();
     // `driml local ... 2>&1 | head -2`
     let (reader, writer) = pipe().unwrap();
-    let run = system.local(&format!("--agent driml-ada {LONG}"));
-    let launcher = start(&system, &run, writer.try_clone().unwrap(), writer);
+    let run = system.local_args(&format!("--agent driml-ada {LONG}"));
+    let launcher = spawn(&system, &run, writer.try_clone().unwrap(), writer);
     let mut lines = BufReader::new(reader).lines();
     let head = [lines.next(), lines.next()];
     assert!(head.iter().flatten().all(|line| line.is_ok()), "{head:?}");
     system.connect().wait_for_updates(100);
     drop(lines);
-    check_saved(&system, launcher);
+    check_ended_saved(&system, launcher);
 }
 
 #[test]
@@ -125,10 +125,10 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     let system = system();
     let (reader, writer) = pipe().unwrap();
     let run = format!("local --agent c51 {LONG} --lockstep --run-dir run");
-    let launcher = start(&system, &run, Stdio::null(), writer);
+    let launcher = spawn(&system, &run, Stdio::null(), writer);
     system.run_folder("run").wait_for_updates(100);
     drop(reader);
-    check_saved(&system, launcher);
+    check_ended_saved(&system, launcher);
 }
 
 /// Returns whether hangups are ignored, as under `nohup`, and then reports the test as skipped. Asks the kernel, not the program.
@@ -149,12 +149,12 @@ fn a_hangup_ends_a_launched_run_once() {
         return;
     }
     let system = system();
-    let process = launched(&system, 100);
+    let process = start_run(&system, 100);
     // The kernel and a shell may each send a hangup.
     process.signal(Signal::SIGHUP);
     process.signal(Signal::SIGHUP);
     process.wait().expect_code(130);
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
     system.run_folder("run").check(Outcome::Interrupted);
 }
 
@@ -162,7 +162,7 @@ fn a_hangup_ends_a_launched_run_once() {
 #[test]
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
-    let run = system.local(&format!("--agent driml-ada {LONG}"));
+    let run = system.local_args(&format!("--agent driml-ada {LONG}"));
     let process = system.start(&format!(
         "sh -c 'trap \"\" HUP; exec \"$0\" \"$@\"' DRIML {run}"
     ));
@@ -182,7 +182,7 @@ fn a_run_that_is_to_ignore_hangups_does() {
 #[ignore = "three minutes: cargo nextest run --workspace --run-ignored only -E 'test(stopped_for_long)'"]
 fn a_run_that_was_stopped_for_long_resumes() {
     let system = system();
-    let mut process = launched(&system, 100);
+    let mut process = start_run(&system, 100);
     let all = PROCESSES.map(|role| system.find_process(role));
     let signal = |launcher: &Process, signal| {
         launcher.signal(signal);
@@ -195,7 +195,7 @@ fn a_run_that_was_stopped_for_long_resumes() {
     let before = client.wait_for_updates(100);
     wait_until("500 more updates", || {
         assert!(process.is_running(), "{}", process.stderr());
-        let learner = client.learner();
+        let learner = client.learner_status();
         learner.is_some_and(|it| it.updates > before.updates + 500)
     });
     process.stop().expect_code(130);

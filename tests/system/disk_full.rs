@@ -40,13 +40,13 @@ impl Drop for Disk {
 }
 
 /// Writes a file until the disk is full.
-pub(crate) fn fill(file: impl AsRef<Path>) {
+pub(crate) fn fill_disk(file: impl AsRef<Path>) {
     let mut file = File::create(file).unwrap();
     while file.write_all(&[0; 4096]).is_ok() {}
 }
 
 /// A checkpoint period that no run reaches, in updates.
-pub(crate) const NEVER: u32 = 100_000_000;
+pub(crate) const PERIOD_NEVER: u32 = 100_000_000;
 
 /// Calls `test` with a run that has made updates and has logged `words` because its disk is full; the path is that of the file that fills
 /// the disk. The run saves a checkpoint every `checkpoint_period` updates. Then checks that no process and no temporary file is left.
@@ -61,15 +61,15 @@ fn with_full_disk(
     };
     let period = format!("--set learner.checkpoint_period_updates={checkpoint_period}");
     let run = format!("local --agent c51 {LONG} {period} --run-dir disk/run");
-    let mut process = system.start(&system.listening(&run));
+    let mut process = system.start(&system.listen_args(&run));
     system.connect().wait_for_updates(100);
     let filler = system.path("disk/filler");
-    fill(&filler);
+    fill_disk(&filler);
     process.wait_for_stderr(words);
     test(&system, process, filler);
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
     for folder in ["disk/run", "disk/run/checkpoints"] {
-        let names = system.names(folder);
+        let names = system.file_names(folder);
         let temporary = names.iter().find(|name| name.contains("tmp"));
         assert_eq!(temporary, None);
     }
@@ -78,26 +78,26 @@ fn with_full_disk(
 const NOT_WRITTEN: &str = "cannot be written: No space left";
 
 /// Returns how often `words` occur in `said`.
-fn times(said: &str, words: &str) -> usize {
-    said.matches(words).count()
+fn occurrences(text: &str, words: &str) -> usize {
+    text.matches(words).count()
 }
 
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
-    with_full_disk(NEVER, NOT_WRITTEN, |system, process, filler| {
+    with_full_disk(PERIOD_NEVER, NOT_WRITTEN, |system, process, filler| {
         let client = system.connect();
-        let then = client.learner().unwrap().updates;
+        let then = client.learner_status().unwrap().updates;
         client.wait_for_updates(then + 200);
         fs::remove_file(filler).unwrap();
         let run = system.run_folder("disk/run");
-        let now = client.learner().unwrap().updates;
+        let now = client.learner_status().unwrap().updates;
         run.wait_for_updates(now);
         let ended = process.interrupt().expect_code(130);
-        assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
-        assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
+        assert_eq!(occurrences(&ended.stderr, "No space left"), 1, "{ended:#?}");
+        assert_eq!(occurrences(&ended.stderr, "are lost"), 0, "{ended:#?}");
         run.check(Outcome::Interrupted);
         // Times increase strictly, and frames never decrease.
-        let [seconds, frames] = ["seconds", "frames"].map(|name| run.numbers(name));
+        let [seconds, frames] = ["seconds", "frames"].map(|name| run.numeric_column(name));
         assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
         assert!(frames.is_sorted(), "{frames:?}");
     });
@@ -105,7 +105,7 @@ fn a_run_continues_while_the_disk_is_full() {
 
 #[test]
 fn the_first_error_is_the_one_shown() {
-    with_full_disk(NEVER, NOT_WRITTEN, |_, process, filler| {
+    with_full_disk(PERIOD_NEVER, NOT_WRITTEN, |_, process, filler| {
         let ended = process.interrupt().expect_code(1);
         // The run fails because the checkpoint could not be saved. The error about the summary is only logged before.
         let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
@@ -120,7 +120,7 @@ fn the_first_error_is_the_one_shown() {
         );
         for line in ended.stderr.lines() {
             assert!(
-                times(line, "No space left") <= 1,
+                occurrences(line, "No space left") <= 1,
                 "a cause is logged once: {line}"
             );
         }
@@ -132,12 +132,12 @@ fn the_first_error_is_the_one_shown() {
 fn a_checkpoint_that_finds_no_room_is_tried_again() {
     with_full_disk(200, "No space left", |system, process, filler| {
         let client = system.connect();
-        let then = client.learner().unwrap().updates;
+        let then = client.learner_status().unwrap().updates;
         client.wait_for_updates(then + 600);
         fs::remove_file(filler).unwrap();
-        let now = client.learner().unwrap().updates;
+        let now = client.learner_status().unwrap().updates;
         wait_until("a checkpoint after that", || {
-            let names = system.names("disk/run/checkpoints");
+            let names = system.file_names("disk/run/checkpoints");
             let updates = |name: &String| name.strip_prefix("checkpoint-")?.parse::<u64>().ok();
             names.iter().any(|name| updates(name) > Some(now))
         });
@@ -162,10 +162,10 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let client = system.connect();
     client.wait_for_updates(100);
     let filler = system.path("disk/filler");
-    fill(&filler);
+    fill_disk(&filler);
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
-    let stopped = client.replay().unwrap();
-    let ask = system.connected("status");
+    let stopped = client.replay_status().unwrap();
+    let status = system.connect_args("status");
     let words = [
         "replay on disk: ",
         "REFUSED for",
@@ -174,21 +174,21 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         "to do: the disk of the replay server on",
     ];
     wait_until("a status that says it", || {
-        let said = system.run(&ask).stdout;
-        words.iter().all(|it| said.contains(it))
+        let text = system.run(&status).stdout;
+        words.iter().all(|it| text.contains(it))
     });
     fs::remove_file(filler).unwrap();
     client.wait_for_transitions(stopped.transitions_inserted + 1_000);
     server.wait_for_stderr("can be written again; nothing was lost");
-    let said = system.run(&ask).stdout;
-    check_has(&said, &["replay on disk: "]);
-    assert!(!said.contains("REFUSED"), "{said}");
+    let text = system.run(&status).stdout;
+    check_has(&text, &["replay on disk: "]);
+    assert!(!text.contains("REFUSED"), "{text}");
     actor.stop_ok();
     learner.stop_ok();
     let before = client.check_nothing_lost();
     server.kill();
     let server = system.start_replay_server(&flags);
-    let after = wait_for("the server", || client.replay());
+    let after = wait_for("the server", || client.replay_status());
     assert_eq!(after.transitions_inserted, before.transitions_inserted);
     // The learner's checkpoint contains all served batches except those in flight.
     let learner = system.start_learner("run");
@@ -210,7 +210,7 @@ fn a_folder_that_cannot_be_used_is_said() {
     let server = system.start_replay_server(&flags);
     drop(system.connect());
     let other = |flags: &str| {
-        let socket = system.socket("other");
+        let socket = system.socket_endpoint("other");
         system.start_process(&format!("replay-server --listen {socket} {flags}"))
     };
     other(&flags)
@@ -230,5 +230,5 @@ fn a_folder_that_cannot_be_used_is_said() {
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .fails("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
     drop(disk);
-    assert!(system.names("replay").len() > 2);
+    assert!(system.file_names("replay").len() > 2);
 }

@@ -44,7 +44,7 @@ fn parameters_that_are_not_finite_are_neither_saved_nor_acted_with() {
                 "local --agent driml-fix {SHORT} {at_once} --set learner.update.adam.lr={lr} --run-dir run"
             ))
             .expect_code(1);
-        system.check_over(Outcome::Failed);
+        system.check_outcome(Outcome::Failed);
         let run = system.run_folder("run");
         let log = run.log("learner");
         assert!(log.contains(said), "{lr}:\n{log}");

@@ -4,47 +4,49 @@
 use std::collections::BTreeSet;
 
 use driml_tests::{
-    Ended, Outcome, Process, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until,
+    Exit, Outcome, Process, RunningProcess, TestSystem, check_has, check_nothing_lost, print_line,
+    wait_until,
 };
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    PRIORITISED, chain, launched_with,
-    numbered::{KILLS, ROWS, SAMPLED, WARMUP, kill_after_rows},
-    prioritised::{SET, said},
-    system,
+    PRIORITISED, chain,
+    numbered::{KILLS, ROWS, ROWS_SAMPLED, WARMUP, kill_after_rows},
+    prioritised::{ROWS_WERE_SET, logged_counts},
+    start_run_with, system,
 };
 
 /// Sends a signal to a process of a launched run, then waits for its successor or the end of the run.
-fn end_one(system: &TestSystem, role: &str, signal: Signal) {
-    let dead = system.find_process(role);
-    let of_its_role = |all: &[Survivor]| {
-        let all = all.iter().filter(|it| it.args.first() == dead.args.first());
+fn signal_and_wait(system: &TestSystem, role: &str, signal: Signal) {
+    let old = system.find_process(role);
+    let count_of_role = |all: &[RunningProcess]| {
+        let all = all.iter().filter(|it| it.args.first() == old.args.first());
         all.count()
     };
-    let before = of_its_role(&system.survivors());
-    dead.signal(signal);
+    let before = count_of_role(&system.running_processes());
+    old.signal(signal);
     wait_until("another one, or the end", || {
-        let left = system.survivors();
-        left.is_empty() || !left.contains(&dead) && of_its_role(&left) == before
+        let left = system.running_processes();
+        left.is_empty() || !left.contains(&old) && count_of_role(&left) == before
     });
 }
 
 /// A process to end in a launched run: the number of updates to wait for, the role, and the signal.
-type End = (u64, &'static str, Signal);
+type Fault = (u64, &'static str, Signal);
 
-const fn killed_server(updates: u64) -> End {
+const fn kill_server_at(updates: u64) -> Fault {
     (updates, "replay-server", Signal::SIGKILL)
 }
 
 /// Makes a run of `frames` frames with two actors and ends the processes in `ends`, which the launcher restarts. Checks that every
-/// transition is stored once and every planned update is made. The learner is held at `hold_at` updates until all have ended.
-fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (TestSystem, Ended) {
+/// transition is stored once and every planned update is made. The learner is paused at `pause_at` updates until all have ended.
+fn ends_as_planned(frames: u64, flags: &str, pause_at: u64, ends: &[Fault]) -> (TestSystem, Exit) {
     let system = system();
-    system.hold_at(hold_at);
-    let process = system.start(&system.local(&format!("{flags} {} --actors 2", chain(frames))));
+    system.pause_learners_at(pause_at);
+    let flags = format!("{flags} {} --actors 2", chain(frames));
+    let process = system.start(&system.local_args(&flags));
     let run = system.run_folder("run");
     for (updates, role, signal) in ends {
         run.wait_for_updates(*updates);
@@ -53,39 +55,39 @@ fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (Tes
             let client = system.connect();
             client.wait_for_replay("both actors", |replay| replay.actors == 2);
         }
-        end_one(&system, role, *signal);
+        signal_and_wait(&system, role, *signal);
     }
-    system.let_go();
+    system.release_learners();
     let ended = process.wait_ok();
-    let summary = system.check_over(Outcome::Finished);
-    let said = format!("{summary:#?}");
+    let summary = system.check_outcome(Outcome::Finished);
+    let text = format!("{summary:#?}");
     let replay = &summary.replay;
     check_nothing_lost(replay);
-    let updates = planned(replay.transitions_inserted);
-    assert_eq!(summary.updates, updates, "{said}");
-    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
+    let updates = planned_updates(replay.transitions_inserted);
+    assert_eq!(summary.updates, updates, "{text}");
+    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{text}");
     let servers = ends.iter().filter(|it| it.1 == "replay-server").count() as u32;
     let restarted = (summary.replay_servers_restarted, summary.actors_restarted);
-    assert_eq!(restarted, (servers, ends.len() as u32 - servers), "{said}");
+    assert_eq!(restarted, (servers, ends.len() as u32 - servers), "{text}");
     (system, ended)
 }
 
 /// Returns the number of updates that the settings of `SHORT` and `LONG` plan for `frames` frames.
-const fn planned(frames: u64) -> u64 {
+const fn planned_updates(frames: u64) -> u64 {
     (frames - WARMUP) * 8 / ROWS as u64
 }
 
-/// Kills a server of numbered transitions, and the servers of two shards in a launched run, at moments drawn from the seed.
+/// Kills a server of numbered transitions, and the servers of two shards in a launched run, at points drawn from the seed.
 #[test]
 #[ignore = "an hour: cargo nextest run --workspace --run-ignored only -E 'test(fifty_seeds)'"]
 fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
     for seed in 0..50 {
-        note(&format!("seed {seed}"));
+        print_line(&format!("seed {seed}"));
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut moments =
+        let mut kill_points =
             |max| -> BTreeSet<u64> { (0..KILLS).map(|_| rng.random_range(0..max)).collect() };
-        kill_after_rows(moments(SAMPLED));
-        kill_shards_after_updates(moments(SHARDS_HOLD - 100));
+        kill_after_rows(kill_points(ROWS_SAMPLED));
+        kill_shards_after_updates(kill_points(SHARDS_PAUSE_AT - 100));
     }
 }
 
@@ -94,32 +96,34 @@ fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
     let flags = format!("--durable --agent driml-ada {PRIORITISED}");
-    let kills = [500, 1_500, 2_500].map(killed_server);
+    let kills = [500, 1_500, 2_500].map(kill_server_at);
     let (system, ended) = ends_as_planned(8_000, &flags, 3_500, &kills);
     ended
-        .expect_said("replay-server was killed by signal 9 SIGKILL")
-        .expect_said("replay-server is started again with what it has kept (3 of 8 times in a run)")
-        .expect_printed("of disk, in the run folder");
+        .expect_stderr("replay-server was killed by signal 9 SIGKILL")
+        .expect_stderr(
+            "replay-server is started again with what it has kept (3 of 8 times in a run)",
+        )
+        .expect_stdout("of disk, in the run folder");
     let run = system.run_folder("run");
     run.check_finished();
     let log = run.log("replay-server");
     check_has(&log, &["priorities are those of the last checkpoint"]);
-    assert!(said::<3>(&log, SET)[0] > 0, "{log}");
+    assert!(logged_counts::<3>(&log, ROWS_WERE_SET)[0] > 0, "{log}");
 }
 
 /// The transitions that a dead actor had not delivered are lost and appear in no count. Everything else is as planned.
 #[test]
 fn a_dead_actor_is_started_again() {
-    // Held at 600 updates, the run has room for 1,400 transitions and the slack; then the limiter is closed.
+    // Paused at 600 updates, the run has room for 1,400 transitions and the slack; then the limiter is closed.
     let ends = [
         (150, "actor", Signal::SIGKILL),
         (400, "actor", Signal::SIGTERM),
     ];
     let (system, ended) = ends_as_planned(2_560, "--agent c51", 600, &ends);
     ended
-        .expect_said("was killed by signal 9 SIGKILL (log: ")
-        .expect_said("is started again (1 of 16 times in a run)")
-        .expect_said("is started again (2 of 16 times in a run)");
+        .expect_stderr("was killed by signal 9 SIGKILL (log: ")
+        .expect_stderr("is started again (1 of 16 times in a run)")
+        .expect_stderr("is started again (2 of 16 times in a run)");
     let run = system.run_folder("run");
     run.check_finished();
     system.run_ok("local --resume run --frames 3000");
@@ -127,19 +131,19 @@ fn a_dead_actor_is_started_again() {
     assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }
 
-/// The number of updates at which the learner of two shards is held until all kills are done.
-const SHARDS_HOLD: u64 = 2_000;
+/// The number of updates at which the learner of two shards is paused until all kills are done.
+const SHARDS_PAUSE_AT: u64 = 2_000;
 
 #[test]
 fn shards_come_back_each_by_itself() {
     kill_shards_after_updates([500, 1_500]);
 }
 
-fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
-    let kills: Vec<_> = moments.into_iter().map(killed_server).collect();
+fn kill_shards_after_updates(kill_points: impl IntoIterator<Item = u64>) {
+    let kills: Vec<_> = kill_points.into_iter().map(kill_server_at).collect();
     let flags = "--durable --agent c51 --replay-shards 2";
-    let (system, ended) = ends_as_planned(6_400, flags, SHARDS_HOLD, &kills);
-    ended.expect_said(&format!(
+    let (system, ended) = ends_as_planned(6_400, flags, SHARDS_PAUSE_AT, &kills);
+    ended.expect_stderr(&format!(
         "is started again with what it has kept ({} of 8",
         kills.len()
     ));
@@ -151,12 +155,12 @@ fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
 #[test]
 fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     let system = system();
-    let process = launched_with(&system, "--durable --agent c51", 100);
+    let process = start_run_with(&system, "--durable --agent c51", 100);
     for _ in 0..=8 {
-        end_one(&system, "replay-server", Signal::SIGKILL);
+        signal_and_wait(&system, "replay-server", Signal::SIGKILL);
     }
     process.fails("(8 of 8 times in a run)");
-    system.check_over(Outcome::Failed);
+    system.check_outcome(Outcome::Failed);
     assert!(
         !system.run_folder("run").checkpoints().is_empty(),
         "the learner saved"
@@ -170,7 +174,7 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let system = system();
     let longer = chain(3_200);
     let flags = format!("--agent driml-ada {longer} --replay-dir replay");
-    system.hold_at(1_000);
+    system.pause_learners_at(1_000);
     let server = system.start_replay_server(&flags);
     let learner = system.start_learner("run");
     let actors = || [0, 1].map(|id| system.start_actor(id));
@@ -179,29 +183,28 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     client.wait_for_updates(500);
     server.kill();
     first.into_iter().for_each(Process::kill);
-    system.let_go();
+    system.release_learners();
     let server = system.start_replay_server(&flags);
     for actor in actors() {
         actor.wait_ok();
     }
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
-    assert_eq!(status.updates, planned(replay.transitions_inserted));
+    assert_eq!(status.updates, planned_updates(replay.transitions_inserted));
     learner.stop_ok();
     drop(client);
-    server
-        .stop_ok()
-        .expect_said("continues with the replay in replay");
+    let exit = server.stop_ok();
+    exit.expect_stderr("continues with the replay in replay");
 }
 
 #[test]
 fn a_resumed_run_continues_with_its_replay() {
     let system = system();
-    let process = launched_with(&system, "--durable --agent driml-ada", 1_000);
+    let process = start_run_with(&system, "--durable --agent driml-ada", 1_000);
     let client = system.connect();
     // Kill all at once, as when the machine stops. Suspend the actor first, so that it adds nothing after the status is read.
     system.find_process("actor").signal(Signal::SIGSTOP);
-    let before = client.replay().unwrap();
+    let before = client.replay_status().unwrap();
     drop(client);
     system.kill_all();
     process.wait();
@@ -227,16 +230,16 @@ fn a_resumed_run_continues_with_its_replay() {
 #[test]
 fn a_run_whose_launcher_was_killed_continues() {
     let system = system();
-    let process = launched_with(&system, "--durable --agent c51", 1_000);
+    let process = start_run_with(&system, "--durable --agent c51", 1_000);
     let client = system.connect();
     let actor = system.find_process("actor");
     actor.signal(Signal::SIGSTOP);
-    let frames = client.replay().unwrap().transitions_inserted + 2_000;
+    let frames = client.replay_status().unwrap().transitions_inserted + 2_000;
     drop(client);
     process.kill();
     // Which process exits last depends on how busy the machine is.
-    let resume = system.listening(&format!("local --resume run --frames {frames}"));
-    system.run_ok(&resume).expect_said(": waiting");
+    let resume = system.listen_args(&format!("local --resume run --frames {frames}"));
+    system.run_ok(&resume).expect_stderr(": waiting");
     actor.signal(Signal::SIGKILL);
     system.run_folder("run").check_finished();
 }

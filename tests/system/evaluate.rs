@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
-use driml_tests::{TestSystem, check_has, updates_of, wait_until};
+use driml_tests::{TestSystem, check_has, checkpoint_updates, wait_until};
 
 use crate::{SHORT, system};
 
@@ -27,8 +27,8 @@ fn a_run_is_evaluated() {
 
 fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(system: &TestSystem) {
     let flags = "evaluate run --episodes 7 --seed 2";
-    let said = system.run_ok(flags).stdout;
-    let lines: Vec<_> = said.lines().collect();
+    let stdout = system.run_ok(flags).stdout;
+    let lines: Vec<_> = stdout.lines().collect();
     assert_eq!(lines.len(), 3, "{lines:?}");
     assert_eq!(
         lines[0],
@@ -41,18 +41,16 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
         );
     }
     // The chain world has no levels to hold out.
-    system.refuses("evaluate --run run --levels unseen", "use --levels train");
+    system.rejects("evaluate --run run --levels unseen", "use --levels train");
 
     // The same seed plays the same episodes.
-    let told = system
-        .run_ok(&format!("{flags} --json --returns returns.csv"))
-        .json();
-    assert_eq!(told["world"], "chain");
-    assert_eq!(told["updates"], 540);
+    let json = system.run_json(&format!("{flags} --json --returns returns.csv"));
+    assert_eq!(json["world"], "chain");
+    assert_eq!(json["updates"], 540);
     let table = system.read("returns.csv");
     for policy in ["driml-fix", "random"] {
-        let mean = told["policies"][policy]["mean_return"].as_f64().unwrap();
-        check_has(&said, &[&format!("{policy:12} mean return {mean:8.3}")]);
+        let mean = json["policies"][policy]["mean_return"].as_f64().unwrap();
+        check_has(&stdout, &[&format!("{policy:12} mean return {mean:8.3}")]);
         let rows = table
             .lines()
             .filter_map(|row| row.strip_prefix(&format!("{policy},")));
@@ -64,7 +62,7 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
         assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-6);
     }
     // A call that fails leaves existing files unchanged.
-    system.refuses(
+    system.rejects(
         "evaluate run --levels unseen --returns returns.csv",
         "use --levels train",
     );
@@ -74,12 +72,12 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
 
     // Any existing checkpoint can be played.
     let kept = system.run_folder("run").checkpoints();
-    let oldest = updates_of(&kept[0]);
+    let oldest = checkpoint_updates(&kept[0]);
     assert!(oldest < 540);
     system
         .run_ok(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
-        .expect_printed(&format!("weights after {oldest} updates"));
-    system.refuses(
+        .expect_stdout(&format!("weights after {oldest} updates"));
+    system.rejects(
         "evaluate run --checkpoint 7",
         "no checkpoint after 7 updates; it has those after",
     );
@@ -96,16 +94,14 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
         ("--weights average", "averaged"),
         ("--weights online", "online"),
     ] {
-        let told = system
-            .run_ok(&format!("evaluate run --episodes 2 --json {flags}"))
-            .json();
-        assert_eq!(told["averaged"], weights == "averaged", "{flags}");
+        let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
+        assert_eq!(json["averaged"], weights == "averaged", "{flags}");
     }
-    system.refuses("evaluate run --checkpoint average", "leave it out");
+    system.rejects("evaluate run --checkpoint average", "leave it out");
 
     system
         .run_ok("evaluate run --export net.safetensors")
-        .expect_printed("averaged weights after 540 updates as f16");
+        .expect_stdout("averaged weights after 540 updates as f16");
     let run = system.run_ok("evaluate run --episodes 3 --exact");
     fs::rename(system.path("run"), system.path("moved")).unwrap();
     let net = system.run_ok("evaluate net.safetensors --episodes 3 --record play.gif --overlay");
@@ -114,7 +110,7 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
     assert_eq!(lines.last(), run.stdout.lines().last().as_ref());
     let online = system.run_folder("moved").newest_checkpoint();
     let online = online.join("online.safetensors").display().to_string();
-    system.refuses_each(&format!(
+    system.rejects_each(&format!(
         "
         evaluate net.safetensors --keep => is a single network
         evaluate net.safetensors --weights online => is a single network
@@ -191,8 +187,8 @@ fn it_plays_checkpoints_while_the_run_continues() {
             "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
         ));
         again
-            .expect_printed(&format!("weights after {} updates", best[0]))
-            .expect_printed(&format!("mean return {most:8.3}"));
+            .expect_stdout(&format!("weights after {} updates", best[0]))
+            .expect_stdout(&format!("mean return {most:8.3}"));
         system.run_ok(&format!(
             "plot {name} --column evaluated_return --out {name}.svg"
         ));
@@ -212,26 +208,26 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     process
         .interrupt()
         .expect_code(130)
-        .expect_said("an evaluation was left out");
+        .expect_stderr("an evaluation was left out");
     fs::write(system.path("run/best"), "not a folder").unwrap();
     system
         .run_ok("local --resume run --set local.evaluation.episodes=2")
-        .expect_said("the run continues without an evaluation: ");
+        .expect_stderr("the run continues without an evaluation: ");
     system.run_folder("run").check_finished();
 }
 
 /// A checkpoint is compared with the best one over at least as many episodes as the best was played for.
 fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &TestSystem) {
-    system.refuses(
+    system.rejects(
         "evaluate run --checkpoint best",
         "run has no best checkpoint",
     );
     let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
-    keep("--episodes 3").expect_printed("over 3 episodes, the most so far\n");
+    keep("--episodes 3").expect_stdout("over 3 episodes, the most so far\n");
     system.run_ok("evaluate run --checkpoint best --episodes 1");
     let oldest = system.run_folder("run").checkpoints().remove(0);
-    let updates = updates_of(&oldest);
-    keep(&format!("--episodes 1 --checkpoint {updates}")).expect_printed(
+    let updates = checkpoint_updates(&oldest);
+    keep(&format!("--episodes 1 --checkpoint {updates}")).expect_stdout(
         "; the best stays: it was played for 3 episodes, and fewer do not compare\n",
     );
     // For a comparison over more episodes, the best checkpoint is played again.
@@ -245,7 +241,7 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &
     assert_eq!(rows, [(540, 3), (updates, 1), (540, 5), (updates, 5)]);
 
     // The episodes that select the best checkpoint are never those of a report.
-    system.refuses_each(&format!(
+    system.rejects_each(&format!(
         "
         evaluate run --keep --seed 0 => '--keep' cannot be used with
         evaluate run --checkpoint bset => the updates of a checkpoint
@@ -263,9 +259,9 @@ fn a_film_changes_nothing_that_is_played() {
     let film =
         "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-envs 2";
     let filmed = system.run_ok(film);
-    let said: Vec<_> = filmed.stdout.lines().collect();
-    assert_eq!(said[1], "filmed 40 steps: play.gif");
-    let rest: Vec<_> = said
+    let lines: Vec<_> = filmed.stdout.lines().collect();
+    assert_eq!(lines[1], "filmed 40 steps: play.gif");
+    let rest: Vec<_> = lines
         .iter()
         .filter(|line| !line.starts_with("filmed"))
         .copied()
@@ -296,32 +292,32 @@ fn it_plays_in_the_precision_of_the_run() {
     for (flags, precision) in [("", "bf16"), ("--exact", "f32")] {
         let call = format!("evaluate run --episodes 2 {flags}");
         let words = format!("{precision} weights after 540 updates played in {precision}");
-        system.run_ok(&call).expect_printed(&words);
+        system.run_ok(&call).expect_stdout(&words);
     }
-    let told = system.run_ok("evaluate run --episodes 2 --json").json();
-    assert_eq!(told["weights"], "bf16");
-    assert_eq!(told["arithmetic"], "bf16");
+    let json = system.run_json("evaluate run --episodes 2 --json");
+    assert_eq!(json["weights"], "bf16");
+    assert_eq!(json["arithmetic"], "bf16");
 }
 
 #[test]
 fn a_folder_that_is_no_run_s() {
     let system = system();
     fs::create_dir(system.path("empty")).unwrap();
-    system.refuses_each(
+    system.rejects_each(
         "
         evaluate --run empty => error: empty is not the folder of a run
         evaluate --run none => error: none is not the folder of a run
         ",
     );
     fs::write(system.path("empty/config.toml"), "[run]\n").unwrap();
-    system.refuses("evaluate --run empty", "config.toml that driml wrote");
+    system.rejects("evaluate --run empty", "config.toml that driml wrote");
 }
 
 /// The learner's own tests check that damage to any file is found. Impossible films are rejected before anything is played.
 fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
     system: &TestSystem,
 ) {
-    system.refuses_each(
+    system.rejects_each(
         "
         evaluate run --record play.mp4 => use one that ends in .gif
         evaluate run --record none/play.gif => --record none/play.gif: No such file or directory
@@ -338,7 +334,7 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
     let damaged = format!("error: run/checkpoints/{name}/online.safetensors is damaged: ");
     system
         .fails(call, &damaged)
-        .expect_said("remove the folder it is in");
+        .expect_stderr("remove the folder it is in");
     fs::write(&path, &whole).unwrap();
     system.run_ok(call);
 
@@ -347,9 +343,9 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
     fs::write(system.path("run/config.toml"), other).unwrap();
     system
         .fails(call, "belongs to a run with specification")
-        .expect_said("resume with the settings it was made with");
+        .expect_stderr("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system.refuses(call, "has no checkpoint yet");
-    system.refuses("evaluate run --record play.gif", "has no checkpoint yet");
-    assert!(!system.names(".").iter().any(|name| name.contains("play")));
+    system.rejects(call, "has no checkpoint yet");
+    system.rejects("evaluate run --record play.gif", "has no checkpoint yet");
+    assert!(!system.file_names(".").iter().any(|it| it.contains("play")));
 }

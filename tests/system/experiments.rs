@@ -8,7 +8,7 @@ use driml_tests::{Outcome, check_has};
 use crate::system;
 
 /// Returns every file of a folder except the page, which contains the time it took.
-fn data(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+fn data_files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let entries = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap());
     let files = entries.filter(|entry| entry.file_type().unwrap().is_file());
     files
@@ -20,13 +20,13 @@ fn data(folder: &Path) -> BTreeMap<String, Vec<u8>> {
         .collect()
 }
 
-fn names(files: &BTreeMap<String, Vec<u8>>) -> String {
+fn joined_names(files: &BTreeMap<String, Vec<u8>>) -> String {
     let names: Vec<_> = files.keys().map(String::as_str).collect();
     names.join(" ")
 }
 
 /// Returns the number of lines of a CSV file without its header.
-fn rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
+fn count_rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
     String::from_utf8_lossy(&files[name]).lines().count() - 1
 }
 
@@ -42,8 +42,8 @@ fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
     ];
     check_has(&page, &of_all);
     check_has(&page, sections);
-    let found = data(folder);
-    assert_eq!(names(&found), files);
+    let found = data_files(folder);
+    assert_eq!(joined_names(&found), files);
     for (file, bytes) in &found {
         let text = String::from_utf8_lossy(bytes);
         let is_sound = file.ends_with(".png") || !text.contains("NaN");
@@ -52,32 +52,32 @@ fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
     page
 }
 
-fn check(name: &str, files: &str) {
+fn check_experiment(name: &str, files: &str) {
     let system = system();
     let call = format!("experiment {name} --smoke");
     let printed = system.run_ok(&call).stdout;
     let folder = system.path("experiments").join(name);
     assert!(printed.ends_with("README.md\n"), "{printed}");
     check_page(&folder, &["**Time.**", "**Expected.**"], files);
-    let first = data(&folder);
+    let first = data_files(&folder);
 
     // Another folder gets the same bytes. If one piece is lost, the next call makes that piece again, with the same bytes.
     system.run_ok(&format!("{call} --out other"));
-    assert_eq!(data(&system.path("other")), first);
-    let mut pieces = system.names(&format!("experiments/{name}/pieces"));
+    assert_eq!(data_files(&system.path("other")), first);
+    let mut pieces = system.file_names(&format!("experiments/{name}/pieces"));
     pieces.retain(|it| !["settings.json", "cores.json"].contains(&&**it));
     fs::remove_file(folder.join("pieces").join(pieces.iter().min().unwrap())).unwrap();
     system.run_ok(&call);
-    assert_eq!(data(&folder), first);
+    assert_eq!(data_files(&folder), first);
 
     // More seeds add pieces to the same grid; the full length is another grid.
     system.run_ok(&format!("{call} --seeds 3"));
-    system.refuses(&format!("experiment {name}"), "made with other settings");
+    system.rejects(&format!("experiment {name}"), "made with other settings");
 }
 
 #[test]
 fn random_walk() {
-    check(
+    check_experiment(
         "random-walk",
         "alpha.csv convergence.csv convergence.png convergence.svg curves.csv fig1.png fig1.svg ratio.csv",
     );
@@ -85,7 +85,7 @@ fn random_walk() {
 
 #[test]
 fn ising() {
-    check(
+    check_experiment(
         "ising",
         "auc.csv fig2.png fig2.svg learning.png learning.svg loss.csv maps.csv",
     );
@@ -94,7 +94,7 @@ fn ising() {
 /// The command fails if a routine breaks a promise in this build.
 #[test]
 fn stability() {
-    check("stability", "promises.csv worst.png worst.svg");
+    check_experiment("stability", "promises.csv worst.png worst.svg");
 }
 
 /// Real processes make each run different, but finished runs stay unchanged.
@@ -103,14 +103,14 @@ fn procgen_without_the_engine() {
     let system = system();
     let call = "experiment procgen --smoke";
     // A rejected call leaves the folder free for the corrected call.
-    system.refuses(&format!("{call} --set learner.batchsize=1"), "no setting");
+    system.rejects(&format!("{call} --set learner.batchsize=1"), "no setting");
     system.run_ok(call);
     let folder = system.path("experiments/procgen");
     let files = "curves.png curves.svg table.csv";
     let page = check_page(&folder, &["**Results.**\n\n* ", "| --- |"], files);
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
-    let first = data(&folder);
+    let first = data_files(&folder);
     let table = || system.run_folder("experiments/procgen").table("table.csv");
     let before = table();
     let header = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
@@ -125,7 +125,7 @@ fn procgen_without_the_engine() {
 
     // Nothing is run again, and the same runs give the same files.
     system.run_ok(call);
-    assert_eq!(data(&folder), first);
+    assert_eq!(data_files(&folder), first);
 
     // A run that failed before its first checkpoint is moved aside, made again and played again; the others stay. The earlier evaluations
     // get the return 777, so that they can be recognised.
@@ -146,7 +146,7 @@ fn procgen_without_the_engine() {
     fs::remove_file(folder.join("runs/chain-c51-seed1.commit")).unwrap();
     system
         .run_ok(call)
-        .expect_said("chain-c51-seed2 was not finished");
+        .expect_stderr("chain-c51-seed2 was not finished");
     assert!(summary("chain-c51-seed2.unfinished-1").exists());
     let again = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
     assert!(again.contains(": \"finished\""), "{again}");
@@ -214,21 +214,21 @@ fn tradeoff() {
     let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
     let first = summary("c51-seed1").unwrap();
     let planned = call("--dials learner.precision,DIM --plan --budget 0");
-    let said = [
+    let expected = [
         "learner.precision = bf16: finished\n",
         "DIM = driml-fix: does not fit",
     ];
-    check_has(&planned, &said);
+    check_has(&planned, &expected);
     call("--dials DIM");
     assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
-    let files = data(&folder);
+    let files = data_files(&folder);
     let all = "equal_time.csv levels.csv pareto.png pareto.svg pareto_training.png pareto_training.svg runs.csv wall.png wall.svg";
-    assert_eq!(names(&files), all);
+    assert_eq!(joined_names(&files), all);
     // The base has two seeds and each level has one. The base of each dial has its own row.
-    let counts = || ["levels.csv", "runs.csv"].map(|name| rows(&data(&folder), name));
+    let counts = || ["levels.csv", "runs.csv"].map(|name| count_rows(&data_files(&folder), name));
     assert_eq!(counts(), [2 + 3, 2 + 3]);
     // Runs this short may have no return yet when the others end: then they have no row at equal time.
-    let at_equal_time = rows(&files, "equal_time.csv");
+    let at_equal_time = count_rows(&files, "equal_time.csv");
     assert!(at_equal_time <= 2, "{at_equal_time} levels of DIM");
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     let is_shown = page.contains("at equal wall-clock time");
@@ -243,7 +243,7 @@ fn tradeoff() {
     ];
     check_has(&page, &parts);
     check_has(&call("--report"), &["learner.precision = bf16 (c51): x"]);
-    assert_eq!(data(&folder), files);
+    assert_eq!(data_files(&folder), files);
 
     // The page includes the seeds of other calls. A report of one dial contains only that dial.
     call("--dials learner.precision --seeds 2");
@@ -253,7 +253,7 @@ fn tradeoff() {
     assert_eq!(counts()[0], 2);
 
     // If the first seed of a level is missing, the other seeds are reported.
-    let names = system.names("t/runs").into_iter();
+    let names = system.file_names("t/runs").into_iter();
     let first = names.filter(|it| it.contains("bf16") && it.ends_with("-seed1"));
     for name in first {
         fs::remove_file(folder.join("runs").join(name).join("summary.json")).unwrap();
@@ -268,16 +268,16 @@ fn killed_and_resumed() {
     let system = system();
     let call =
         "experiment procgen --smoke --games mspacman --agents c51 --seeds 1 --out x --frames 4000";
-    // Hold the learner, so that the run does not end before it is killed.
-    system.hold_at(100);
+    // Pause the learner, so that the run does not end before it is killed.
+    system.pause_learners_at(100);
     let process = system.start(call);
     let run = system.run_folder("x/runs/mspacman-c51-seed1");
     run.wait_for_updates(0);
     process.kill();
-    system.let_go();
+    system.release_learners();
     system
         .run_ok(call)
-        .expect_said("mspacman-c51-seed1 resumes from its checkpoint");
+        .expect_stderr("mspacman-c51-seed1 resumes from its checkpoint");
     let summary = run.summary();
     assert_eq!(summary.outcome, Outcome::Finished, "{summary:#?}");
     assert!(summary.resumed_after_updates > 0, "{summary:#?}");
@@ -292,12 +292,12 @@ fn a_grid_makes_every_combination_once() {
     let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
     // A grid that cannot work is rejected before anything starts.
     let unfit = format!("{fixed} --set learner.update.adam.lr=1e-4,fast");
-    system.refuses(&unfit, "agent=c51").expect_said("lr=fast");
+    system.rejects(&unfit, "agent=c51").expect_stderr("lr=fast");
     let twice = format!("{call} --set learner.update.adam.lr=1");
-    system.refuses(&twice, "is set twice");
+    system.rejects(&twice, "is set twice");
     let seeded = format!("{call} --set run.seed=7");
-    system.refuses(&seeded, "use --seeds and --frames");
-    system.refuses(&format!("{call} --report"), "there is nothing to report");
+    system.rejects(&seeded, "use --seeds and --frames");
+    system.rejects(&format!("{call} --report"), "there is nothing to report");
 
     let printed = system.run_ok(&format!("{call} --jobs 2")).stdout;
     let folder = system.path("experiments/sweep");
@@ -327,5 +327,5 @@ fn a_grid_makes_every_combination_once() {
     system.run_ok("grid --report");
     assert_eq!(table().rows, made);
     // Another grid is rejected in the same folder.
-    system.refuses(&format!("{fixed} --frames 352"), "other settings");
+    system.rejects(&format!("{fixed} --frames 352"), "other settings");
 }

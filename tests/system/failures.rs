@@ -3,30 +3,30 @@
 
 use std::{fs, process::Command};
 
-use driml_tests::{Ended, Outcome, Process, wait_until};
+use driml_tests::{Exit, Outcome, Process, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{
-    LONG, PROCESSES, SHORT, launched,
-    leftovers::{check_gone, shared_memory},
-    system,
+    LONG, PROCESSES, SHORT,
+    leftovers::{check_removed, shared_memory},
+    start_run, system,
 };
 
 #[test]
 fn a_second_interrupt_ends_at_once() {
     let system = system();
-    let mut process = launched(&system, 100);
+    let mut process = start_run(&system, 100);
     // After the first interrupt, the launcher would wait for minutes for this unresponsive learner.
     system.find_process("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
     interrupt_until_it_ends(process)
         .expect_error("stopped at once by a second interrupt: what was not saved is lost");
-    system.check_over(Outcome::Failed);
+    system.check_outcome(Outcome::Failed);
 }
 
 /// Sends SIGINT until the process ends, because signals at nearly the same time count as one request.
-pub(crate) fn interrupt_until_it_ends(mut process: Process) -> Ended {
+pub(crate) fn interrupt_until_it_ends(mut process: Process) -> Exit {
     wait_until("the launcher's end", || {
         let is_over = !process.is_running();
         if !is_over {
@@ -47,20 +47,20 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
         system.find_process("replay-server");
         let ended = process.interrupt().expect_code(130);
         assert!(!ended.stderr.contains("error:"), "{}", ended.stderr);
-        ended.expect_printed("no episode ended");
-        system.check_over(Outcome::Interrupted);
+        ended.expect_stdout("no episode ended");
+        system.check_outcome(Outcome::Interrupted);
     }
 }
 
 #[test]
 fn a_run_whose_folder_is_gone_says_what_is_lost() {
     let system = system();
-    let process = launched(&system, 100);
+    let process = start_run(&system, 100);
     fs::rename(system.path("run"), system.path("elsewhere")).unwrap();
     let ended =
         process.fails("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
     assert!(!ended.stderr.contains("resumes it"), "{}", ended.stderr);
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }
 
 #[test]
@@ -77,16 +77,16 @@ fn dead_processes_end_the_run_and_leave_no_shared_memory() {
         (&PROCESSES, " was killed by signal 9 SIGKILL (log: "),
     ] {
         let system = system();
-        let process = launched(&system, 100);
+        let process = start_run(&system, 100);
         let segments = shared_memory(&system);
         let dead = dead.iter().map(|role| system.find_process(role));
         let dead: Vec<_> = dead.collect();
         dead.iter().for_each(|it| it.signal(Signal::SIGKILL));
         process
             .fails(says)
-            .expect_said("`driml train --resume run` resumes it");
-        system.check_over(Outcome::Failed);
-        check_gone(&segments);
+            .expect_stderr("`driml train --resume run` resumes it");
+        system.check_outcome(Outcome::Failed);
+        check_removed(&segments);
     }
 }
 
@@ -96,13 +96,13 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     let system = system();
     let flags = "--env mspacman --agent c51 --preset smoke --frames 100000 --actors 1";
     let changing = "--set world.lethal_schedule={episodes_per_task=5,order=[0,1]}";
-    let process = system.start(&system.local(&format!("{flags} {changing}")));
+    let process = system.start(&system.local_args(&format!("{flags} {changing}")));
     system.connect().wait_for_transitions(0);
     system.find_process("actor").signal(Signal::SIGKILL);
     process
         .fails("error: actor-0 was killed by signal 9 SIGKILL (log: ")
-        .expect_said("actor-0 is not started again: the ghosts of this run change");
-    system.check_over(Outcome::Failed);
+        .expect_stderr("actor-0 is not started again: the ghosts of this run change");
+    system.check_outcome(Outcome::Failed);
 }
 
 /// All processes notice the launcher's death at once. The replay server stays until the others have delivered what they have and left.
@@ -126,9 +126,9 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
         ("learner", "finished after "),
         ("server", "this process is to end, and 0 processes are left"),
     ] {
-        let said = system.read(role);
-        assert!(said.contains(words), "{said}");
-        assert!(!said.contains("did not receive this actor's"), "{said}");
+        let stderr = system.read(role);
+        assert!(stderr.contains(words), "{stderr}");
+        assert!(!stderr.contains("did not receive this actor's"), "{stderr}");
     }
 }
 
@@ -140,6 +140,6 @@ fn a_process_whose_launcher_died_before_it_looked_ends() {
     let parent = launcher.id();
     let server = format!("replay-server {SHORT} --exit-with-parent {parent}");
     system
-        .run_ok(&system.listening(&server))
-        .expect_said("replay server stops");
+        .run_ok(&system.listen_args(&server))
+        .expect_stderr("replay server stops");
 }

@@ -3,10 +3,10 @@
 
 use std::time::{Duration, Instant};
 
-use driml_tests::{Outcome, Process, TestSystem, at_once, wait_until};
+use driml_tests::{Outcome, Process, TestSystem, in_parallel, wait_until};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, failures::interrupt_until_it_ends, launched, system};
+use crate::{LONG, SHORT, failures::interrupt_until_it_ends, start_run, system};
 
 /// Runs all checks at the same time, because each waits for time-outs of up to a minute.
 #[test]
@@ -18,19 +18,19 @@ fn a_frozen_process_does_not_hold_the_others_up() {
         a_replay_server_ends_whose_launcher_died,
         a_frozen_actor_does_not_stop_the_others,
     ];
-    at_once(checks, |check| check());
+    in_parallel(checks, |check| check());
 }
 
 /// Starts a run of two actors, suspends one of them, and waits until the learner has made its last update.
 fn complete_but_for_an_actor(system: &TestSystem) -> Process {
-    // Hold the learner, so that the run does not end before its second actor starts.
-    system.hold_at(100);
+    // Pause the learner, so that the run does not end before its second actor starts.
+    system.pause_learners_at(100);
     let flags = format!("--agent c51 {SHORT} --actors 2");
-    let process = system.start(&system.local(&flags));
+    let process = system.start(&system.local_args(&flags));
     let client = system.connect();
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     system.find_process("actor").signal(Signal::SIGSTOP);
-    system.let_go();
+    system.release_learners();
     client.wait_for_the_last_update();
     process
 }
@@ -39,9 +39,9 @@ fn a_complete_run_is_finished() {
     let system = system();
     complete_but_for_an_actor(&system)
         .wait_ok()
-        .expect_said("did not end within 1 min 0 s and was killed")
-        .expect_printed("finished: ");
-    system.check_over(Outcome::Finished);
+        .expect_stderr("did not end within 1 min 0 s and was killed")
+        .expect_stdout("finished: ");
+    system.check_outcome(Outcome::Finished);
 }
 
 /// After the first interrupt the launcher waits for the actor, after the second it does not. Neither changes the run's outcome.
@@ -49,32 +49,32 @@ fn an_interrupt_of_a_complete_run_leaves_it_finished() {
     let system = system();
     interrupt_until_it_ends(complete_but_for_an_actor(&system))
         .expect_code(0)
-        .expect_printed("finished: ");
-    system.check_over(Outcome::Finished);
+        .expect_stdout("finished: ");
+    system.check_outcome(Outcome::Finished);
 }
 
 fn a_replay_server_ends_without_its_actor() {
     let system = system();
     let server = format!("replay-server --agent c51 {SHORT}");
-    let server = system.start_process(&system.listening(&server));
+    let server = system.start_process(&system.listen_args(&server));
     let mut frozen = system.start_actor(1);
     frozen.wait_for_stderr("waiting for the learner's first weights");
     frozen.signal(Signal::SIGSTOP);
-    let learner = system.start_process(&system.connected("learner --run-dir run"));
+    let learner = system.start_process(&system.connect_args("learner --run-dir run"));
     system.start_actor(0).wait_ok();
     learner.wait_ok();
-    server.wait_ok().expect_said("the run is over, and ");
+    server.wait_ok().expect_stderr("the run is over, and ");
     frozen.kill();
 }
 
 fn a_replay_server_ends_whose_launcher_died() {
     let system = system();
-    let process = launched(&system, 100);
+    let process = start_run(&system, 100);
     let [server, actor] = ["replay-server", "actor"].map(|role| system.find_process(role));
     actor.signal(Signal::SIGSTOP);
     process.kill();
     wait_until("the replay server's end", || {
-        !system.survivors().contains(&server)
+        !system.running_processes().contains(&server)
     });
     actor.signal(Signal::SIGKILL);
     system.wait_until_all_have_ended();
@@ -98,7 +98,7 @@ fn a_frozen_actor_does_not_stop_the_others() {
     // Wait well beyond the time-out of a blocked link, but less than the session's lease, which would end the session anyway.
     let started = Instant::now();
     let late = |after_s| started.elapsed() > Duration::from_secs(after_s);
-    let rows = || client.replay().map_or(0, |replay| replay.rows_sampled);
+    let rows = || client.replay_status().map_or(0, |it| it.rows_sampled);
     wait_until("the time that a link may stand still", || late(12));
     let before = rows();
     wait_until("batches while an actor is frozen", || {
@@ -107,10 +107,10 @@ fn a_frozen_actor_does_not_stop_the_others() {
     });
     assert!(learner.is_running() && healthy.is_running() && frozen.is_running());
     frozen.signal(Signal::SIGCONT);
-    let others = client.replay().unwrap().transitions_inserted;
+    let others = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_transitions(others + 500);
     for actor in [healthy, frozen] {
-        actor.stop_ok().expect_said("leaves: ");
+        actor.stop_ok().expect_stderr("leaves: ");
     }
     client.check_nothing_lost();
     learner.stop_ok();

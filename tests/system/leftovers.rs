@@ -6,70 +6,65 @@ use std::{fs, path::PathBuf};
 
 use driml_tests::{Process, TestSystem};
 
-use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, system};
+use crate::{LONG, PROCESSES, SHORT, disk_full::PERIOD_NEVER, system};
 
 /// Returns the call of a run whose temporary folder is `tmp` in the system's folder.
-fn local(system: &TestSystem, flags: &str) -> String {
+fn local_call(system: &TestSystem, flags: &str) -> String {
     let folder = system.path("tmp");
     format!("env TMPDIR={} DRIML local {flags}", folder.display())
 }
 
-/// Starts a run of [`local`] that has made updates and saved no checkpoint. Returns the run and its shared memory files.
-fn started(system: &TestSystem) -> (Process, Vec<PathBuf>) {
+/// Starts a run of [`local_call`] that has made updates and saved no checkpoint. Returns the run and its shared memory files.
+fn start_without_checkpoint(system: &TestSystem) -> (Process, Vec<PathBuf>) {
     fs::create_dir(system.path("tmp")).unwrap();
-    let never = format!("--set learner.checkpoint_period_updates={NEVER}");
+    let never = format!("--set learner.checkpoint_period_updates={PERIOD_NEVER}");
     let flags = format!("--agent driml-ada {LONG} {never} --run-dir run");
-    let process = system.start(&local(system, &flags));
+    let process = system.start(&local_call(system, &flags));
     system.run_folder("run").wait_for_updates(100);
-    assert_eq!(temporary(system).len(), 1);
+    assert_eq!(system.file_names("tmp").len(), 1);
     (process, shared_memory(system))
-}
-
-fn temporary(system: &TestSystem) -> Vec<PathBuf> {
-    let entries = fs::read_dir(system.path("tmp")).unwrap();
-    entries.map(|entry| entry.unwrap().path()).collect()
 }
 
 #[test]
 fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     let system = system();
-    let (process, segments) = started(&system);
+    let (process, segments) = start_without_checkpoint(&system);
     process.kill();
     system.wait_until_all_have_ended();
     assert!(system.run_folder("run").saved_updates() > 100);
-    assert_eq!(temporary(&system), [] as [PathBuf; 0]);
-    check_gone(&segments);
+    assert_eq!(system.file_names("tmp"), [] as [&str; 0]);
+    check_removed(&segments);
 }
 
 #[test]
 fn a_run_that_finishes_leaves_its_folder_alone() {
     let system = system();
     fs::create_dir(system.path("tmp")).unwrap();
-    system.hold_at(100);
-    let process = system.start(&local(
+    system.pause_learners_at(100);
+    let process = system.start(&local_call(
         &system,
         &format!("--agent c51 {SHORT} --run-dir run"),
     ));
     system.run_folder("run").wait_for_updates(50);
     let segments = shared_memory(&system);
-    system.let_go();
+    system.release_learners();
     process.wait_ok();
-    assert_eq!(temporary(&system), [] as [PathBuf; 0]);
-    check_gone(&segments);
+    assert_eq!(system.file_names("tmp"), [] as [&str; 0]);
+    check_removed(&segments);
 }
 
 #[test]
 fn the_next_run_sweeps_what_killed_processes_left() {
     let system = system();
-    let (process, segments) = started(&system);
+    let (process, segments) = start_without_checkpoint(&system);
     system.kill_all();
     process.wait();
     system.wait_until_all_have_ended();
-    assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
+    assert_eq!(system.file_names("tmp").len(), 1, "nothing could remove it");
     let next = format!("--agent c51 {SHORT} --run-dir next");
-    system.run_ok(&local(&system, &next));
-    assert_eq!(temporary(&system), [] as [PathBuf; 0]);
-    check_gone(&segments);
+    system.run_ok(&local_call(&system, &next));
+    assert_eq!(system.file_names("tmp"), [] as [&str; 0]);
+    check_removed(&segments);
 }
 
 #[test]
@@ -86,7 +81,7 @@ fn processes_started_by_hand_leave_no_shared_memory() {
     for process in [actor, learner, server] {
         process.stop_ok();
     }
-    check_gone(&segments);
+    check_removed(&segments);
 }
 
 /// Returns the shared memory files that the processes of a run have open.
@@ -105,7 +100,7 @@ pub(crate) fn shared_memory(system: &TestSystem) -> Vec<PathBuf> {
     files
 }
 
-pub(crate) fn check_gone(files: &[PathBuf]) {
+pub(crate) fn check_removed(files: &[PathBuf]) {
     let left: Vec<&PathBuf> = files.iter().filter(|file| file.exists()).collect();
     assert!(left.is_empty(), "{left:?}");
 }

@@ -6,7 +6,7 @@ use std::fs;
 use crate::{LONG, SHORT, system};
 
 /// Returns a call of the program under a limit of the shell's `ulimit`, which its children inherit.
-fn limited(limit: &str, call: &str) -> String {
+fn with_ulimit(limit: &str, call: &str) -> String {
     format!("sh -c 'ulimit {limit} && exec \"$0\" \"$@\"' DRIML {call}")
 }
 
@@ -15,19 +15,19 @@ fn a_run_with_more_actors_than_files_may_be_open_does_not_start() {
     let system = system();
     let run = |actors| format!("local --agent c51 {SHORT} --actors {actors} --run-dir run");
     let why = "the replay server of a run with 20 actors needs 128 open files, and the system allows 60: raise the limit";
-    system.refuses(&limited("-n 60", &run(20)), why);
+    system.rejects(&with_ulimit("-n 60", &run(20)), why);
     assert!(!system.path("run").exists());
-    system.run_ok(&limited("-n 60", &run(2)));
+    system.run_ok(&with_ulimit("-n 60", &run(2)));
     // A soft limit is raised if the hard limit permits it.
     let more = run(4).replace("--run-dir run", "--run-dir more");
-    system.run_ok(&limited("-S -n 60", &more));
+    system.run_ok(&with_ulimit("-S -n 60", &more));
 }
 
 #[test]
 fn a_replay_server_warns_if_it_may_not_open_enough_files() {
     let system = system();
-    let server = system.replay_server(&format!("--agent c51 {LONG} --actors 20"));
-    let mut server = system.start_process(&limited("-n 60", &server));
+    let server = system.replay_server_args(&format!("--agent c51 {LONG} --actors 20"));
+    let mut server = system.start_process(&with_ulimit("-n 60", &server));
     server.wait_for_stderr(
         "a replay server for 20 actors needs 128 open files, and the system allows 60: ",
     );
@@ -38,9 +38,9 @@ fn a_replay_server_warns_if_it_may_not_open_enough_files() {
 #[test]
 fn a_file_that_may_not_grow_is_an_error_and_no_end() {
     let system = system();
-    let server = system.replay_server(&format!("--agent c51 {LONG} --replay-dir replay"));
+    let server = system.replay_server_args(&format!("--agent c51 {LONG} --replay-dir replay"));
     // This size is also too small for a segment of shared memory.
-    let mut server = system.start_process(&limited("-f 64", &server));
+    let mut server = system.start_process(&with_ulimit("-f 64", &server));
     server.wait_for_stderr("replay server listens on ");
     let (_learner, _actor) = (system.start_learner("run"), system.start_actor(0));
     server.wait_for_stderr("cannot be written: File too large (os error 27)");
@@ -62,5 +62,5 @@ fn a_temporary_folder_may_have_a_name_too_long_for_a_socket() {
     ));
     let endpoint = format!("unixsock-stream/{folder}/{}", "s".repeat(20));
     system
-        .refuses(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"), "the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");
+        .rejects(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"), "the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");
 }

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use driml_tests::{Outcome, Summary, TestSystem, check_has, wait_until};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, chain, listener, system};
+use crate::{LONG, SHORT, chain, listen_on_free_port, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
@@ -30,16 +30,14 @@ fn c51_leaves_a_whole_run_folder() {
         let is_sound = !log.contains("panicked") && !log.contains("driml_");
         assert!(log.contains("INFO") && is_sound, "{role}:\n{log}");
     }
-    let warned = ended
-        .stderr
-        .lines()
-        .find(|line| line.contains(" WARN ") || line.contains(" ERROR "));
+    let mut lines = ended.stderr.lines();
+    let warned = lines.find(|it| it.contains(" WARN ") || it.contains(" ERROR "));
     assert_eq!(warned, None, "an orderly run warns of nothing");
     ended
-        .expect_printed("trains      c51 on chain, seed 1")
-        .expect_printed("finished: 1280 frames and 540 updates");
-    assert_eq!(system.survivors(), []);
-    let names = system.names("run").into_iter();
+        .expect_stdout("trains      c51 on chain, seed 1")
+        .expect_stdout("finished: 1280 frames and 540 updates");
+    assert_eq!(system.running_processes(), []);
+    let names = system.file_names("run").into_iter();
     let events = names.filter(|name| name.contains("tfevents"));
     assert_eq!(events.count(), 0, "there are none without the flag");
     // The run's `config.toml` repeats the run. Processes race, so the weights differ; the counts do not.
@@ -51,20 +49,20 @@ fn c51_leaves_a_whole_run_folder() {
 
 #[test]
 fn driml_ada_with_two_actors_over_tcp() {
-    let (endpoint, _) = listener();
-    let system = system().at(endpoint);
-    // Hold the learner, so that the run does not end before its second actor starts.
-    system.hold_at(500);
+    let (endpoint, _) = listen_on_free_port();
+    let system = system().with_endpoint(endpoint);
+    // Pause the learner, so that the run does not end before its second actor starts.
+    system.pause_learners_at(500);
     let longer = chain(2_560);
     // The alphabet maps all actions to one, so the learner's affinity A is 1 everywhere and k reaches its maximum. Without the learner's A,
     // the replay server uses A = 1/3 everywhere, and the mean of k is at most 1 + 1/3 + .. + 1/81.
     let alphabet = "--set learner.affinity.alphabet=visible --set learner.affinity.visible=[0,0,0]";
     let flags = format!("--agent driml-ada {alphabet} {longer} --actors 2");
-    let process = system.start(&system.local(&flags));
+    let process = system.start(&system.local_args(&flags));
     system
         .connect()
         .wait_for_replay("both actors", |replay| replay.actors == 2);
-    system.let_go();
+    system.release_learners();
     process.wait_ok();
     let run = system.run_folder("run");
     let summary = run.check_finished();
@@ -83,13 +81,13 @@ fn driml_ada_with_two_actors_over_tcp() {
 
 /// With `driml local --listen`, actors of other machines play in the same run, and other processes watch it.
 fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
-    let run = system.start(&system.local(&format!("--agent c51 {LONG}")));
+    let run = system.start(&system.local_args(&format!("--agent c51 {LONG}")));
     let mut outside = system.start_actor(2);
     outside.wait_for_stderr("actor 2 steps 4 environments");
     let client = system.connect();
     client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
     // An observer receives everything that is recorded, including episodes.
-    let mut watched = system.start(&system.connected("watch --run-dir seen"));
+    let mut watched = system.start(&system.connect_args("watch --run-dir seen"));
     let both = BTreeSet::from([0, 2]);
     let has_both = |folder| {
         let episodes = system.run_folder(folder).episodes();
@@ -102,7 +100,7 @@ fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
     watched.signal(Signal::SIGINT);
     watched.wait_for_stderr("the run continues without being watched");
     watched.wait().expect_code(130);
-    outside.stop_ok().expect_said("actor 2 leaves: ");
+    outside.stop_ok().expect_stderr("actor 2 leaves: ");
     drop(client);
     run.interrupt().expect_code(130);
     system.run_folder("run").check(Outcome::Interrupted);
@@ -111,8 +109,8 @@ fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
 
 #[test]
 fn an_actor_from_elsewhere_plays_in_a_launched_run() {
-    let (endpoint, _) = listener();
-    plays_with_an_actor_from_elsewhere(&system().at(endpoint));
+    let (endpoint, _) = listen_on_free_port();
+    plays_with_an_actor_from_elsewhere(&system().with_endpoint(endpoint));
 }
 
 /// The run's own processes connect through a unix socket.
@@ -146,7 +144,7 @@ fn cpc_and_curl_get_what_they_need_and_no_more() {
         assert!(last > 0.0, "{agent}: {last}");
         system
             .run_ok(&format!("evaluate --run {agent} --episodes 3"))
-            .expect_printed(agent);
+            .expect_stdout(agent);
     }
 }
 
@@ -175,15 +173,15 @@ fn two_replay_shards_are_one_replay() {
     system.run_ok(&format!(
         "local --agent driml-ada {SHORT} --actors 2 --replay-shards 2 --run-dir run"
     ));
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
     let summary = system.run_folder("run").check(Outcome::Finished);
     // Each of the two limiters admits chunks until it learns the other's count.
     assert!((1280..=1800).contains(&summary.frames), "{summary:#?}");
     assert_eq!(summary.updates * 16, summary.replay.rows_sampled);
-    let owed = (summary.frames - 200) * 8 / 16;
-    assert!(owed - summary.updates <= 1, "{summary:#?}");
+    let updates_due = (summary.frames - 200) * 8 / 16;
+    assert!(updates_due - summary.updates <= 1, "{summary:#?}");
 
-    system.refuses_each(&format!(
+    system.rejects_each(&format!(
         "
         local {SHORT} --replay-shards 2 --actors 1 => 2 replay shards for 1 actors
         local {SHORT} --replay-shards 2 --actors 2 --lockstep => leave --replay-shards out

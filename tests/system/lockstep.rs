@@ -43,7 +43,7 @@ fn seed_and_settings_decide_the_weights() {
 }
 
 /// Returns the results of a run that are compared: weights, mean return, histogram of k, and episodes.
-fn result(it: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
+fn compared_results(it: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
     let k_histogram = it.replay.k_histogram;
     (it.weights_sha256, it.mean_return, k_histogram, it.episodes)
 }
@@ -65,35 +65,35 @@ pub(crate) fn continues_exactly(flags: &str) {
     };
     let whole = run(FRAMES, "whole");
     assert!(whole.updates > 300 && whole.episodes > 0, "{whole:#?}");
-    let whole = result(whole);
+    let whole = compared_results(whole);
 
     let half = run(FRAMES / 2, "half");
     assert_ne!(half.weights_sha256, whole.0);
     system.run_ok(&format!("local --resume half --frames {FRAMES}"));
     let prolonged = system.run_folder("half").check_finished();
-    assert_eq!(result(prolonged), whole, "prolonged");
+    assert_eq!(compared_results(prolonged), whole, "prolonged");
 
     for signal in [Signal::SIGINT, Signal::SIGKILL] {
         let system = crate::system();
-        system.hold_at(150);
+        system.pause_learners_at(150);
         let process = start(&system, FRAMES, "run");
         let run = system.run_folder("run");
         // The signal comes between two checkpoints.
         run.wait_for_updates(110);
         process.signal(signal);
-        system.let_go();
+        system.release_learners();
         let ended = process.wait();
         if signal == Signal::SIGINT {
             ended
                 .expect_code(130)
-                .expect_said("`driml train --resume run` resumes it");
+                .expect_stderr("`driml train --resume run` resumes it");
         }
         system
             .run_ok("local --resume run")
-            .expect_printed("with everything in lockstep");
+            .expect_stdout("with everything in lockstep");
         let resumed = run.check_finished();
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
-        assert_eq!(result(resumed), whole, "{signal}");
+        assert_eq!(compared_results(resumed), whole, "{signal}");
         // A world's process has a second to exit by itself after its run was killed.
         system.wait_until_all_have_ended();
     }
@@ -130,19 +130,17 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
     let mut world = folder.config()["world"].as_table().unwrap().clone();
     world.remove("kind");
     let world: ChainConfig = world.try_into().unwrap();
-    let wanted = 0.9 * optimal_discounted_return(&world, 1.0);
+    let return_min = 0.9 * optimal_discounted_return(&world, 1.0);
     let while_training = summary.mean_return.unwrap();
     assert!(
-        while_training >= wanted,
-        "the last 100 episodes, with exploration: {while_training} of {wanted}"
+        while_training >= return_min,
+        "the last 100 episodes, with exploration: {while_training} of {return_min}"
     );
 
-    let told = system
-        .run_ok("evaluate --run run --episodes 40 --json")
-        .json();
-    let mean = |policy: &str| told["policies"][policy]["mean_return"].as_f64().unwrap();
+    let json = system.run_json("evaluate --run run --episodes 40 --json");
+    let mean = |policy: &str| json["policies"][policy]["mean_return"].as_f64().unwrap();
     let (learned, random) = (mean("c51"), mean("random"));
-    assert!(learned >= wanted, "greedy: {learned} of {wanted}");
+    assert!(learned >= return_min, "greedy: {learned} of {return_min}");
     // A random walk reaches the far end in one of seven episodes.
-    assert!(random < 0.6 * wanted, "random: {random}");
+    assert!(random < 0.6 * return_min, "random: {random}");
 }

@@ -37,7 +37,7 @@ const CHUNKS: u64 = 32;
 const STEPS: u32 = 4;
 const TRANSITIONS: u64 = ACTORS as u64 * CHUNKS * STEPS as u64;
 /// How often each transition is sampled, on average. The probability that a given one is never drawn is exp(-64).
-const SAMPLED: u64 = 64;
+const SAMPLES_PER_TRANSITION: u64 = 64;
 const ROWS: u32 = 16;
 /// One of this many batches, or parts of batches, is lost.
 const LOSES: u32 = 4;
@@ -55,7 +55,7 @@ fn batches_spec() -> RunSpec {
 /// The endpoint of a replay server, at which a test replies.
 struct Endpoint {
     session: Session,
-    answered: Vec<Queryable<()>>,
+    queryables: Vec<Queryable<()>>,
     system: TestSystem,
 }
 
@@ -64,26 +64,26 @@ impl Endpoint {
         let system = system();
         Self {
             session: listen(system.endpoint()),
-            answered: Vec::new(),
+            queryables: Vec::new(),
             system,
         }
     }
 
     /// Replies to messages of type `M`.
-    fn answer<M: Keyed>(&mut self, answer: impl Fn(Query) + Send + Sync + 'static) {
+    fn on_message<M: Keyed>(&mut self, answer: impl Fn(Query) + Send + Sync + 'static) {
         let key = Keys::new("driml").unwrap().of::<M>();
         let queryable = self.session.declare_queryable(key).callback(answer).wait();
-        self.answered.push(queryable.unwrap());
+        self.queryables.push(queryable.unwrap());
     }
 }
 
 /// Decides by the number of a message about chunks whether the message arrives, and whether its reply arrives.
-type Passes = fn(u32) -> [bool; 2];
+type ArrivalRule = fn(u32) -> [bool; 2];
 
 /// A replay server behind a network that loses messages.
 struct Server {
     replay: Mutex<Replay>,
-    passes: Passes,
+    arrival_rule: ArrivalRule,
     messages: AtomicU32,
     /// How often each actor sent `Leave`.
     leaves: Mutex<BTreeMap<u32, u32>>,
@@ -92,18 +92,18 @@ struct Server {
 }
 
 impl Server {
-    fn new(passes: Passes) -> Arc<Self> {
+    fn new(arrival_rule: ArrivalRule) -> Arc<Self> {
         let config = Config {
-            replay_ratio: SAMPLED as f64,
+            replay_ratio: SAMPLES_PER_TRANSITION as f64,
             ..tiny_replay::config(2 * TRANSITIONS)
         };
         let mut replay = Replay::new(&spec(), &config, ROWS).unwrap();
         for actor in 0..ACTORS {
-            tiny_replay::join(&mut replay, actor);
+            tiny_replay::join_actor(&mut replay, actor);
         }
         Arc::new(Self {
             replay: Mutex::new(replay),
-            passes,
+            arrival_rule,
             messages: AtomicU32::new(0),
             leaves: Mutex::default(),
             lost: Mutex::default(),
@@ -112,14 +112,14 @@ impl Server {
 
     /// Replies to chunks, polls and leaves as a replay server does, except for lost messages.
     fn serve(self: &Arc<Self>, endpoint: &mut Endpoint) {
-        self.answer::<ChunkHeader>(endpoint, |server, header, payload| {
+        self.on_message::<ChunkHeader>(endpoint, |server, header, payload| {
             let chunk = Chunk::from_payload(header, payload.to_vec().into()).unwrap();
-            server.lossy(|replay| replay.insert(&chunk))
+            server.respond(|replay| replay.insert(&chunk))
         });
-        self.answer::<ChunkPoll>(endpoint, |server, poll, _| {
-            server.lossy(|replay| replay.answer_poll(&poll).expect("nothing is parked here"))
+        self.on_message::<ChunkPoll>(endpoint, |server, poll, _| {
+            server.respond(|replay| replay.answer_poll(&poll).expect("nothing is parked here"))
         });
-        self.answer::<Leave>(endpoint, |server, leave, _| {
+        self.on_message::<Leave>(endpoint, |server, leave, _| {
             let mut leaves = server.leaves.lock().unwrap();
             let tries = leaves.entry(leave.actor).or_default();
             *tries += 1;
@@ -132,13 +132,13 @@ impl Server {
         });
     }
 
-    fn answer<M: Request + 'static>(
+    fn on_message<M: Request + 'static>(
         self: &Arc<Self>,
         endpoint: &mut Endpoint,
         answer: fn(&Self, M, &[u8]) -> Option<M::Reply>,
     ) {
         let (server, hash) = (self.clone(), spec().hash());
-        endpoint.answer::<M>(move |query| {
+        endpoint.on_message::<M>(move |query| {
             let bytes = query.payload().unwrap().to_bytes();
             let (message, payload) = codec::decode(&bytes, Some(hash)).unwrap();
             match answer(&server, message, payload) {
@@ -151,10 +151,10 @@ impl Server {
         });
     }
 
-    fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<InsertReply> {
+    fn respond(&self, handle: impl FnOnce(&mut Replay) -> InsertReply) -> Option<InsertReply> {
         let message = self.messages.fetch_add(1, Ordering::Relaxed);
-        let [arrives, is_answered] = (self.passes)(message);
-        let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
+        let [arrives, is_answered] = (self.arrival_rule)(message);
+        let reply = arrives.then(|| handle(&mut self.replay.lock().unwrap()))?;
         is_answered.then_some(reply)
     }
 
@@ -172,16 +172,16 @@ impl Server {
         let status = replay.status();
         assert_eq!(status.transitions_inserted, TRANSITIONS, "{status:#?}");
         check_nothing_lost(&status);
-        let batches = TRANSITIONS * SAMPLED / u64::from(ROWS);
-        let numbers = tiny_replay::numbers(&mut replay, batches, ROWS);
+        let batches = TRANSITIONS * SAMPLES_PER_TRANSITION / u64::from(ROWS);
+        let numbers = tiny_replay::drawn_returns(&mut replay, batches, ROWS);
         // As many transitions are stored as there are numbers: if each number is present, none is stored twice.
         assert_eq!(numbers, (0..TRANSITIONS).collect());
     }
 }
 
 /// Delivers the chunks of `ACTORS` actors and checks that the server holds all of them. If `leaving`, the actors are told to stop first.
-fn deliver_all(passes: Passes, ack_timeout: Duration, leaving: bool) -> Arc<Server> {
-    let server = Server::new(passes);
+fn deliver_all(arrival_rule: ArrivalRule, ack_timeout: Duration, leaving: bool) -> Arc<Server> {
+    let server = Server::new(arrival_rule);
     let mut endpoint = Endpoint::open();
     server.serve(&mut endpoint);
     let limits = DeliveryLimits {
@@ -212,8 +212,8 @@ fn deliver_all(passes: Passes, ack_timeout: Duration, leaving: bool) -> Arc<Serv
 
 #[test]
 fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
-    let passes = |message: u32| [message % 5 != 1, message % 5 != 3];
-    let server = deliver_all(passes, Duration::from_millis(100), false);
+    let arrival_rule = |message: u32| [message % 5 != 1, message % 5 != 3];
+    let server = deliver_all(arrival_rule, Duration::from_millis(100), false);
     let retried = server.replay.lock().unwrap().status().chunks_retried;
     // Some replies were lost. How many chunks are then sent again, and not just polled, depends on the machine.
     assert!(retried > 0, "answers were to get lost");
@@ -222,8 +222,8 @@ fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
 /// An actor that leaves does not spend its time for delivery on one lost message.
 #[test]
 fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
-    let passes = |message: u32| [message >= 3 * ACTORS, true];
-    deliver_all(passes, Duration::from_secs(15), true);
+    let arrival_rule = |message: u32| [message >= 3 * ACTORS, true];
+    deliver_all(arrival_rule, Duration::from_secs(15), true);
 }
 
 fn config(shards: u32) -> Config {
@@ -235,15 +235,15 @@ fn config(shards: u32) -> Config {
 }
 
 /// Returns a shard that holds its share of the run.
-fn full(shard: u32, shards: u32) -> Replay {
+fn full_shard(shard: u32, shards: u32) -> Replay {
     let mut replay = Replay::shard(&batches_spec(), &config(shards), ROWS, shard).unwrap();
-    tiny_replay::join(&mut replay, 0);
-    fill(&mut replay, 0..TRANSITIONS / 8 / u64::from(shards));
+    tiny_replay::join_actor(&mut replay, 0);
+    fill_shard(&mut replay, 0..TRANSITIONS / 8 / u64::from(shards));
     replay
 }
 
 /// Stores chunks of 8 transitions with these sequence numbers.
-fn fill(replay: &mut Replay, sequences: Range<u64>) {
+fn fill_shard(replay: &mut Replay, sequences: Range<u64>) {
     for sequence in sequences {
         let stored = replay.insert(&tiny_replay::chunk(&batches_spec(), 0, sequence, 8));
         assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
@@ -251,7 +251,7 @@ fn fill(replay: &mut Replay, sequences: Range<u64>) {
 }
 
 /// Replies as a replay server does, but draws some batches without sending them.
-fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
+fn reply_with_losses(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
     let hash = batches_spec().hash();
     let payload = query.payload().unwrap().to_bytes();
     let (request, _): (BatchRequest, _) = codec::decode(&payload, Some(hash)).unwrap();
@@ -284,11 +284,11 @@ fn serve(shards: Vec<Replay>) -> Shards {
     for replay in shards {
         let mut endpoint = Endpoint::open();
         let replay = Arc::new(Mutex::new(replay));
-        let (asked, count) = (replay.clone(), drawn.clone());
-        endpoint.answer::<BatchRequest>(move |query| answer(&query, &asked, &count));
-        let asked = replay.clone();
-        endpoint.answer::<ReplayStatus>(move |query| {
-            let status = asked.lock().unwrap().status();
+        let (state, count) = (replay.clone(), drawn.clone());
+        endpoint.on_message::<BatchRequest>(move |query| reply_with_losses(&query, &state, &count));
+        let state = replay.clone();
+        endpoint.on_message::<ReplayStatus>(move |query| {
+            let status = state.lock().unwrap().status();
             let bytes = codec::encode(batches_spec().hash(), &status, &[]).unwrap();
             session::answer(&query, bytes.into());
         });
@@ -309,7 +309,7 @@ fn serve(shards: Vec<Replay>) -> Shards {
 #[test]
 fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     for shards in [1, 3] {
-        let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
+        let mut served = serve((0..shards).map(|shard| full_shard(shard, shards)).collect());
         let mut batches = 0;
         while let Some(ServedBatch { batch, parts }) = served.learner.next() {
             assert_eq!(batch.rows(), ROWS as usize);
@@ -342,7 +342,7 @@ fn endless_shards() -> Vec<Replay> {
     };
     let shard = |shard| {
         let mut replay = Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap();
-        tiny_replay::join(&mut replay, 0);
+        tiny_replay::join_actor(&mut replay, 0);
         replay
     };
     (0..2).map(shard).collect()
@@ -353,7 +353,7 @@ fn endless_shards() -> Vec<Replay> {
 #[test]
 fn a_shard_that_fills_late_is_asked() {
     let mut shards = endless_shards();
-    fill(&mut shards[0], 0..8);
+    fill_shard(&mut shards[0], 0..8);
     let mut served = serve(shards);
     for batches in 0..1_000 {
         let parts = served.learner.next().unwrap().parts;
@@ -364,9 +364,9 @@ fn a_shard_that_fills_late_is_asked() {
         }
         let replays: Vec<_> = served.replays.iter().map(|it| it.lock().unwrap()).collect();
         let [mut first, mut second] = <[_; 2]>::try_from(replays).ok().unwrap();
-        fill(&mut first, 8 + 2 * batches..10 + 2 * batches);
+        fill_shard(&mut first, 8 + 2 * batches..10 + 2 * batches);
         if batches == 3 {
-            fill(&mut second, 0..8);
+            fill_shard(&mut second, 0..8);
         }
     }
     panic!("a shard that holds something is never drawn from");
@@ -378,8 +378,8 @@ fn a_shard_that_waits_hears_what_the_other_gave() {
     let slack = config(2).slack_transitions;
     let mut shards = endless_shards();
     // Most batches are drawn from the first shard alone.
-    fill(&mut shards[0], 0..slack / 8);
-    fill(&mut shards[1], 0..1);
+    fill_shard(&mut shards[0], 0..slack / 8);
+    fill_shard(&mut shards[1], 0..1);
     let mut served = serve(shards);
     let held = slack + 8;
     for _ in 0..held / u64::from(ROWS) {
@@ -396,8 +396,8 @@ fn a_shard_that_waits_hears_what_the_other_gave() {
         inserted: 2 * slack,
         rows_sampled: 0,
     };
-    let waits = insert(Some(actors_ahead));
-    assert!(matches!(waits, InsertReply::Wait { .. }), "{waits:?}");
+    let reply = insert(Some(actors_ahead));
+    assert!(matches!(reply, InsertReply::Wait { .. }), "{reply:?}");
     wait_until("the shard's inserts wait no more", || {
         matches!(insert(None), InsertReply::Stored { .. })
     });

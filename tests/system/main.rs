@@ -7,7 +7,6 @@ mod by_hand;
 mod circles;
 mod cli;
 mod closed_terminal;
-mod company;
 mod disk_full;
 mod diverging;
 mod doctor;
@@ -21,6 +20,7 @@ mod limits;
 mod local;
 mod lockstep;
 mod lost_messages;
+mod many_processes;
 mod numbered;
 mod own_worlds;
 mod pages;
@@ -55,7 +55,7 @@ fn system() -> TestSystem {
 }
 
 /// Returns an unused endpoint and its listener. The loopback address belongs to this process, so no other takes the port meanwhile.
-fn listener() -> (String, TcpListener) {
+fn listen_on_free_port() -> (String, TcpListener) {
     let [_, high, middle, low] = std::process::id().to_be_bytes();
     let address = Ipv4Addr::new(127, high, middle, low);
     let listener = TcpListener::bind((address, 0)).unwrap();
@@ -83,13 +83,13 @@ const PRIORITISED: &str =
     "--set 'replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}'";
 
 /// Starts a run of `driml-ada` and waits until it has made more than `updates` updates.
-fn launched(system: &TestSystem, updates: u64) -> Process {
-    launched_with(system, "--agent driml-ada", updates)
+fn start_run(system: &TestSystem, updates: u64) -> Process {
+    start_run_with(system, "--agent driml-ada", updates)
 }
 
 /// Starts a run with these flags and waits until it has made more than `updates` updates.
-fn launched_with(system: &TestSystem, flags: &str, updates: u64) -> Process {
-    let process = system.start(&system.local(&format!("{LONG} {flags}")));
+fn start_run_with(system: &TestSystem, flags: &str, updates: u64) -> Process {
+    let process = system.start(&system.local_args(&format!("{LONG} {flags}")));
     system.connect().wait_for_updates(updates);
     process
 }

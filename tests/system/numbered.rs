@@ -18,33 +18,33 @@ const ACTORS: u32 = 3;
 const CHUNKS: u64 = 40;
 const STREAMS: u32 = 4;
 const STEPS: u32 = 8;
-const OF_AN_ACTOR: u64 = CHUNKS * (STREAMS * STEPS) as u64;
-const TRANSITIONS: u64 = ACTORS as u64 * OF_AN_ACTOR;
+const TRANSITIONS_PER_ACTOR: u64 = CHUNKS * (STREAMS * STEPS) as u64;
+const TRANSITIONS: u64 = ACTORS as u64 * TRANSITIONS_PER_ACTOR;
 /// The values of the preset `smoke`.
 pub(crate) const WARMUP: u64 = 200;
 pub(crate) const ROWS: u32 = 16;
 /// The replay ratio: rows per transition.
 const RATIO: u64 = 16;
 /// How often each transition is drawn at the end, on average. The probability that a given one is never drawn is exp(-64).
-const DRAWN: u64 = 64;
+const DRAWS_PER_TRANSITION: u64 = 64;
 /// How often the server is killed.
 pub(crate) const KILLS: u64 = 6;
 
 /// Delivers all of one actor's chunks; each transition is one episode whose return is its number.
-fn deliver(run: RunClient, first: ChunkHeader) {
+fn deliver_chunks(run: RunClient, first: ChunkHeader) {
     let limits = DeliveryLimits {
         chunks_in_flight_max: 4,
         ack_timeout: Duration::from_secs(2),
         unreachable_max: Duration::from_secs(60),
     };
-    let number = u64::from(first.actor) * OF_AN_ACTOR;
+    let number = u64::from(first.actor) * TRANSITIONS_PER_ACTOR;
     let mut synthetic = SyntheticActor::start(run, first, limits, &Shutdown::default());
     (0..CHUNKS).for_each(|_| synthetic.send(number));
     synthetic.finish();
 }
 
 /// Returns the numbers of all transitions in the replay of a server that has ended. Draws rows until each number was seen.
-fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
+fn stored_numbers(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
     let mut config: Config = Settings::parse(config_toml)
         .unwrap()
         .table("replay")
@@ -62,16 +62,16 @@ fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSe
         "{recovery:?}"
     );
     replay.check_valid();
-    let batches = TRANSITIONS * DRAWN / u64::from(ROWS);
-    tiny_replay::numbers(&mut replay, batches, ROWS)
+    let batches = TRANSITIONS * DRAWS_PER_TRANSITION / u64::from(ROWS);
+    tiny_replay::drawn_returns(&mut replay, batches, ROWS)
 }
 
 /// The number of rows sampled from all transitions.
-pub(crate) const SAMPLED: u64 = (TRANSITIONS - WARMUP) * RATIO;
+pub(crate) const ROWS_SAMPLED: u64 = (TRANSITIONS - WARMUP) * RATIO;
 
-/// Kills the server each time it has served the next number of rows in `moments`. Checks that the numbers in the replay equal those sent,
-/// and that each planned batch was served.
-pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
+/// Kills the server each time it has served the next number of rows in `kill_points`. Checks that the numbers in the replay equal those
+/// sent, and that each planned batch was served.
+pub(crate) fn kill_after_rows(kill_points: impl IntoIterator<Item = u64>) {
     let system = system();
     let flags = format!(
         "--agent c51 --env chain --preset smoke --frames {TRANSITIONS} --set replay.replay_ratio={RATIO} --replay-dir replay"
@@ -87,7 +87,7 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
         for actor in 0..ACTORS {
             let first = tiny_replay::header(&client.spec, actor, STREAMS, STEPS);
             let run = run();
-            scope.spawn(move || deliver(run, first));
+            scope.spawn(move || deliver_chunks(run, first));
         }
         let mut learner = SyntheticLearner::start(&[run()], 7, ROWS, 1);
         let learning = scope.spawn(move || {
@@ -95,14 +95,14 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
             learner.end();
             batches as u64
         });
-        for rows in moments {
+        for rows in kill_points {
             client.wait_for_replay("some more rows", |replay| replay.rows_sampled > rows);
             server.take().into_iter().for_each(Process::kill);
             server = Some(system.start_replay_server(&flags));
         }
         learning.join().unwrap()
     });
-    assert_eq!(batches, SAMPLED / u64::from(ROWS));
+    assert_eq!(batches, ROWS_SAMPLED / u64::from(ROWS));
     // A server that has just started may not be reached at once.
     let replay = client.wait_for_replay("the counts in the end", |_| true);
     check_nothing_lost(&replay);
@@ -111,12 +111,12 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
     let (spec, config_toml) = (client.spec.clone(), client.config_toml.clone());
     drop(client);
     server.into_iter().for_each(Process::kill);
-    let numbers = numbers_in(&system, &spec, &config_toml);
+    let numbers = stored_numbers(&system, &spec, &config_toml);
     let missing = (0..TRANSITIONS).find(|it| !numbers.contains(it));
     assert_eq!((missing, numbers.len() as u64), (None, TRANSITIONS));
 }
 
 #[test]
 fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
-    kill_after_rows((1..=KILLS).map(|round| round * SAMPLED / (KILLS + 1)));
+    kill_after_rows((1..=KILLS).map(|round| round * ROWS_SAMPLED / (KILLS + 1)));
 }

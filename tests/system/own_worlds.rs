@@ -8,27 +8,27 @@ use driml_tests::{python, skipped_offline, succeeds, wait_until};
 use crate::{lockstep::continues_exactly, repo_rules::root, system};
 
 /// The preset `smoke`, and the settings that a world with frames of 12 x 12 needs.
-const SMALL: &str =
+const SMALL_WORLD: &str =
     "--preset smoke --set run.frame_stack=2 --set model.conv=[{out=8,kernel=4,stride=2}]";
 
 /// Returns the path of a file of this repository.
-fn file(name: &str) -> String {
+fn repo_file(name: &str) -> String {
     root().join(name).display().to_string()
 }
 
 /// Returns the command of a world whose frames contain their own number. Needs only `python3`.
-fn numbered(fault: &str) -> String {
+fn numbered_world(fault: &str) -> String {
     format!(
         "exec:exec python3 {} {fault}",
-        file("tests/worlds/numbered.py")
+        repo_file("tests/worlds/numbered.py")
     )
 }
 
 #[test]
 fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let system = system();
-    let env = numbered("");
-    let flags = format!("{SMALL} --agent driml-ada --frames 1280 --env '{env}'");
+    let env = numbered_world("");
+    let flags = format!("{SMALL_WORLD} --agent driml-ada --frames 1280 --env '{env}'");
     let summary = system.train(&format!("{flags} --actors 2"), "run");
     assert_eq!(summary.frames, 1280);
     // Each episode of a copy lasts three to six steps.
@@ -49,21 +49,21 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     // Each episode ends with a reward of 1000; each step before gives at most 2.
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }
 
 #[test]
 fn a_process_that_saves_its_state_continues_exactly_in_lockstep() {
-    let env = numbered("saves");
-    continues_exactly(&format!("{SMALL} --agent driml-ada --env '{env}'"));
+    let env = numbered_world("saves");
+    continues_exactly(&format!("{SMALL_WORLD} --agent driml-ada --env '{env}'"));
 }
 
 #[test]
 fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
     let run = |fault| {
         let flags = format!(
-            "{SMALL} --agent c51 --frames 640 --env '{}'",
-            numbered(fault)
+            "{SMALL_WORLD} --agent c51 --frames 640 --env '{}'",
+            numbered_world(fault)
         );
         format!("local --lockstep {flags} --run-dir run")
     };
@@ -78,11 +78,11 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
         let ended = system.run_ok(&run(fault));
         assert!(!ended.stdout.contains("--resume"), "{}", ended.stdout);
         ended
-            .expect_said(sentence)
-            .expect_said(": the run cannot be resumed, only repeated");
+            .expect_stderr(sentence)
+            .expect_stderr(": the run cannot be resumed, only repeated");
         let cannot =
             "the run in run cannot be resumed, because the state of its world cannot be saved";
-        system.refuses("local --resume run --frames 1280", cannot);
+        system.rejects("local --resume run --frames 1280", cannot);
         let run = system.run_folder("run");
         run.check_finished();
         assert!(!run.path().join("replay").exists());
@@ -93,13 +93,13 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
 }
 
 /// The last chunk, of eight steps of four copies, waits for thousands of updates when the world fails.
-const SLOW: &str = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
+const SLOW_LEARNER: &str = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
 
 #[test]
 fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored() {
     for (fault, limit, sentence) in [
         ("kill 20", "", "ended in the middle of a step (signal: 9"),
-        ("raise 25", SLOW, "the dragon got out"),
+        ("raise 25", SLOW_LEARNER, "the dragon got out"),
         (
             "hang 20",
             "--set world.step_timeout_ms=1500",
@@ -107,11 +107,11 @@ fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored
         ),
     ] {
         let system = system();
-        let env = numbered(fault);
-        let flags = format!("{SMALL} {limit} --agent c51 --frames 100000 --env '{env}'");
+        let env = numbered_world(fault);
+        let flags = format!("{SMALL_WORLD} {limit} --agent c51 --frames 100000 --env '{env}'");
         system.fails(&format!("local {flags} --run-dir run"), sentence);
-        assert_eq!(system.survivors(), [], "{fault}");
-        if limit == SLOW {
+        assert_eq!(system.running_processes(), [], "{fault}");
+        if limit == SLOW_LEARNER {
             // On a slow machine the actor is restarted, and plays the same number of frames again.
             let frames = system.run_folder("run").summary().frames;
             assert!(frames > 0 && frames.is_multiple_of(3 * 8 * 4), "{frames}");
@@ -122,8 +122,8 @@ fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored
 #[test]
 fn a_command_that_is_no_world_is_refused_before_anything_starts() {
     let system = system();
-    let local = format!("local {SMALL} --run-dir run");
-    system.refuses_each(&format!(
+    let local = format!("local {SMALL_WORLD} --run-dir run");
+    system.rejects_each(&format!(
         "
         {local} --env exec:no-such-command => the shell found no such command
         {local} --env 'exec:echo hello' => does not declare itself as a world
@@ -131,37 +131,35 @@ fn a_command_that_is_no_world_is_refused_before_anything_starts() {
         "
     ));
     assert!(!system.path("run").exists());
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }
 
 #[test]
 fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let system = system();
-    let env = numbered("");
-    let flags = format!("{SMALL} --agent c51 --frames 100000000 --env '{env}'");
+    let env = numbered_world("");
+    let flags = format!("{SMALL_WORLD} --agent c51 --frames 100000000 --env '{env}'");
     let server = system.start_replay_server(&flags);
     let learner = system.start_learner("run");
     system
         .start_actor(0)
         .fails("an actor starts none because a replay server says so")
-        .expect_said("--env \"exec:exec python3 ");
-    let actor = |flags: &str| system.start_process(&system.connected(&format!("actor {flags}")));
+        .expect_stderr("--env \"exec:exec python3 ");
+    let actor = |flags: &str| system.start_process(&system.connect_args(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");
     // An actor whose world takes long to start stops at once.
     let mut starting = actor("--id 2 --env 'exec:echo starts >&2; exec sleep 100'");
     starting.wait_for_stderr("starts");
     starting.stop().expect_code(130);
     // The same world by another command, as another machine may have it. This world will hang.
-    let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
+    let mut hanging = actor(&format!("--id 1 --env '{}'", numbered_world("hang 50")));
     let client = system.connect();
     client.wait_for_replay("the actor", |replay| replay.actors == 1);
-    wait_until("the world's hanging", || {
-        hanging.stderr().contains("sleeping")
-    });
+    hanging.wait_for_stderr("sleeping");
     // A world's process that ignores its pipes does not outlive its actor, however the actor ends.
     let worlds = || {
         let is_world = |word: &String| word.ends_with("numbered.py");
-        let all = system.survivors().into_iter();
+        let all = system.running_processes().into_iter();
         all.filter(|it| it.args.iter().any(is_world)).count()
     };
     assert_eq!(worlds(), 1);
@@ -185,7 +183,7 @@ fn gymnasium() -> Option<String> {
     let lock = fs::File::create(folder.join("lock")).unwrap();
     lock.lock().unwrap();
     if !ready.exists() {
-        let requirements = file("deploy/python/requirements.txt");
+        let requirements = repo_file("deploy/python/requirements.txt");
         let script = format!(
             "python3 -m venv {0} && {0}/bin/pip install --quiet --disable-pip-version-check -r {requirements}",
             folder.display()
@@ -202,7 +200,7 @@ fn gymnasium() -> Option<String> {
 fn atari_by_gymnasium_trains() {
     let Some(python) = gymnasium() else { return };
     let system = system();
-    let script = file("deploy/python/driml_env.py");
+    let script = repo_file("deploy/python/driml_env.py");
     let env = format!("exec:{python} {script} ALE/Pong-v5 --atari");
     let flags = format!("--preset smoke --agent c51 --frames 480 --env '{env}'");
     assert_eq!(system.train(&flags, "run").frames, 480);
@@ -213,21 +211,21 @@ fn atari_by_gymnasium_trains() {
         assert_eq!(config["world"][side].as_integer(), Some(84));
     }
     assert_eq!(config["world"]["channels"].as_integer(), Some(1));
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }
 
 /// The states of ALE's emulator, wrappers and random generators are restored.
 #[test]
 fn atari_continues_exactly_in_lockstep() {
     let Some(python) = gymnasium() else { return };
-    let script = file("deploy/python/driml_env.py");
+    let script = repo_file("deploy/python/driml_env.py");
     let env = format!("exec:{python} {script} ALE/Breakout-v5 --atari --clip --size 20");
-    continues_exactly(&format!("{SMALL} --agent driml-ada --env '{env}'"));
+    continues_exactly(&format!("{SMALL_WORLD} --agent driml-ada --env '{env}'"));
 }
 
 /// Runs the adapter's own test, which needs Gymnasium: all autoreset modes of vector environments, seeds, shapes, and rejected worlds.
 #[test]
 fn the_adapter_keeps_gymnasium_s_episodes() {
     let Some(python) = gymnasium() else { return };
-    python::run(&python, &[&file("tests/worlds/check_adapter.py")], &[]);
+    python::run_script(&python, &[&repo_file("tests/worlds/check_adapter.py")], &[]);
 }

@@ -69,7 +69,7 @@ fn anchors(text: &str) -> BTreeSet<String> {
 fn every_link_leads_to_a_file_and_heading_of_the_repository() {
     check_pages("links that lead nowhere", |page| {
         let path = root().join(&page.name);
-        let leads = |link: &str| {
+        let resolves = |link: &str| {
             let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
             let target = match file {
                 "" => path.clone(),
@@ -81,7 +81,7 @@ fn every_link_leads_to_a_file_and_heading_of_the_repository() {
         let rests = page.text.split("](").skip(1);
         let links = rests.filter_map(|rest| rest.split_once(')').map(|it| it.0));
         links
-            .filter(|link| !link.contains("://") && !leads(link))
+            .filter(|link| !link.contains("://") && !resolves(link))
             .map(str::to_owned)
             .collect()
     });
@@ -111,13 +111,13 @@ fn the_book_lists_each_of_its_pages_once() {
         .map(|rest| Path::new(DOCS).join(rest.split(')').next().unwrap()))
         .collect();
     listed.sort();
-    let mut there: Vec<_> = pages()
+    let mut existing: Vec<_> = pages()
         .into_iter()
         .filter(|page| page.name.starts_with(DOCS) && !page.name.ends_with("SUMMARY.md"))
         .map(|page| PathBuf::from(page.name))
         .collect();
-    there.sort();
-    assert_eq!(listed, there);
+    existing.sort();
+    assert_eq!(listed, existing);
 }
 
 #[test]

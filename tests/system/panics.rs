@@ -2,7 +2,7 @@
 //! In debug builds `DRIML_TEST_PANIC` triggers the panics (`driml_protocol::fail_point`).
 
 use driml_protocol::fail_point;
-use driml_tests::{Outcome, at_once};
+use driml_tests::{Outcome, in_parallel};
 
 use crate::{LONG, PRIORITISED, system};
 
@@ -11,7 +11,7 @@ const LAUNCHER: &str = "launcher";
 
 /// The process's name in the launcher, the fail points in its threads, and the flags of a run that has these threads. If several processes
 /// have them, any of them may panic first.
-static THREADS: [(&str, &str, &str); 8] = [
+static FAIL_POINTS: [(&str, &str, &str); 8] = [
     (
         "replay-server",
         "insert, poll, admit, request, sample, affinity, run-info, join-actor, join-learner, leave, weights-upload, weights, status, \
@@ -32,7 +32,7 @@ static THREADS: [(&str, &str, &str); 8] = [
 ];
 
 /// Checks that a panic at `point` ends a run.
-fn ends_the_run((process, point, flags): (&str, &str, &str)) {
+fn check_panic_ends_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
     let ended = system.run(&format!(
         "env '{}={point}' DRIML local --agent driml-ada {LONG} {flags} --run-dir run",
@@ -49,10 +49,10 @@ fn ends_the_run((process, point, flags): (&str, &str, &str)) {
         );
         return system.wait_until_all_have_ended();
     }
-    assert_eq!(system.survivors(), [], "{point}");
+    assert_eq!(system.running_processes(), [], "{point}");
     assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
-    let said = format!(": the thread {point}");
-    let line = ended.stderr.lines().find(|line| line.contains(&said));
+    let thread = format!(": the thread {point}");
+    let line = ended.stderr.lines().find(|line| line.contains(&thread));
     let line = line.unwrap_or_else(|| panic!("{point}: {ended:#?}"));
     contains(line, " panicked at ");
     contains(
@@ -73,13 +73,13 @@ fn a_panic_in_any_thread_ends_the_run_and_is_named() {
     if !cfg!(debug_assertions) {
         return driml_tests::skip("a release build");
     }
-    let threads = THREADS.iter().flat_map(|(process, points, flags)| {
+    let threads = FAIL_POINTS.iter().flat_map(|(process, points, flags)| {
         let points = points.split(", ");
         points.map(move |point| (*process, point, *flags))
     });
     let threads: Vec<_> = threads.collect();
     // These runs spend more time waiting for processes to end than computing.
-    at_once(threads.chunks(6), |some| {
-        some.iter().copied().for_each(ends_the_run);
+    in_parallel(threads.chunks(6), |some| {
+        some.iter().copied().for_each(check_panic_ends_run);
     });
 }

@@ -26,12 +26,12 @@ fn a_case_with_another_expectation_fails() {
         call += &format!(" {tensor}");
     }
     let ended = system.fails(&call, "error: 5 of 6 files are out of tolerance");
-    let said = &ended.stdout;
-    let failed: Vec<_> = said.lines().filter(|it| it.ends_with("FAILED")).collect();
-    assert_eq!(failed.len(), CHANGED.len(), "{said}");
+    let stdout = &ended.stdout;
+    let failed: Vec<_> = stdout.lines().filter(|it| it.ends_with("FAILED")).collect();
+    assert_eq!(failed.len(), CHANGED.len(), "{stdout}");
     for ((_, tensor), line) in CHANGED.iter().zip(failed) {
         let name = tensor.trim_start_matches("expect.");
-        assert!(line.contains(name), "{tensor}: {line}\n{said}");
+        assert!(line.contains(name), "{tensor}: {line}\n{stdout}");
     }
 }
 

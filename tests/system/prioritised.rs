@@ -7,7 +7,7 @@ use crate::{PRIORITISED, SHORT, system};
 
 /// Returns the numbers of the last line with `words`. A replay server logs rows whose priority was set, came too late and came twice; the
 /// learner logs updates whose priorities arrived.
-pub(crate) fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
+pub(crate) fn logged_counts<const N: usize>(log: &str, words: &str) -> [u64; N] {
     let line = log.lines().rfind(|line| line.contains(words));
     let line = line.unwrap_or_else(|| panic!("no word of priorities: {log}"));
     let start = line.find("priorities of ").unwrap();
@@ -18,7 +18,7 @@ pub(crate) fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
 
 /// The batch size of the preset `smoke`.
 const BATCH_ROWS: u64 = 16;
-pub(crate) const SET: &str = "rows were set";
+pub(crate) const ROWS_WERE_SET: &str = "rows were set";
 
 /// The servers got the priorities of all updates that the learner counts as arrived. On a busy machine it exits before some arrive.
 #[test]
@@ -30,18 +30,18 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
         ));
         let run = system.run_folder("run");
         let summary = run.check(Outcome::Finished);
-        let mut logs = system.names("run/logs");
+        let mut logs = system.file_names("run/logs");
         logs.retain(|name| name.starts_with("replay-server"));
         let all = logs.iter().map(|name| {
             let log = system.read(&format!("run/logs/{name}"));
-            said::<3>(&log, SET)
+            logged_counts::<3>(&log, ROWS_WERE_SET)
         });
         let sums = all.fold([0; 3], |sums, counts| {
             std::array::from_fn(|at| sums[at] + counts[at])
         });
         let [set, gone, repeated] = sums;
         let rows = summary.replay.rows_sampled;
-        let [arrived] = said(&run.log("learner"), "updates have arrived");
+        let [arrived] = logged_counts(&run.log("learner"), "updates have arrived");
         assert!(arrived > 0 && set + gone <= rows, "{sums:?} of {rows}");
         assert!(
             set + gone >= arrived * BATCH_ROWS,

@@ -20,7 +20,7 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
     assert!(summary.mean_k.is_some());
     system
         .run_ok("evaluate --run run --episodes 2 --levels unseen")
-        .expect_printed("procgen:bigfish on unseen levels, 2 episodes each");
+        .expect_stdout("procgen:bigfish on unseen levels, 2 episodes each");
 }
 
 /// The engine's frames lose a border that no convolution reads. At 104 x 80 they are enlarged after that.
@@ -70,7 +70,7 @@ fn a_run_that_is_prolonged_is_a_longer_one() {
         assert_ne!(half.weights_sha256, whole.weights_sha256);
         system
             .run_ok(&format!("local --resume {game}-608"))
-            .expect_printed("nothing is left to do");
+            .expect_stdout("nothing is left to do");
         system.run_ok(&format!("local --resume {game}-608 --frames 1216"));
         let resumed = system.run_folder(&format!("{game}-608")).check_finished();
         assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{game}");

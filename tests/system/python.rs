@@ -14,8 +14,8 @@ use driml_learner::{
 use driml_machine::resources::Machine;
 use driml_settings::{config::RunConfig, flags::of_names};
 use driml_tests::{
-    TestSystem, check_has, note,
-    python::{python_with, run},
+    TestSystem, check_has, print_line,
+    python::{find_python, run_script},
 };
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -26,13 +26,13 @@ use crate::{
 };
 
 /// The largest allowed difference of a value, and of a probability, between PyTorch and driml, both in f32.
-const VALUE_OFF: f64 = 2e-5;
-const PROBABILITY_OFF: f64 = 2e-6;
+const VALUE_ERROR_MAX: f64 = 2e-5;
+const PROB_ERROR_MAX: f64 = 2e-6;
 /// The number of states that are compared.
 const STATES: usize = 16;
 
 /// A script that prints values and probabilities of the states in a file, as JSON.
-const ASK: &str = "
+const TORCH_PY: &str = "
 import json, sys
 sys.path.insert(0, sys.argv[1])
 import torch
@@ -47,7 +47,7 @@ print(json.dumps([values.flatten().tolist(), logits.softmax(-1).flatten().tolist
 ";
 
 /// A script that prints the values that ONNX Runtime computes.
-const ASK_ONNX: &str = "
+const ONNX_PY: &str = "
 import json, sys
 import numpy, onnxruntime
 session = onnxruntime.InferenceSession(sys.argv[1], providers=['CPUExecutionProvider'])
@@ -58,7 +58,7 @@ print(json.dumps(session.run(['q_values'], {'states': states})[0].flatten().toli
 
 /// A run of each kind of network: all heads of local and global DIM with enlarged stacks, C51 alone with averaged weights, Rainbow's
 /// streams of noisy layers, and the residual torsos.
-const RUNS: [&str; 5] = [
+const RUN_FLAGS: [&str; 5] = [
     "--env mspacman --agent driml-ada --preset smoke --frames 320",
     "--env chain --agent c51 --preset smoke --frames 320 --set learner.update.average_tau=0.01",
     "--env chain --agent rainbow --preset smoke --frames 320",
@@ -67,7 +67,7 @@ const RUNS: [&str; 5] = [
 ];
 
 /// Makes a run. Returns its agent and the agent's outputs for random states, which are in a file beside the run.
-fn trained(system: &TestSystem, flags: &str) -> (Agent, NetworkOutputs) {
+fn train_agent(system: &TestSystem, flags: &str) -> (Agent, NetworkOutputs) {
     let _ = fs::remove_dir_all(system.path("run"));
     system.run_ok(&format!("local --lockstep {flags} --run-dir run"));
     let config = RunConfig::parse("config.toml", &system.read("run/config.toml")).unwrap();
@@ -95,15 +95,15 @@ fn largest_difference(ours: &[f32], theirs: &serde_json::Value) -> f64 {
 
 #[test]
 fn pytorch_and_onnx_runtime_compute_what_driml_does() {
-    let Some(python) = python_with(&["torch"]) else {
+    let Some(python) = find_python(&["torch"]) else {
         return;
     };
-    let has_onnx = python_with(&["onnx", "onnxscript", "onnxruntime"]).is_some();
+    let has_onnx = find_python(&["onnx", "onnxscript", "onnxruntime"]).is_some();
     let system = system();
     let scripts = root().join("deploy/python");
     let script = scripts.join("driml_net.py").display().to_string();
-    for flags in RUNS {
-        let (agent, ours) = trained(&system, flags);
+    for flags in RUN_FLAGS {
+        let (agent, ours) = train_agent(&system, flags);
         let path = |name: &str| system.path(name).display().to_string();
         let args = [
             &scripts.display().to_string(),
@@ -111,36 +111,36 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
             &path("states"),
         ];
         let args = args.map(String::as_str);
-        let ask = || -> serde_json::Value {
-            serde_json::from_str(&run(&python, &["-c", ASK], &args)).unwrap()
+        let torch_outputs = || -> serde_json::Value {
+            serde_json::from_str(&run_script(&python, &["-c", TORCH_PY], &args)).unwrap()
         };
-        let theirs = ask();
+        let theirs = torch_outputs();
         let value = largest_difference(&ours.q_values, &theirs[0]);
         let probability = largest_difference(&ours.probabilities, &theirs[1]);
-        note(&format!(
+        print_line(&format!(
             "{flags}: values {value:.1e}, probabilities {probability:.1e}"
         ));
-        assert!(value < VALUE_OFF, "{flags}: {value}");
-        assert!(probability < PROBABILITY_OFF, "{flags}: {probability}");
+        assert!(value < VALUE_ERROR_MAX, "{flags}: {value}");
+        assert!(probability < PROB_ERROR_MAX, "{flags}: {probability}");
         if has_onnx {
             let net = path("net.onnx");
-            let said = run(&python, &[&script], &[&path("run"), "--onnx", &net]);
-            assert!(said.contains("wrote"), "{said}");
+            let output = run_script(&python, &[&script], &[&path("run"), "--onnx", &net]);
+            assert!(output.contains("wrote"), "{output}");
             let model = agent.model();
             let shape = format!(
                 "-1,{},{},{}",
                 model.height, model.width, model.input_channels
             );
-            let answer = run(&python, &["-c", ASK_ONNX], &[&net, &path("states"), &shape]);
+            let answer = run_script(&python, &["-c", ONNX_PY], &[&net, &path("states"), &shape]);
             let off = largest_difference(&ours.q_values, &serde_json::from_str(&answer).unwrap());
-            note(&format!("{flags}: ONNX values {off:.1e}"));
-            assert!(off < VALUE_OFF, "{flags}: {off}");
+            print_line(&format!("{flags}: ONNX values {off:.1e}"));
+            assert!(off < VALUE_ERROR_MAX, "{flags}: {off}");
         }
         // A checkpoint of an earlier version has no metadata; `config.toml` contains the same facts.
         let newest = system.run_folder("run").checkpoints().pop().unwrap();
         let bare = agent.online().to_safetensors(|_| true).unwrap();
         fs::write(newest.join("online.safetensors"), bare).unwrap();
-        assert_eq!(ask(), theirs);
+        assert_eq!(torch_outputs(), theirs);
     }
 }
 
@@ -158,7 +158,7 @@ fn the_page_has_the_actions_in_their_order() {
 
 #[test]
 fn optuna_searches() {
-    let Some(python) = python_with(&["optuna"]) else {
+    let Some(python) = find_python(&["optuna"]) else {
         return;
     };
     let system = system();
@@ -173,7 +173,7 @@ fn optuna_searches() {
             "--out",
             out.to_str().unwrap(),
         ]);
-        run(&python, &[script.to_str().unwrap()], &args)
+        run_script(&python, &[script.to_str().unwrap()], &args)
     };
     check_has(&search(), &["best: ", "replay_ratio"]);
     // The search continues: the second trial has number 1.
@@ -185,7 +185,7 @@ fn optuna_searches() {
 
 #[test]
 fn a_helper_without_its_package_says_which() {
-    let Some(python) = python_with(&[]) else {
+    let Some(python) = find_python(&[]) else {
         return;
     };
     for (script, args, package) in [
@@ -206,12 +206,12 @@ fn a_helper_without_its_package_says_which() {
         // A script that fails earlier does not read this input.
         let _ = process.stdin.take().unwrap().write_all(asks);
         let ended = process.wait_with_output().unwrap();
-        let said = String::from_utf8_lossy(&ended.stderr);
+        let stderr = String::from_utf8_lossy(&ended.stderr);
         let names = format!("{script} needs the package {package}: ");
         let install = format!("-m pip install {package}\n");
         assert!(
-            said.starts_with(&names) && said.ends_with(&install),
-            "{said}"
+            stderr.starts_with(&names) && stderr.ends_with(&install),
+            "{stderr}"
         );
         assert_eq!(ended.status.code(), Some(1));
     }

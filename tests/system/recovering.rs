@@ -12,7 +12,7 @@ use driml_tests::{Client, Process, SlowMachine, TestSystem, check_has, new_learn
 use serde_json::Value;
 
 use crate::{
-    refusals::{Row, actor_join, batch_request, send, upload},
+    refusals::{Row, actor_join, batch_request, check_replies, upload},
     system, tiny_replay,
 };
 
@@ -23,21 +23,21 @@ const WARMUP: u64 = 192;
 /// The time-out for an unresponsive server in these runs, in seconds.
 const UNREACHABLE_MAX_S: f64 = 5.0;
 /// What a waiting process logs.
-const WAITING: &str =
+const WAITING_LOG: &str =
     "waiting for as long as it takes: the replay server reads its replay back from disk, ";
 
 /// Returns the updates of a run that continues with `kept` transitions: one of 16 rows for 1,024 transitions after the warm-up.
-const fn updates(kept: u64) -> u64 {
+const fn planned_updates(kept: u64) -> u64 {
     kept / 1024 + 15
 }
 
-const fn frames(kept: u64) -> u64 {
-    WARMUP + 1024 * updates(kept)
+const fn planned_frames(kept: u64) -> u64 {
+    WARMUP + 1024 * planned_updates(kept)
 }
 
 /// Returns flags without shared memory: a slow process would hold the lock of `/dev/shm` for seconds, for which other tests wait.
 fn flags(kept: u64) -> String {
-    let (frames, capacity) = (frames(kept), kept + 100_000);
+    let (frames, capacity) = (planned_frames(kept), kept + 100_000);
     format!(
         "--agent c51 --env chain --preset smoke --frames {frames} --set replay.replay_ratio=0.015625 \
          --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions={capacity} --set replay.slack_transitions=2048 \
@@ -46,7 +46,7 @@ fn flags(kept: u64) -> String {
 }
 
 /// Writes `kept` transitions of another actor into the log in `folder`, for a run with these settings. Returns the run spec.
-fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
+fn write_log(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     let settings = Settings::parse(config_toml).unwrap();
     let spec: RunSpec = settings.table("run").unwrap();
     let mut config: Config = settings.table("replay").unwrap();
@@ -59,7 +59,7 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
         mark: None,
     };
     let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
-    tiny_replay::join(&mut replay, 9);
+    tiny_replay::join_actor(&mut replay, 9);
     let mut header = tiny_replay::header(&spec, 9, 1, 1);
     for sequence in 0..kept {
         (header.sequence, header.first_transition) = (sequence, sequence);
@@ -72,11 +72,11 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
 }
 
 /// Makes a log of `kept` transitions in the folder `replay`. Returns the run spec, and the flags of a replay server that reads the log.
-fn keep_for(system: &TestSystem, kept: u64) -> (RunSpec, String) {
+fn prepare_log(system: &TestSystem, kept: u64) -> (RunSpec, String) {
     let flags = flags(kept);
     let server = system.start_replay_server(&flags);
     let client = system.connect();
-    let spec = keep(kept, &system.path("replay"), &client.config_toml);
+    let spec = write_log(kept, &system.path("replay"), &client.config_toml);
     drop(client);
     server.stop_ok();
     (spec, format!("{flags} --replay-dir replay"))
@@ -91,15 +91,15 @@ fn slow_down(server: &mut Process) -> SlowMachine {
 
 /// Starts a replay server that is stopped until it is slowed down, so that it cannot have read everything before.
 fn start_stopped(system: &TestSystem, flags: &str) -> Process {
-    let server = system.replay_server(flags);
+    let server = system.replay_server_args(flags);
     system.start_process(&format!(
         "sh -c 'kill -STOP $$; exec \"$0\" \"$@\"' DRIML {server}"
     ))
 }
 
 /// Returns the server's progress as `driml status --json` prints it; `None` once the server has read everything.
-fn recovering(system: &TestSystem) -> Option<Value> {
-    let answer = system.run_ok(&system.connected("status --json")).json();
+fn recovery_progress(system: &TestSystem) -> Option<Value> {
+    let answer = system.run_json(&system.connect_args("status --json"));
     let recovering = answer["servers"][0]["recovering"].clone();
     if recovering.is_null() {
         return None;
@@ -109,7 +109,7 @@ fn recovering(system: &TestSystem) -> Option<Value> {
 }
 
 /// Checks that the server puts off every kind of request.
-fn check_put_off(system: &TestSystem, spec: &RunSpec) {
+fn check_postponed(system: &TestSystem, spec: &RunSpec) {
     let run = system.run_client(spec);
     let client = Client {
         session: run.session().clone(),
@@ -117,26 +117,26 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
         spec: spec.clone(),
         config_toml: String::new(),
     };
-    let told = "the replay server reads its replay back from disk, ";
-    let chunk = client.seal(&Chunk::zeroed(tiny_replay::header(spec, 5, 1, 1)));
+    let postponed = "the replay server reads its replay back from disk, ";
+    let chunk = client.encode_chunk(&Chunk::zeroed(tiny_replay::header(spec, 5, 1, 1)));
     let weights = upload(spec.hash(), 99, 1, b"weights");
     let rows = [
-        Row::new(client.keys.of_actor::<ChunkHeader>(5), chunk, told),
-        Row::new(client.keys.of::<WeightsUpload>(), weights, told),
-        Row::of(&client, &batch_request(99, 16), told),
-        Row::of(&client, &actor_join(5, 1), told),
-        Row::of(&client, &new_learner(99), told),
-        Row::new(client.keys.of::<RunInfo>(), [], told),
-        Row::new(client.keys.of::<ReplayStatus>(), [], told),
+        Row::new(client.keys.of_actor::<ChunkHeader>(5), chunk, postponed),
+        Row::new(client.keys.of::<WeightsUpload>(), weights, postponed),
+        Row::of(&client, &batch_request(99, 16), postponed),
+        Row::of(&client, &actor_join(5, 1), postponed),
+        Row::of(&client, &new_learner(99), postponed),
+        Row::new(client.keys.of::<RunInfo>(), [], postponed),
+        Row::new(client.keys.of::<ReplayStatus>(), [], postponed),
     ];
-    send(&client, rows);
+    check_replies(&client, rows);
 }
 
 /// Processes wait beyond the time-out for an unreachable server: some were there when the server died, others start while it reads.
 #[test]
 fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let system = system();
-    let (spec, serve) = keep_for(&system, LONG);
+    let (spec, serve) = prepare_log(&system, LONG);
     let server = system.start_replay_server(&serve);
     let mut learner = system.start_learner("run");
     let mut actors = vec![system.start_actor(0)];
@@ -145,26 +145,26 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
 
     let mut server = start_stopped(&system, &serve);
     let slow = slow_down(&mut server);
-    let first = recovering(&system).expect("it has a long log");
-    check_put_off(&system, &spec);
-    let said = system.run_ok(&system.connected("status")).stdout;
+    let first = recovery_progress(&system).expect("it has a long log");
+    check_postponed(&system, &spec);
+    let text = system.run_ok(&system.connect_args("status")).stdout;
     let words = [
         "chain, c51: frames ?/",
         "replay-server  reads its replay back",
         "reads its replay back from disk (",
         "no action needed",
     ];
-    check_has(&said, &words);
-    let look = system.connected("watch --once");
-    system.fails(&look, "reads its replay back from disk");
-    let mut watched = system.start(&system.connected("watch --run-dir seen"));
+    check_has(&text, &words);
+    let watch_once = system.connect_args("watch --once");
+    system.fails(&watch_once, "reads its replay back from disk");
+    let mut watched = system.start(&system.connect_args("watch --run-dir seen"));
     watched.wait_for_stderr(": reads its replay back from disk, ");
     actors.push(system.start_actor(1));
-    actors[1].wait_for_stderr(WAITING);
+    actors[1].wait_for_stderr(WAITING_LOG);
     actors[0].wait_for_stderr("the replay server reads its replay back from disk, ");
     learner.wait_for_stderr("the replay server reads its replay back from disk, ");
     let last = wait_for("more than the limit for an absent server", || {
-        let now = recovering(&system).expect("the log is long enough");
+        let now = recovery_progress(&system).expect("the log is long enough");
         (now["since_s"].as_f64() > Some(UNREACHABLE_MAX_S + 3.0)).then_some(now)
     });
     let read = |it: &Value| it["bytes_read"].as_u64();
@@ -178,36 +178,34 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let client = system.connect();
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
-    assert_eq!(status.updates, updates(LONG));
-    assert_eq!(replay.rows_sampled, 16 * updates(LONG));
-    assert_eq!(replay.transitions_inserted, frames(LONG));
+    assert_eq!(status.updates, planned_updates(LONG));
+    assert_eq!(replay.rows_sampled, 16 * planned_updates(LONG));
+    assert_eq!(replay.transitions_inserted, planned_frames(LONG));
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait_ok();
     let seen = system.run_folder("seen").summary();
-    assert_eq!(seen.updates, updates(LONG));
+    assert_eq!(seen.updates, planned_updates(LONG));
     learner.stop_ok();
     drop(client);
-    server
-        .stop_ok()
-        .expect_said("continues with the replay in replay");
+    let exit = server.stop_ok();
+    exit.expect_stderr("continues with the replay in replay");
 }
 
 /// A server that is told to stop exits, however much is left to read. The next server reads everything.
 #[test]
 fn a_server_that_reads_is_stopped_and_started_again() {
     let system = system();
-    let (_, serve) = keep_for(&system, SHORTER);
+    let (_, serve) = prepare_log(&system, SHORTER);
     let mut server = start_stopped(&system, &serve);
     let slow = slow_down(&mut server);
     let mut actor = system.start_actor(0);
-    actor.wait_for_stderr(WAITING);
-    server
-        .stop_ok()
-        .expect_said("it was told to end while it read its replay back");
+    actor.wait_for_stderr(WAITING_LOG);
+    let exit = server.stop_ok();
+    exit.expect_stderr("it was told to end while it read its replay back");
     drop(slow);
     actor.stop_ok();
     let server = system.start_replay_server(&serve);
-    let replay = system.connect().replay().unwrap();
+    let replay = system.connect().replay_status().unwrap();
     assert_eq!(replay.transitions_inserted, SHORTER);
     server.stop_ok();
 
@@ -218,19 +216,19 @@ fn a_server_that_reads_is_stopped_and_started_again() {
             fs::write(path, "no log").unwrap();
         }
     }
-    let ended = system.start_replay_server(&serve).wait().expect_code(1);
-    ended.expect_said("no segment can be read");
+    let server = system.start_replay_server(&serve);
+    server.fails("no segment can be read");
 }
 
 #[test]
 fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
-    let mut process = system.start(&system.local(&format!("--durable {}", flags(SHORTER))));
+    let mut process = system.start(&system.local_args(&format!("--durable {}", flags(SHORTER))));
     system.connect().wait_for_updates(10);
     process.stop().expect_code(130);
     let run = system.run_folder("run");
     let config = system.read("run/config.toml");
-    keep(SHORTER, &run.path().join("replay"), &config);
+    write_log(SHORTER, &run.path().join("replay"), &config);
     let stored = run.summary().replay.transitions_inserted + SHORTER;
     let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
@@ -242,7 +240,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let summary = run.check_finished();
     let updates = (frames - WARMUP) / 1024;
     assert_eq!((summary.frames, summary.updates), (frames, updates));
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }
 
 /// Each role receives the progress in place of the reply.
@@ -251,15 +249,15 @@ fn roles_are_told_too() {
     let Some(system) = system().over_tls() else {
         return;
     };
-    let (_, serve) = keep_for(&system, SHORTER);
+    let (_, serve) = prepare_log(&system, SHORTER);
     let mut server = system.start_replay_server(&serve);
     let slow = slow_down(&mut server);
     let [mut actor, mut learner] = [system.start_actor(0), system.start_learner("run")];
     for role in [&mut actor, &mut learner] {
-        role.wait_for_stderr(WAITING);
+        role.wait_for_stderr(WAITING_LOG);
     }
-    let said = system.run_ok(&system.connected("status")).stdout;
-    assert!(said.contains("reads its replay back"), "{said}");
+    let text = system.run_ok(&system.connect_args("status")).stdout;
+    assert!(text.contains("reads its replay back"), "{text}");
     drop(slow);
     actor.wait_ok();
     learner.stop_ok();

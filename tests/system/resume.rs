@@ -5,30 +5,30 @@ use std::fs;
 use driml_settings::config::RunConfig;
 use driml_tests::{Outcome, Summary, TestSystem, check_has};
 
-use crate::{SHORT, launched, system};
+use crate::{SHORT, start_run, system};
 
 /// The number of updates that a resumed run makes: more than the 256 transitions of slack, a chunk in flight and a chunk that fills the
 /// replay again can allow.
-const MORE: u64 = 200;
+const MORE_UPDATES: u64 = 200;
 
-/// Resumes `run` for [`MORE`] updates, and checks what the run leaves behind.
-fn resumes(system: &TestSystem) -> Summary {
+/// Resumes `run` for [`MORE_UPDATES`] updates, and checks what the run leaves behind.
+fn resume_and_check(system: &TestSystem) -> Summary {
     let run = system.run_folder("run");
     let updates = run.saved_updates();
     // The warm-up, and 2 frames for each update of 16 rows at replay ratio 8.
-    let frames = 200 + 2 * (updates + MORE);
+    let frames = 200 + 2 * (updates + MORE_UPDATES);
     let ended = system.run_ok(&format!("local --resume run --frames {frames}"));
     let from = format!("from its checkpoint after {updates} updates");
-    ended.expect_printed(&from);
+    ended.expect_stdout(&from);
     let summary = run.check_finished();
     assert_eq!(summary.resumed_after_updates, updates);
     // The last chunk is stored whole, which allows up to 16 updates more.
-    let planned = updates + MORE..updates + MORE + 16;
+    let planned = updates + MORE_UPDATES..updates + MORE_UPDATES + 16;
     assert!(planned.contains(&summary.updates), "{summary:#?}");
     assert!(summary.episodes > 0);
 
     for name in ["seconds", "frames", "updates", "episodes"] {
-        let numbers = run.numbers(name);
+        let numbers = run.numeric_column(name);
         assert!(numbers.is_sorted(), "{name}: {numbers:?}");
     }
     let log = run.log("learner");
@@ -42,27 +42,27 @@ fn resumes(system: &TestSystem) -> Summary {
 fn an_interrupt_saves_and_ends_all_processes_and_the_run_continues() {
     let system = system();
     // 1,000 updates are 2,200 frames, in which more than 100 episodes end.
-    let process = launched(&system, 1_000);
-    system.refuses("local --resume run", "is still running");
+    let process = start_run(&system, 1_000);
+    system.rejects("local --resume run", "is still running");
     process
         .interrupt()
         .expect_code(130)
-        .expect_said("stopping: actors deliver what they have")
-        .expect_said("`driml train --resume run` resumes it")
-        .expect_printed("interrupted: ");
-    assert_eq!(system.survivors(), []);
+        .expect_stderr("stopping: actors deliver what they have")
+        .expect_stderr("`driml train --resume run` resumes it")
+        .expect_stdout("interrupted: ");
+    assert_eq!(system.running_processes(), []);
     let before = system.run_folder("run").check(Outcome::Interrupted);
     assert!(before.updates > 1_000, "{before:#?}");
-    let summary = resumes(&system);
+    let summary = resume_and_check(&system);
     // A few tens of episodes have ended since, the short ones first. The mean return is still that of 100 episodes.
     let since = summary.episodes - before.episodes;
     assert!((1..100).contains(&since), "{since} episodes since");
     assert_eq!((before.mean_return_of, summary.mean_return_of), (100, 100));
     // A finished run can be resumed with more frames.
-    assert_eq!(resumes(&system).mean_return_of, 100);
+    assert_eq!(resume_and_check(&system).mean_return_of, 100);
     system
         .run_ok("local --resume run")
-        .expect_printed("nothing is left to do");
+        .expect_stdout("nothing is left to do");
 }
 
 /// Runs of earlier versions recorded whole frames; today a border of the frames is cut off.
@@ -77,7 +77,7 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
     let old = cut.with_whole_frames().unwrap();
     fs::write(system.path("old.toml"), old.to_toml()).unwrap();
     system.run_ok("local --config old.toml --run-dir run");
-    resumes(&system);
+    resume_and_check(&system);
     let config = system.run_folder("run").config();
     assert_eq!(config["run"]["frame_height"].as_integer(), Some(15));
     for run in ["run", "cut"] {
@@ -88,7 +88,7 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
 #[test]
 fn a_run_whose_processes_were_all_killed_continues() {
     let system = system();
-    let process = launched(&system, 200);
+    let process = start_run(&system, 200);
     system.kill_all();
     process.wait();
     // The kill may have interrupted a save, whose remains are not a checkpoint.
@@ -98,13 +98,13 @@ fn a_run_whose_processes_were_all_killed_continues() {
             fs::remove_dir_all(path).unwrap();
         }
     }
-    resumes(&system);
+    resume_and_check(&system);
 }
 
 #[test]
 fn what_cannot_be_resumed() {
     let system = system();
-    system.refuses_each(
+    system.rejects_each(
         "
         local --resume nowhere => --resume takes the folder of a run that was interrupted
         local --resume run --agent c51 => cannot be used with
@@ -115,7 +115,7 @@ fn what_cannot_be_resumed() {
     for less in ["", "--frames 700"] {
         let ended = system.run_ok(&format!("local --resume run {less}"));
         let nothing = "nothing is left to do: the run in run has done 540 updates and 1280 frames";
-        ended.expect_printed(nothing);
+        ended.expect_stdout(nothing);
     }
     system.run_ok(&format!("local --lockstep {SHORT} --run-dir step"));
     let rainbow = "--env chain --preset smoke --agent rainbow --frames 640";
@@ -124,7 +124,7 @@ fn what_cannot_be_resumed() {
     let run = format!("local --agent c51 --durable {SHORT} --run-dir kept");
     system.run_ok(&run);
     system.run_ok("local --resume kept --frames 1600 --set local.durable=false");
-    system.refuses_each(
+    system.rejects_each(
         "
         local --resume run --frames 2000 --set run.n_step=5 => belongs to a run with specification
         local --resume run --frames 2000 --set world.reward_right=2 => world.reward_right cannot change in a run: resume without this --set
@@ -148,7 +148,7 @@ fn what_cannot_be_resumed() {
     system.run_ok("local --lockstep --config step/config.toml --run-dir new");
     assert!(since("step") && !since("new"));
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system.refuses("local --resume run --frames 2000", "there is no checkpoint");
+    system.rejects("local --resume run --frames 2000", "there is no checkpoint");
 }
 
 /// The launcher was killed after the last update: only the end of the run is missing, and the shards no longer hold anything.
@@ -183,8 +183,8 @@ fn a_damaged_checkpoint_is_reported_once() {
     fs::write(newest.join("online.safetensors"), "").unwrap();
     let resumed = system.run("local --resume run --frames 2000");
     let ended = resumed.expect_code(1);
-    let said = &ended.stderr;
-    let reports = said.matches("online.safetensors is damaged").count();
-    assert_eq!(reports, 1, "{said}");
-    assert!(!said.contains("resumes it"), "{said}");
+    let stderr = &ended.stderr;
+    let reports = stderr.matches("online.safetensors is damaged").count();
+    assert_eq!(reports, 1, "{stderr}");
+    assert!(!stderr.contains("resumes it"), "{stderr}");
 }

@@ -33,7 +33,7 @@ enum Stop {
 
 /// The settings of the second life, which is the resumed run.
 #[derive(Clone, Copy, Debug)]
-struct Change {
+struct ResumeSettings {
     frames: u64,
     rows: u64,
     ratio: u64,
@@ -42,14 +42,14 @@ struct Change {
 
 /// The counts of the run in a checkpoint.
 #[derive(Clone, Copy, Debug)]
-struct Saved {
+struct SavedCounts {
     updates: u64,
     frames: u64,
     rows: u64,
 }
 
 /// Reads the newest checkpoint; `None` before the first.
-fn saved(run: &RunFolder) -> Option<Saved> {
+fn saved_counts(run: &RunFolder) -> Option<SavedCounts> {
     let entries = fs::read_dir(run.path().join("checkpoints")).ok()?;
     // A checkpoint that a kill has cut off does not count.
     let whole = entries.map(|it| it.unwrap().path()).filter(|path| {
@@ -61,7 +61,7 @@ fn saved(run: &RunFolder) -> Option<Saved> {
         serde_json::from_slice(&fs::read(newest.join("state.json")).unwrap()).unwrap();
     let shards = state["progress"]["shards"].as_array().unwrap().clone();
     let sum = |key: &str| shards.iter().map(|it| it[key].as_u64().unwrap()).sum();
-    Some(Saved {
+    Some(SavedCounts {
         updates: state["updates"].as_u64().unwrap(),
         frames: sum("inserted"),
         rows: sum("rows_sampled"),
@@ -69,7 +69,7 @@ fn saved(run: &RunFolder) -> Option<Saved> {
 }
 
 /// Returns the transitions that actors have delivered in all lives so far, according to their logs.
-fn delivered(run: &RunFolder) -> u64 {
+fn delivered_transitions(run: &RunFolder) -> u64 {
     // A run in lockstep has no logs.
     let logs = fs::read_dir(run.path().join("logs")).into_iter().flatten();
     let logs = logs.map(|entry| entry.unwrap().path());
@@ -108,7 +108,7 @@ fn resume_once(seed: u64) {
         rng.random_range(1..3)
     };
     let mut one_of = |all: &[u64]| *all.choose(&mut rng).unwrap();
-    let mut change = Change {
+    let mut change = ResumeSettings {
         frames: one_of(&[FRAMES, FRAMES, FRAMES / 2, FRAMES + 1_000]),
         rows: one_of(&[ROWS, ROWS, 8, 24]),
         ratio: one_of(&[RATIO, RATIO, 4]),
@@ -123,14 +123,14 @@ fn resume_once(seed: u64) {
          --set learner.batch_size={ROWS} --set learner.checkpoint_period_updates=50 --actors 2 --replay-shards {shards} {store} --run-dir run"
     );
     let run = system.run_folder("run");
-    let moment = Duration::from_millis(rng.random_range(0..1_500));
-    first_life(&system, &run, &first, stop, moment);
-    let Some(before) = saved(&run) else {
+    let delay = Duration::from_millis(rng.random_range(0..1_500));
+    run_and_stop(&system, &run, &first, stop, delay);
+    let Some(before) = saved_counts(&run) else {
         // Nothing was saved yet.
-        system.refuses("local --resume run", "there is no checkpoint");
+        system.rejects("local --resume run", "there is no checkpoint");
         return;
     };
-    let delivered_before = delivered(&run);
+    let delivered_before = delivered_transitions(&run);
     let is_graceful = matches!(stop, Stop::End | Stop::Interrupt);
     if is_graceful && !is_lockstep {
         assert_eq!(before.frames, delivered_before, "{about}: {before:?}");
@@ -162,34 +162,34 @@ fn resume_once(seed: u64) {
         return;
     }
     let after = run.summary();
-    let said = format!("{about}\n{before:?}\n{after:#?}");
-    assert_eq!(after.outcome, Outcome::Finished, "{said}");
+    let details = format!("{about}\n{before:?}\n{after:#?}");
+    assert_eq!(after.outcome, Outcome::Finished, "{details}");
     let replay = &after.replay;
     check_nothing_lost(replay);
     let frames_min = change.frames.max(before.frames);
-    assert!(is_fresh || after.frames >= frames_min, "{said}");
-    assert_eq!(after.updates, planned(after.frames), "{said}");
+    assert!(is_fresh || after.frames >= frames_min, "{details}");
+    assert_eq!(after.updates, planned(after.frames), "{details}");
     let learned = (after.updates - before.updates) * change.rows;
     let rows = before.rows * u64::from(!is_fresh) + learned;
-    assert_eq!(replay.rows_sampled, rows, "{said}");
+    assert_eq!(replay.rows_sampled, rows, "{details}");
     if !is_lockstep && !is_fresh {
-        let delivered = delivered(&run) - delivered_before;
+        let delivered = delivered_transitions(&run) - delivered_before;
         let counted = after.frames + replay.transitions_refilled;
         match (is_graceful, store) {
-            (true, _) | (false, "") => assert_eq!(counted, before.frames + delivered, "{said}"),
+            (true, _) | (false, "") => assert_eq!(counted, before.frames + delivered, "{details}"),
             // The replay's log also contains what came after the checkpoint.
-            (false, _) => assert!(counted >= before.frames + delivered, "{said}"),
+            (false, _) => assert!(counted >= before.frames + delivered, "{details}"),
         }
         let is_refilled = replay.transitions_refilled > 0;
-        assert!(store.is_empty() || !is_refilled, "{said}");
+        assert!(store.is_empty() || !is_refilled, "{details}");
     }
     let episodes = run.episodes();
     let is_sorted = episodes.is_sorted_by_key(|row| (row.episode, row.frames));
     let is_past = episodes.iter().all(|row| row.frames <= after.frames);
-    assert!(is_sorted && is_past, "{said}");
+    assert!(is_sorted && is_past, "{details}");
 }
 
-fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, moment: Duration) {
+fn run_and_stop(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, delay: Duration) {
     if stop == Stop::End {
         system.run_ok(flags);
         return;
@@ -197,7 +197,7 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
     let process = system.start(flags);
     let settings = run.path().join("config.toml");
     wait_until("the run's settings", || settings.exists());
-    std::thread::sleep(moment);
+    std::thread::sleep(delay);
     match stop {
         Stop::End => {}
         Stop::Interrupt => process.signal(Signal::SIGINT),
@@ -225,7 +225,7 @@ fn the_last_checkpoint_counts_frames_that_came_after_its_last_update() {
              --set replay.slack_transitions=64 --set learner.checkpoint_period_updates=1";
         let call = format!("local {flags} {store} --run-dir {dir}");
         system.run_ok(&call);
-        let last = saved(&system.run_folder(&dir)).unwrap();
+        let last = saved_counts(&system.run_folder(&dir)).unwrap();
         assert_eq!((last.updates, last.frames), (16, 1_280), "{store}");
     }
 }

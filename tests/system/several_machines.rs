@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_tests::{Network, Process, TestSystem, note, skip, wait_for, wait_until};
+use driml_tests::{Network, Process, TestSystem, print_line, skip, wait_for, wait_until};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use serde_json::Value;
@@ -44,7 +44,7 @@ impl Run {
             processes: Vec::new(),
         };
         for machine in 0..2 + actors {
-            run.processes.push(run.start_on(machine));
+            run.processes.push(run.start_process_on(machine));
         }
         Some(run)
     }
@@ -53,7 +53,7 @@ impl Run {
         format!("tcp/{}:7447", self.network.address("server"))
     }
 
-    fn start_on(&self, machine: usize) -> Process {
+    fn start_process_on(&self, machine: usize) -> Process {
         let endpoint = self.endpoint();
         let args = match machine {
             0 => format!(
@@ -63,13 +63,13 @@ impl Run {
             1 => format!("learner --keep-alive --connect {endpoint} --run-dir run"),
             _ => format!("actor --connect {endpoint} --id {}", machine - 2),
         };
-        let on = self.network.on(MACHINES[machine]);
+        let on = self.network.exec_prefix(MACHINES[machine]);
         self.system.start_process(&format!("{on} DRIML {args}"))
     }
 
     /// Requests the status of the run from the router; `None` while no process answers.
     fn status(&self) -> Option<Value> {
-        let (on, endpoint) = (self.network.on("router"), self.endpoint());
+        let (on, endpoint) = (self.network.exec_prefix("router"), self.endpoint());
         let status = format!("{on} DRIML status --json --connect {endpoint}");
         let ended = self.system.run(&status);
         let status: Value = serde_json::from_str(ended.stdout.lines().next()?).unwrap();
@@ -87,8 +87,8 @@ impl Run {
     }
 
     /// Waits for the end of the run, and checks that the counts are as if nothing had happened.
-    fn check_end(mut self, patience: Duration) {
-        let deadline = Instant::now() + patience;
+    fn check_end(mut self, timeout: Duration) {
+        let deadline = Instant::now() + timeout;
         let status = loop {
             let is_over = |status: &Value| {
                 status["replay"]["finished"] == true && status["learner"]["finished"] == true
@@ -97,7 +97,7 @@ impl Run {
                 Some(status) => break status,
                 None => assert!(
                     Instant::now() < deadline,
-                    "no end within {patience:?}: {:#?}",
+                    "no end within {timeout:?}: {:#?}",
                     self.status()
                 ),
             }
@@ -118,7 +118,7 @@ impl Run {
         for process in self.processes.into_iter().rev() {
             process.stop_ok();
         }
-        assert_eq!(self.system.survivors(), []);
+        assert_eq!(self.system.running_processes(), []);
     }
 }
 
@@ -127,27 +127,27 @@ impl Run {
 #[test]
 fn cut_cables_heal_by_themselves() {
     let system = system();
-    // Hold the learner, so that even on a fast machine it is not done before the last cut.
-    system.hold_at(25_000);
+    // Pause the learner, so that even on a fast machine it is not done before the last cut.
+    system.pause_learners_at(25_000);
     let Some(run) = Run::start(system, 2, 60_000, 8) else {
         return;
     };
     run.wait_for_frames(2_000);
-    run.network.cut("actor0");
+    run.network.disconnect("actor0");
     let before = run.inserted();
     run.wait_for_frames(before + 2_000);
     sleep(Duration::from_secs(10));
-    run.network.cut("learner");
+    run.network.disconnect("learner");
     sleep(Duration::from_secs(15));
-    run.network.mend("learner");
+    run.network.reconnect("learner");
     sleep(Duration::from_secs(10));
     let learner = &wait_for("an answer", || run.status())["learner"];
     assert_eq!(learner["finished"], false, "a cut of a run that is over");
-    run.network.mend("actor0");
-    run.network.cut("server");
+    run.network.reconnect("actor0");
+    run.network.disconnect("server");
     sleep(Duration::from_secs(12));
-    run.network.mend("server");
-    run.system.let_go();
+    run.network.reconnect("server");
+    run.system.release_learners();
     run.check_end(Duration::from_secs(300));
 }
 
@@ -157,7 +157,7 @@ fn a_narrow_link_stops_no_process() {
     let Some(run) = Run::start(system(), 2, 16_000, 8) else {
         return;
     };
-    if !run.network.narrow("actor0", 256) {
+    if !run.network.limit_rate("actor0", 256) {
         return skip("tc knows no tbf");
     }
     run.wait_for_frames(10_000);
@@ -181,9 +181,9 @@ fn each_process_is_cut_off_for_long() {
     run.wait_for_frames(2_000);
     for seconds in [30, 90] {
         for machine in ["actor0", "learner", "server"] {
-            run.network.cut(machine);
+            run.network.disconnect(machine);
             sleep(Duration::from_secs(seconds));
-            run.network.mend(machine);
+            run.network.reconnect(machine);
             let before = run.inserted();
             run.wait_for_frames(before + 1_000);
         }
@@ -213,7 +213,7 @@ fn random_faults_lose_nothing() {
         let kind = rng.random_range(0..4);
         tried[kind] += 1;
         let what = ["kill", "freeze", "cut", "restart"][kind];
-        note(&format!(
+        print_line(&format!(
             "fault {fault}: {what} {} for {pause:?}",
             MACHINES[machine]
         ));
@@ -228,7 +228,7 @@ fn random_faults_lose_nothing() {
                 process.signal(signal);
                 wait_until("its end", || !process.is_running());
                 sleep(pause);
-                run.processes[machine] = run.start_on(machine);
+                run.processes[machine] = run.start_process_on(machine);
             }
             1 => {
                 run.processes[machine].signal(Signal::SIGSTOP);
@@ -236,14 +236,14 @@ fn random_faults_lose_nothing() {
                 run.processes[machine].signal(Signal::SIGCONT);
             }
             _ => {
-                run.network.cut(MACHINES[machine]);
+                run.network.disconnect(MACHINES[machine]);
                 sleep(pause);
-                run.network.mend(MACHINES[machine]);
+                run.network.reconnect(MACHINES[machine]);
             }
         }
         sleep(Duration::from_millis(rng.random_range(0..1_500)));
     }
-    note(&format!(
+    print_line(&format!(
         "seed {seed}: kills, freezes, cuts, restarts {tried:?}"
     ));
     let status = wait_for("an answer", || run.status());

@@ -3,10 +3,10 @@
 
 use std::process::Command;
 
-use driml_tests::{Ended, succeeds};
+use driml_tests::{Exit, succeeds};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, chain, disk_full::fill, system};
+use crate::{LONG, chain, disk_full::fill_disk, system};
 
 /// Returns a call of the program that gives it and its children a `/dev/shm` of this size. If that is not permitted, returns `None` and
 /// reports the test as skipped.
@@ -19,7 +19,7 @@ fn with_shared_memory(size: &str, call: &str) -> Option<String> {
 }
 
 /// Returns the number of warnings that there is too little, or that messages sent through shared memory do not arrive.
-fn warnings(ended: &Ended) -> usize {
+fn warnings(ended: &Exit) -> usize {
     let lines = ended.stderr.lines();
     lines.filter(|line| line.contains("shared memory")).count()
 }
@@ -47,10 +47,10 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
         assert_eq!(warnings(&ended), usize::from(!enough), "{size}: {ended:#?}");
         if !enough {
             ended
-                .expect_said("no shared memory, so messages go through sockets, which is slower: /dev/shm has ")
-                .expect_said(" MiB are needed: make it larger")
-                .expect_said("--shm-size=1g")
-                .expect_said("--set transport.shared_memory=false asks for none");
+                .expect_stderr("no shared memory, so messages go through sockets, which is slower: /dev/shm has ")
+                .expect_stderr(" MiB are needed: make it larger")
+                .expect_stderr("--shm-size=1g")
+                .expect_stderr("--set transport.shared_memory=false asks for none");
         }
         system.run_folder("run").check_finished();
     }
@@ -59,7 +59,7 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
 #[test]
 fn a_run_continues_when_others_fill_it_up() {
     let system = system();
-    let run = system.local(&format!("--agent c51 {LONG} --actors 2"));
+    let run = system.local_args(&format!("--agent c51 {LONG} --actors 2"));
     let Some(run) = with_shared_memory("64m", &run) else {
         return;
     };
@@ -68,15 +68,15 @@ fn a_run_continues_when_others_fill_it_up() {
     client.wait_for_updates(100);
     // Wait for all processes, because one that starts when shared memory is full warns, too.
     client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
-    fill(format!("/proc/{}/root/dev/shm/filler", process.pid()));
-    let then = client.learner().unwrap().updates;
+    fill_disk(format!("/proc/{}/root/dev/shm/filler", process.pid()));
+    let then = client.learner_status().unwrap().updates;
     client.wait_for_updates(then + 200);
     // A process that starts now finds no room.
     system.find_process("actor").signal(Signal::SIGKILL);
     process.wait_for_stderr("is started again (1 of 16 times in a run)");
     process.wait_for_stderr("no shared memory, so messages go through sockets");
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
-    let then = client.learner().unwrap().updates;
+    let then = client.learner_status().unwrap().updates;
     client.wait_for_updates(then + 200);
     drop(client);
     let ended = process.interrupt().expect_code(130);

@@ -7,27 +7,27 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_tests::{Process, TestSystem, note};
+use driml_tests::{Process, TestSystem, print_line};
 use rand::{Rng, SeedableRng, rngs::StdRng};
 
 use crate::system;
 
 const ACTORS: usize = 32;
 /// The time before the first measurement: buffers fill, and as many actors come and go as may send through shared memory.
-const WARM: Duration = Duration::from_secs(300);
+const WARMUP: Duration = Duration::from_secs(300);
 
 /// The resources that a process holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Held {
+struct Resources {
     rss_kib: u64,
     descriptors: usize,
     threads: u64,
 }
 
-fn held(system: &TestSystem, process: &str) -> Held {
+fn held_resources(system: &TestSystem, process: &str) -> Resources {
     let process = system.find_process(process);
     let descriptors = fs::read_dir(format!("/proc/{}/fd", process.pid));
-    Held {
+    Resources {
         rss_kib: process.status("VmRSS"),
         descriptors: descriptors.unwrap().count(),
         threads: process.status("Threads"),
@@ -48,8 +48,8 @@ fn nothing_grows() {
     let mut actors: Vec<Option<Process>> = Vec::new();
     actors.resize_with(ACTORS, || None);
     let mut rng = StdRng::seed_from_u64(1);
-    let (mut deaths, mut ends, mut looks) = (0, 0, Vec::new());
-    let (mut next_look, started) = (Instant::now() + WARM, Instant::now());
+    let (mut deaths, mut ends, mut samples) = (0, 0, Vec::new());
+    let (mut next_sample_at, started) = (Instant::now() + WARMUP, Instant::now());
     while Instant::now() < end {
         let id = rng.random_range(0..ACTORS);
         match actors[id].take() {
@@ -64,24 +64,24 @@ fn nothing_grows() {
             }
         }
         sleep(Duration::from_millis(rng.random_range(50..1_000)));
-        if Instant::now() > next_look {
-            next_look += Duration::from_secs(60);
-            let look = (
-                held(&system, "replay-server"),
-                held(&system, "learner"),
+        if Instant::now() > next_sample_at {
+            next_sample_at += Duration::from_secs(60);
+            let sample = (
+                held_resources(&system, "replay-server"),
+                held_resources(&system, "learner"),
                 // Segments of shared memory on this machine, including those of other runs.
                 fs::read_dir("/dev/shm").unwrap().count(),
             );
-            note(&format!("after {:?}: {look:?}", started.elapsed()));
-            looks.push(look);
+            print_line(&format!("after {:?}: {sample:?}", started.elapsed()));
+            samples.push(sample);
         }
     }
     let replay = client.check_nothing_lost();
-    note(&format!(
+    print_line(&format!(
         "{} transitions, {} rows, {deaths} actors killed, {ends} ended",
         replay.transitions_inserted, replay.rows_sampled
     ));
-    let (first, last) = (looks[0], looks[looks.len() - 1]);
+    let (first, last) = (samples[0], samples[samples.len() - 1]);
     for (before, after) in [(first.0, last.0), (first.1, last.1)] {
         // Allow a tenth and 8 MiB, because the allocator's pools fill unevenly.
         let most = before.rss_kib * 11 / 10 + 8 * 1024;
@@ -99,5 +99,5 @@ fn nothing_grows() {
     });
     learner.stop_ok();
     server.stop_ok();
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }

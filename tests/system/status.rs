@@ -1,22 +1,20 @@
 //! `driml status`: its output for a run in which a process is missing, gone, suspended or done.
 //! The messages that processes log while they wait are tested here, too.
 
-use std::fs;
-
 use driml_tests::{TestSystem, check_has, wait_for, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
-fn status(system: &TestSystem) -> String {
-    system.run_ok(&system.connected("status")).stdout
+fn status_text(system: &TestSystem) -> String {
+    system.run_ok(&system.connect_args("status")).stdout
 }
 
 /// Requests the status until it contains all of `words`.
 fn wait_for_status(system: &TestSystem, words: &[&str]) -> String {
     wait_for(&format!("{words:?} in the status"), || {
-        let said = status(system);
-        words.iter().all(|it| said.contains(it)).then_some(said)
+        let text = status_text(system);
+        words.iter().all(|it| text.contains(it)).then_some(text)
     })
 }
 
@@ -30,7 +28,7 @@ fn missing_processes_are_named_with_what_to_do() {
         format!("no learner has joined: start `driml learner --connect {endpoint} --run-dir DIR`");
     let act = format!("no actor has joined: start `driml actor --connect {endpoint} --id N`");
     let words = ["chain, c51: frames 0/", &learn, &act];
-    check_has(&status(&system), &words);
+    check_has(&status_text(&system), &words);
     // The server also logs this itself.
     server.wait_for_stderr("no learner has joined yet, waiting since");
 
@@ -41,8 +39,8 @@ fn missing_processes_are_named_with_what_to_do() {
 
     let actors = [system.start_actor(0), system.start_actor(5)];
     let words = ["actor-0 ", "actor-5 ", "learns (", "nothing is missing"];
-    let said = wait_for_status(&system, &words);
-    assert!(!said.contains("GONE"), "{said}");
+    let text = wait_for_status(&system, &words);
+    assert!(!text.contains("GONE"), "{text}");
 
     actors[1].signal(Signal::SIGKILL);
     let again = format!("`driml actor --connect {endpoint} --id 5`");
@@ -58,7 +56,7 @@ fn missing_processes_are_named_with_what_to_do() {
     let words = ["learner        GONE for", "from its newest checkpoint"];
     wait_for_status(&system, &words);
 
-    let answer = system.run_ok(&system.connected("status --json")).json();
+    let answer = system.run_json(&system.connect_args("status --json"));
     let processes = &answer["servers"][0]["processes"]["processes"];
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);
@@ -67,7 +65,7 @@ fn missing_processes_are_named_with_what_to_do() {
 
     // A suspended server is reported within seconds, too.
     server.signal(Signal::SIGSTOP);
-    let ended = system.run(&system.connected("status"));
+    let ended = system.run(&system.connect_args("status"));
     server.signal(Signal::SIGCONT);
     ended.expect_error("endpoint");
 }
@@ -85,17 +83,15 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     let watched = system.start("status --run run --watch --json");
     process.interrupt().expect_code(130);
     watched.wait_ok();
-    system
-        .run("watch --once --run run --prometheus run.prom")
-        .expect_code(1)
-        .expect_error("no process of it runs");
-    let file = fs::read_to_string(system.path("run.prom")).unwrap();
+    let watch_once = "watch --once --run run --prometheus run.prom";
+    system.fails(watch_once, "no process of it runs");
+    let file = system.read("run.prom");
     assert!(file.ends_with("\ndriml_up 0\n"), "{file}");
     system
         .run_ok("status --run run")
-        .expect_printed("no process runs in run, which holds")
-        .expect_printed("`driml train --resume run` resumes it");
-    system.refuses("status --run nowhere", "nowhere is not the folder of a run");
+        .expect_stdout("no process runs in run, which holds")
+        .expect_stdout("`driml train --resume run` resumes it");
+    system.rejects("status --run nowhere", "nowhere is not the folder of a run");
 }
 
 /// The launcher still plays the last checkpoint; no other process is left.
@@ -106,19 +102,19 @@ fn a_run_that_is_ending_is_no_riddle() {
         "local --agent c51 {SHORT} --eval-interval 1000 --eval-episodes 1000000 --run-dir run"
     ));
     process.wait_for_stderr("playing the last checkpoint");
-    let config = fs::read_to_string(system.path("run/config.toml")).unwrap();
+    let config = system.read("run/config.toml");
     check_has(&config, &["checkpoint_period_updates = 50"]);
     system
         .run_ok("status --run run")
-        .expect_printed("the run in run is stopping: all frames are stored");
-    let stopping = system.run_ok("status --json --run run").json();
+        .expect_stdout("the run in run is stopping: all frames are stored");
+    let stopping = system.run_json("status --json --run run");
     assert_eq!(stopping["finished"], false, "{stopping}");
     process.interrupt().expect_code(0);
     system
         .run_ok("status --run run")
-        .expect_printed("the run is over");
+        .expect_stdout("the run is over");
     for command in ["status --json", "watch --once --json"] {
-        let over = system.run_ok(&format!("{command} --run run")).json();
+        let over = system.run_json(&format!("{command} --run run"));
         assert_eq!(over["finished"], true);
         assert_eq!(over["message"], "the run is over");
         assert_eq!(over["summary"]["outcome"], "finished", "{over}");

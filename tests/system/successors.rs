@@ -16,17 +16,17 @@ fn killed_learners_cost_no_update_of_the_plan() {
     let server = system.start_replay_server(&format!(
         "--agent driml-ada {longer} --set learner.checkpoint_period_updates=200"
     ));
-    // Hold the learner between two checkpoints: whether it saves one before the kill must not depend on who is faster.
-    system.hold_at(390);
+    // Pause the learner between two checkpoints: whether it saves one before the kill must not depend on who is faster.
+    system.pause_learners_at(390);
     let mut learner = system.start_learner("run");
     let actor = system.start_actor(0);
     let client = system.connect();
     let (mut version, mut forgotten) = (0, 0);
-    // Each learner is held at the first number of updates; its successor, which starts from the checkpoint, at the second.
+    // Each learner is paused at the first number of updates; its successor, which starts from the checkpoint, at the second.
     for (updates, successor) in [(390, 300), (300, 250), (250, 225)] {
         let killed = client.wait_for_learner("updates", |it| it.updates == updates);
         learner.kill();
-        system.hold_at(successor);
+        system.pause_learners_at(successor);
         learner = system.start_learner("run");
         let next = client.wait_for_learner("the successor", |it| it.weights_version > version);
         // A learner reports a version when it queues it: a killed learner may not have sent the last ones, and versions that no actor has
@@ -43,14 +43,14 @@ fn killed_learners_cost_no_update_of_the_plan() {
         assert!(replay.rows_unlearned > forgotten, "{replay:#?}");
         forgotten = replay.rows_unlearned;
     }
-    system.let_go();
+    system.release_learners();
     let learned = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     let planned = (replay.transitions_inserted - 200) * 8 / 16;
     assert_eq!(learned.updates, planned, "{replay:#?}");
     assert_eq!(replay.rows_sampled, 16 * planned);
     actor.wait_ok();
-    learner.stop_ok().expect_said("resumed after ");
+    learner.stop_ok().expect_stderr("resumed after ");
     drop(client);
     server.stop_ok();
 
@@ -62,7 +62,7 @@ fn killed_learners_cost_no_update_of_the_plan() {
 }
 
 /// Starts a run by hand, and waits until the learner has made more than 75 updates; the first checkpoint is due after 1,000.
-fn between_checkpoints(system: &TestSystem, flags: &str) -> (Process, Process, Client) {
+fn start_between_checkpoints(system: &TestSystem, flags: &str) -> (Process, Process, Client) {
     let server = system.start_replay_server(&format!(
         "--agent c51 {LONG} --set learner.checkpoint_period_updates=1000 {flags}"
     ));
@@ -78,7 +78,7 @@ fn between_checkpoints(system: &TestSystem, flags: &str) -> (Process, Process, C
 fn a_learner_whose_replay_server_is_gone_saves() {
     let system = system();
     let patience = "--set learner.unreachable_max_ms=1000";
-    let (server, learner, client) = between_checkpoints(&system, patience);
+    let (server, learner, client) = start_between_checkpoints(&system, patience);
     drop(client);
     server.kill();
     learner.fails("no batch and no answer for 1s");
@@ -90,7 +90,7 @@ fn a_learner_whose_replay_server_is_gone_saves() {
 #[test]
 fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let system = system();
-    let (server, learner, client) = between_checkpoints(&system, "");
+    let (server, learner, client) = start_between_checkpoints(&system, "");
     let actor = system.start_actor(1);
     // An actor without weights would wait for them, and not notice the new server.
     client.wait_for_replay("a second actor", |replay| {
@@ -110,7 +110,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let actor = system.start_actor(0);
     let client = system.connect();
     client.wait_for_updates(saved);
-    let replay = client.replay().unwrap();
+    let replay = client.replay_status().unwrap();
     assert_eq!(replay.transitions_refilled, 200, "the warm-up: {replay:#?}");
     assert!(replay.transitions_inserted > 200 + 2 * saved, "{replay:#?}");
     assert!(replay.rows_sampled >= 16 * saved, "{replay:#?}");
@@ -125,14 +125,14 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
 #[test]
 fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let system = system();
-    let (server, learner, client) = between_checkpoints(&system, "");
+    let (server, learner, client) = start_between_checkpoints(&system, "");
     learner.kill();
-    let stranger = |flags: &str| system.connected(&format!("learner --run-dir elsewhere {flags}"));
+    let args = |flags: &str| system.connect_args(&format!("learner --run-dir elsewhere {flags}"));
     let why = "and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints";
-    system.fails(&stranger(""), why);
-    let before = client.replay().unwrap();
+    system.fails(&args(""), why);
+    let before = client.replay_status().unwrap();
     assert!(before.updates > 75, "{before:#?}");
-    let restarted = system.start(&stranger("--keep-alive --restart"));
+    let restarted = system.start(&args("--keep-alive --restart"));
     let replay = client.wait_for_replay("updates that are learned again", |replay| {
         replay.updates_relearned > 75
     });
@@ -142,12 +142,12 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     drop(client);
 
     let server = system.start_replay_server(&format!("--agent c51 {SHORT}"));
-    let learner = system.start(&system.connected("learner --run-dir short"));
+    let learner = system.start(&system.connect_args("learner --run-dir short"));
     let actor = system.start_actor(0);
     let client = system.connect();
     let replay = client.wait_for_replay("the run's end", |replay| replay.learner_finished);
     assert_eq!(replay.updates, 540);
-    system.fails(&stranger(""), "the run is finished, with 540 updates");
+    system.fails(&args(""), "the run is finished, with 540 updates");
     learner.wait_ok();
     actor.wait_ok();
     server.stop_ok();

@@ -10,7 +10,7 @@ use driml_learner::remote::batch_source::{
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End, RunClient, Shutdown};
 
 /// The time-out of a batch and of a reply.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 pub(crate) struct SyntheticLearner {
     source: BatchSource,
@@ -24,7 +24,7 @@ impl SyntheticLearner {
             rows,
             in_flight,
             shared_memory: false,
-            unreachable_max: PATIENCE,
+            unreachable_max: TIMEOUT,
         };
         let (counters, never) = (Counters::at_start(clients.len()), Shutdown::default());
         let source = BatchSource::start(clients, requests, &counters, &never).unwrap();
@@ -33,7 +33,7 @@ impl SyntheticLearner {
 
     /// Returns the next batch; `None` at the end of the run.
     pub(crate) fn next(&mut self) -> Option<ServedBatch> {
-        match self.source.next(PATIENCE).unwrap() {
+        match self.source.next(TIMEOUT).unwrap() {
             NextBatch::Ready(served) => Some(*served),
             NextBatch::Finished => None,
             NextBatch::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),

@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 
 use driml_tests::{
     TestSystem,
-    python::{python_with, run},
+    python::{find_python, run_script},
 };
 use serde_json::Value;
 
 use crate::system;
 
 /// A script that prints what TensorBoard finds in a folder: points of curves, histograms, sizes of pictures.
-const READ: &str = "
+const READ_EVENTS: &str = "
 import json, sys
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 events = EventAccumulator(sys.argv[1], size_guidance={'scalars': 0, 'histograms': 0, 'images': 0}).Reload()
@@ -27,7 +27,7 @@ print(json.dumps({
 ";
 
 /// Returns the columns of `metrics.csv` without empty cells, as pairs of frames and value.
-fn columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
+fn metric_columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
     let metrics = system.run_folder("run").table("metrics.csv");
     let mut columns = BTreeMap::<_, Vec<_>>::new();
     for row in &metrics.rows {
@@ -43,9 +43,9 @@ fn columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
     columns
 }
 
-fn read(python: &str, system: &TestSystem) -> Value {
+fn read_events(python: &str, system: &TestSystem) -> Value {
     let folder = system.path("run").display().to_string();
-    serde_json::from_str(&run(python, &["-c", READ], &[&folder])).unwrap()
+    serde_json::from_str(&run_script(python, &["-c", READ_EVENTS], &[&folder])).unwrap()
 }
 
 /// Checks that each number in the rows is a point of the curve with its name, and that there are no other points.
@@ -70,15 +70,15 @@ fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
 
 #[test]
 fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
-    let Some(python) = python_with(&["tensorboard"]) else {
+    let Some(python) = find_python(&["tensorboard"]) else {
         return;
     };
     let system = system();
     let flags =
         "--lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --tensorboard";
     let summary = system.train(flags, "run");
-    let first = read(&python, &system);
-    check_points(&first, &columns(&system));
+    let first = read_events(&python, &system);
+    check_points(&first, &metric_columns(&system));
     let counted = |tag: &str| -> u64 {
         let all = first["histograms"][tag].as_array().unwrap();
         all.iter().map(|it| it[1].as_f64().unwrap() as u64).sum()
@@ -95,11 +95,11 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
     assert!(picture[1].as_u64().unwrap() >= 5 * 24);
 
     system.run_ok("local --resume run --frames 480");
-    let second = read(&python, &system);
-    let columns = columns(&system);
+    let second = read_events(&python, &system);
+    let columns = metric_columns(&system);
     check_points(&second, &columns);
     assert_eq!(columns["mean_age"].last().unwrap().0, 480);
-    let names = system.names("run").into_iter();
+    let names = system.file_names("run").into_iter();
     let files = names.filter(|name| name.contains("tfevents"));
     assert_eq!(files.count(), 2, "a file for each time it was started");
 }

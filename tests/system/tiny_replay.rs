@@ -31,7 +31,7 @@ pub(crate) fn config(transitions: u64) -> Config {
 const INCARNATION: u64 = 1;
 
 /// Lets an actor join.
-pub(crate) fn join(replay: &mut Replay, actor: u32) {
+pub(crate) fn join_actor(replay: &mut Replay, actor: u32) {
     let join = ActorJoin {
         actor,
         incarnation: INCARNATION,
@@ -61,14 +61,14 @@ pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Ch
 }
 
 /// Returns the returns in the rows of `batches` batches, as integers. If transitions are whole episodes, these are their rewards.
-pub(crate) fn numbers(replay: &mut Replay, batches: u64, rows: u32) -> BTreeSet<u64> {
-    let mut numbers = BTreeSet::new();
+pub(crate) fn drawn_returns(replay: &mut Replay, batches: u64, rows: u32) -> BTreeSet<u64> {
+    let mut drawn = BTreeSet::new();
     let mut request = RequestId::first(1);
     for _ in 0..batches {
         let batch = replay.draw_for(request, rows, Buffer::zeroed).unwrap();
         let returns = batch.unpack().n_step_returns();
-        numbers.extend(returns.into_iter().map(|it| it as u64));
+        drawn.extend(returns.into_iter().map(|it| it as u64));
         request = request.next();
     }
-    numbers
+    drawn
 }

@@ -3,17 +3,17 @@
 
 use std::time::{Duration, Instant};
 
-use driml_tests::{Certificates, EXPIRED, Ended, FUTURE, TestSystem, at_once, quic_endpoint};
+use driml_tests::{Certificates, EXPIRED, Exit, FUTURE, TestSystem, in_parallel, quic_endpoint};
 use zenoh::{Session, Wait};
 
 use crate::{LONG, system};
 
 /// The time within which a rejection must be reported, on a busy machine too.
-const SECONDS: Duration = Duration::from_secs(30);
+const REPORT_MAX: Duration = Duration::from_secs(30);
 
 /// Copies the good certificates to another folder, where a test can make them invalid.
-fn spoiled(system: &TestSystem, name: &str) -> Certificates {
-    system.certificates().copy(system.path(name))
+fn tls_copy(system: &TestSystem, name: &str) -> Certificates {
+    system.certificates().copy_to(system.path(name))
 }
 
 /// Opens the session of a stranger that listens in place of a replay server.
@@ -63,20 +63,20 @@ fn own_files_that_cannot_be_used() {
     let Some(system) = system().over_tls() else {
         return;
     };
-    let key = spoiled(&system, "key").path("actor-0.key");
+    let key = tls_copy(&system, "key").path("actor-0.key");
     std::fs::copy(system.path("tls/actor-1.key"), key).unwrap();
-    std::fs::write(spoiled(&system, "garbage").path("learner.key"), "no key").unwrap();
-    spoiled(&system, "role").pass_off("learner", "actor-0");
-    spoiled(&system, "number").pass_off("actor-1", "actor-0");
-    spoiled(&system, "old").sign_again("learner", EXPIRED);
-    spoiled(&system, "new").sign_again("learner", FUTURE);
+    std::fs::write(tls_copy(&system, "garbage").path("learner.key"), "no key").unwrap();
+    tls_copy(&system, "role").replace_role("learner", "actor-0");
+    tls_copy(&system, "number").replace_role("actor-1", "actor-0");
+    tls_copy(&system, "old").sign_again("learner", EXPIRED);
+    tls_copy(&system, "new").sign_again("learner", FUTURE);
     let foreign = Certificates::make(system.path("foreign"), "");
-    let mixed = spoiled(&system, "mixed").path("ca.pem");
+    let mixed = tls_copy(&system, "mixed").path("ca.pem");
     std::fs::copy(foreign.path("ca.pem"), mixed).unwrap();
     let [actor, learner] = ["actor --id 0", "learner --run-dir run"]
         .map(|role| format!("{role} --connect {} --tls-dir", system.endpoint()));
     let other = |id: u32| actor.replace("--id 0", &format!("--id {id}"));
-    system.refuses_each(&format!(
+    system.rejects_each(&format!(
         "
         {} tls => tls/actor-9.pem is not there: the role actor-9 needs ca.pem, actor-9.pem and actor-9.key; `deploy/certs.sh tls --actors 10` makes them
         {} tls => actors have the numbers 0 to 1023
@@ -96,7 +96,7 @@ fn own_files_that_cannot_be_used() {
 
     std::fs::remove_file(system.path("old/replay-server.pem")).unwrap();
     let server = "--tls-dir old --env chain --agent c51";
-    system.refuses_each(&format!(
+    system.rejects_each(&format!(
         "
         replay-server --listen quic/127.0.0.1:1 {server} => old/replay-server.pem is not there
         replay-server --listen tcp/127.0.0.1:1 {server} => it is quic/127.0.0.1:1
@@ -116,8 +116,8 @@ fn strangers_at_a_replay_server() {
     let foreign = Certificates::make(system.path("foreign"), "");
     std::fs::copy(system.path("tls/ca.pem"), foreign.path("ca.pem")).unwrap();
     let good = system.certificates();
-    let old = spoiled(&system, "old").sign_again("learner", EXPIRED);
-    let new = spoiled(&system, "new").sign_again("learner", FUTURE);
+    let old = tls_copy(&system, "old").sign_again("learner", EXPIRED);
+    let new = tls_copy(&system, "new").sign_again("learner", FUTURE);
     let endpoint = system.endpoint();
     let attempts = [
         ("none", &good, None),
@@ -133,7 +133,7 @@ fn strangers_at_a_replay_server() {
     ]);
     assert!(accepted.is_ok(), "else what is below says nothing");
     // Each attempt lasts until its time-out.
-    at_once(attempts, |(name, certificates, role)| {
+    in_parallel(attempts, |(name, certificates, role)| {
         let opened = open_raw(&[
             ("connect/endpoints", format!("[{endpoint:?}]")),
             ("transport/link/tls", raw_tls("connect", certificates, role)),
@@ -146,7 +146,7 @@ fn strangers_at_a_replay_server() {
     let started = Instant::now();
     let why = "One with --tls-dir is reached with quic/HOST:PORT";
     system.fails(&format!("actor --connect {plain}"), why);
-    assert!(started.elapsed() < SECONDS);
+    assert!(started.elapsed() < REPORT_MAX);
 
     // The strangers do not disturb admitted processes.
     let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
@@ -161,10 +161,10 @@ fn strangers_in_the_place_of_a_replay_server() {
     let Some(system) = system().over_tls() else {
         return;
     };
-    let old = spoiled(&system, "old").sign_again("replay-server", EXPIRED);
-    let new = spoiled(&system, "new").sign_again("replay-server", FUTURE);
+    let old = tls_copy(&system, "old").sign_again("replay-server", EXPIRED);
+    let new = tls_copy(&system, "new").sign_again("replay-server", FUTURE);
     let foreign = Certificates::make(system.path("foreign"), "");
-    let [named, unknowing] = ["named", "unknowing"].map(|name| spoiled(&system, name));
+    let [named, unknowing] = ["named", "unknowing"].map(|name| tls_copy(&system, name));
     for ending in ["pem", "key"] {
         std::fs::remove_file(named.path(&format!("replay-server.{ending}"))).unwrap();
     }
@@ -195,8 +195,8 @@ fn strangers_in_the_place_of_a_replay_server() {
         let ended = actor.wait();
         assert_eq!(ended.code, Some(1), "a certificate that is {name}");
         ended
-            .expect_said(&words)
-            .expect_said("driml doctor --tls-dir");
+            .expect_stderr(&words)
+            .expect_stderr("driml doctor --tls-dir");
         drop(listening);
     }
 }
@@ -209,10 +209,10 @@ fn the_doctor_looks_at_certificates() {
     };
     let doctor = |dir: &str| system.run(&format!("doctor --tls-dir {dir}"));
     let well = doctor("tls");
-    let said = |ended: &Ended, state: &str, what: &str, words: &str| {
+    let check_line = |exit: &Exit, state: &str, what: &str, words: &str| {
         let line = |it: &&str| it.starts_with(state) && it.contains(what) && it.contains(words);
-        let found = ended.stdout.lines().find(line);
-        assert!(found.is_some(), "{state} {what} {words}: {}", ended.stdout);
+        let found = exit.stdout.lines().find(line);
+        assert!(found.is_some(), "{state} {what} {words}: {}", exit.stdout);
     };
     for (what, words) in [
         ("tls replay-server", "127.0.0.1"),
@@ -220,23 +220,23 @@ fn the_doctor_looks_at_certificates() {
         ("tls observer", "days)"),
         ("tls actors", "from 0 to"),
     ] {
-        said(&well, "ok", what, words);
+        check_line(&well, "ok", what, words);
     }
-    said(&well, "note", "tls authority", "ca.key is here");
+    check_line(&well, "note", "tls authority", "ca.key is here");
     assert!(!well.stderr.contains("--tls-dir"), "{}", well.stderr);
 
-    let bad = spoiled(&system, "bad").sign_again("learner", EXPIRED);
-    bad.pass_off("actor-0", "observer");
+    let bad = tls_copy(&system, "bad").sign_again("learner", EXPIRED);
+    bad.replace_role("actor-0", "observer");
     std::fs::remove_file(bad.path("actor-1.key")).unwrap();
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o644);
     std::fs::set_permissions(bad.path("replay-server.key"), open).unwrap();
-    let ended = doctor("bad").expect_code(1);
-    said(&ended, "missing", "tls learner", "expired at");
-    said(&ended, "missing", "tls observer", "is the certificate of");
-    said(&ended, "missing", "tls actor-1", "actor-1.key is not there");
-    said(&ended, "note", "tls replay-server", "chmod 600");
-    ended.expect_said("these certificates cannot be used: tls learner, tls observer, tls actor-1");
-    said(
+    let exit = doctor("bad").expect_code(1);
+    check_line(&exit, "missing", "tls learner", "expired at");
+    check_line(&exit, "missing", "tls observer", "is the certificate of");
+    check_line(&exit, "missing", "tls actor-1", "actor-1.key is not there");
+    check_line(&exit, "note", "tls replay-server", "chmod 600");
+    exit.expect_stderr("these certificates cannot be used: tls learner, tls observer, tls actor-1");
+    check_line(
         &doctor("nowhere").expect_code(1),
         "missing",
         "tls folder",

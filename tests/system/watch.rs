@@ -5,30 +5,30 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use driml_launch::metrics::COLUMNS;
 use driml_tests::{
-    python::{python_with, run},
+    python::{find_python, run_script},
     wait_for, wait_until,
 };
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, launched, system};
+use crate::{LONG, SHORT, start_run, system};
 
 #[test]
 fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let system = system();
     let flags = "--agent driml-ada --actors 2";
     let server = format!("replay-server {flags} {SHORT}");
-    let server = system.start_process(&system.listening(&server));
+    let server = system.start_process(&system.listen_args(&server));
     let client = system.connect();
-    let watch = system.start(&system.connected("watch --run-dir run --tensorboard"));
+    let watch = system.start(&system.connect_args("watch --run-dir run --tensorboard"));
     wait_until("the folder", || system.path("run/metrics.csv").exists());
     // Both actors start together, with the first weights: an actor that starts late would play hardly an episode.
     let actors = [system.start_actor(0), system.start_actor(1)];
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     // The learner writes into the same folder, which is then as complete as that of a launched run.
-    let learner = system.start_process(&system.connected("learner --run-dir run"));
+    let learner = system.start_process(&system.connect_args("learner --run-dir run"));
     watch
         .wait_ok()
-        .expect_printed("finished: 1280 frames and 540 updates");
+        .expect_stdout("finished: 1280 frames and 540 updates");
     drop(client);
     for process in actors.into_iter().chain([learner, server]) {
         process.wait_ok();
@@ -52,14 +52,14 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     assert_eq!(header, launched.header);
     assert_eq!(watched.column("rss_mib_learner").pop().unwrap(), "");
     system.run_ok("plot run launched --out plot.svg");
-    let names = system.names("run");
+    let names = system.file_names("run");
     assert!(names.iter().any(|name| name.contains("tfevents")));
 }
 
 #[test]
 fn a_launched_run_is_watched_and_continues_without() {
     let system = system();
-    let launcher = launched(&system, 1);
+    let launcher = start_run(&system, 1);
     let mut watched = system.start("watch --run run --run-dir seen");
     let seen = system.run_folder("seen");
     let rows = || seen.table("metrics.csv").rows.len();
@@ -72,7 +72,7 @@ fn a_launched_run_is_watched_and_continues_without() {
 
     // No other process may write where the launcher writes, and a folder holds only one run.
     system.run_ok(&format!("local --agent c51 {SHORT} --run-dir other"));
-    system.refuses_each(
+    system.rejects_each(
         "
         watch --run run --run-dir run => run is written by `driml train` or by another `driml watch`
         watch --run run --run-dir other => other holds another run (chain with c51, seed 1)
@@ -83,7 +83,7 @@ fn a_launched_run_is_watched_and_continues_without() {
     wait_until("further rows", || rows() > before + 1);
     launcher.interrupt().expect_code(130);
     watched.interrupt().expect_code(130);
-    let frames = seen.numbers("frames");
+    let frames = seen.numeric_column("frames");
     assert!(frames.is_sorted(), "{frames:?}");
 }
 
@@ -93,7 +93,7 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     let flags = format!("--replay-dir replay --agent c51 {LONG}");
     let server = system.start_replay_server(&flags);
     let client = system.connect();
-    let mut watched = system.start(&system.connected("watch --run-dir seen"));
+    let mut watched = system.start(&system.connect_args("watch --run-dir seen"));
     watched.wait_for_stderr("no learner has joined yet; no actor has joined yet");
     let learner = system.start_learner("run");
     let _actor = system.start_actor(0);
@@ -102,7 +102,7 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     watched.wait_for_stderr("learner: no answer for ");
     learner.signal(Signal::SIGCONT);
 
-    let before = client.replay().unwrap().transitions_inserted;
+    let before = client.replay_status().unwrap().transitions_inserted;
     drop(client);
     server.kill();
     watched.wait_for_stderr("replay server: no answer for ");
@@ -115,7 +115,7 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
 }
 
 /// The fields of `--once --json` beside the metrics, which deploy/docs/src/reference/run-folder.md describes.
-const FIELDS: &str = "actors_planned agent finished frames_planned learner replay replay_ratio_planned run_spec seed servers actions_needed \
+const JSON_FIELDS: &str = "actors_planned agent finished frames_planned learner replay replay_ratio_planned run_spec seed servers actions_needed \
     updates_planned waiting_for healthy world";
 
 #[test]
@@ -123,30 +123,29 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let system = system();
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
-    let look = system.connected("watch --once");
+    let watch_once = system.connect_args("watch --once");
     // A process is missing.
-    let ended = system.run(&look).expect_code(1);
-    ended
-        .expect_said("error: the run needs attention: no learner has joined: start `driml learner");
+    let words = "error: the run needs attention: no learner has joined: start `driml learner";
+    system.fails(&watch_once, words);
     let _processes = [system.start_learner("run"), system.start_actor(0)];
     client.wait_for_the_last_update();
 
-    let ended = system.run_ok(&format!("{look} --json --prometheus run.prom"));
-    let said = ended.json();
-    let names = said.as_object().unwrap().keys().map(String::as_str);
+    let ended = system.run_ok(&format!("{watch_once} --json --prometheus run.prom"));
+    let json = ended.json();
+    let names = json.as_object().unwrap().keys().map(String::as_str);
     let names: BTreeSet<_> = names.collect();
     let metrics = COLUMNS.iter().map(|it| it.name);
-    let fields: BTreeSet<_> = metrics.chain(FIELDS.split(' ')).collect();
+    let fields: BTreeSet<_> = metrics.chain(JSON_FIELDS.split(' ')).collect();
     assert_eq!(names, fields);
-    assert_eq!(said["frames"], 1280);
-    assert_eq!(said["updates"], 540);
-    assert_eq!(said["healthy"], true);
-    assert_eq!(said["finished"], true);
-    assert_eq!(said["losses"].as_object().unwrap().len(), 1);
+    assert_eq!(json["frames"], 1280);
+    assert_eq!(json["updates"], 540);
+    assert_eq!(json["healthy"], true);
+    assert_eq!(json["finished"], true);
+    assert_eq!(json["losses"].as_object().unwrap().len(), 1);
     // The text output is that of `driml status`.
     system
-        .run_ok(&look)
-        .expect_printed("the run is over: everything is learned and saved");
+        .run_ok(&watch_once)
+        .expect_stdout("the run is over: everything is learned and saved");
 
     let samples = parse_prometheus(&system.read("run.prom"));
     let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();
@@ -159,8 +158,8 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     assert_eq!(labels["endpoint"], system.endpoint());
     assert_eq!(of("driml_updates_total").2, 540.0);
     // The JSON parser may be off by the last digit.
-    let (found, said) = (of("driml_mean_return").2, &said["mean_return"]);
-    assert!((found - said.as_f64().unwrap()).abs() < 1e-12, "{found}");
+    let (found, mean) = (of("driml_mean_return").2, &json["mean_return"]);
+    assert!((found - mean.as_f64().unwrap()).abs() < 1e-12, "{found}");
     assert_eq!(of("driml_finished").2, 1.0);
     assert!(of("driml_c51_kl").2 > 0.0 && of("driml_total_loss").2 > 0.0);
     assert_eq!(of("driml_losses").1["loss"], "dim_4t4");
@@ -210,11 +209,11 @@ fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> 
 
 #[test]
 fn prometheus_reads_the_file_of_a_run_that_is_watched() {
-    let Some(python) = python_with(&["prometheus_client"]) else {
+    let Some(python) = find_python(&["prometheus_client"]) else {
         return;
     };
     let system = system();
-    let launcher = launched(&system, 1);
+    let launcher = start_run(&system, 1);
     let watched = system.start("watch --run run --prometheus run.prom");
     let path = system.path("run.prom");
     let read = "
@@ -224,8 +223,8 @@ print(next(it for it in parse(open(sys.argv[1]).read()) if it.name == 'driml_upd
 ";
     let updates = || {
         path.exists().then(|| {
-            let said = run(&python, &["-c", read], &[&path.display().to_string()]);
-            said.trim().parse::<f64>().unwrap()
+            let stdout = run_script(&python, &["-c", read], &[&path.display().to_string()]);
+            stdout.trim().parse::<f64>().unwrap()
         })
     };
     let first = wait_for("the file", updates);

@@ -27,6 +27,6 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
     assert!(played.starts_with("island as trained on"), "{played}");
     system
         .run_ok("presets")
-        .expect_printed("predictive")
-        .expect_printed("island");
+        .expect_stdout("predictive")
+        .expect_stdout("island");
 }

@@ -7,7 +7,7 @@ use driml_protocol::{
 use driml_tests::Client;
 
 use super::{
-    Row, SILENCE, affinity, batch_request, chunk_header, leave, newer, sealed, send_refused,
+    NO_REPLY, Row, affinity, batch_request, check_refused, chunk_header, encoded, leave, newer,
 };
 use crate::{LONG, system};
 
@@ -32,10 +32,10 @@ fn chunk(client: &Client, sequence: u64) -> Chunk {
 }
 
 /// Words of the reason for which a chunk is rejected, and the change that makes it invalid.
-type Senseless = (&'static str, fn(&mut Chunk));
+type InvalidChunk = (&'static str, fn(&mut Chunk));
 
 /// Chunks that are invalid in this run. All kinds of invalid chunks are tested beside the codec and the replay.
-const SENSELESS: [Senseless; 4] = [
+const INVALID_CHUNKS: [InvalidChunk; 4] = [
     ("do not fill", |it| it.header.steps = 4),
     ("the reward of row 5 is not finite", |it| {
         it.set(5, 0, f32::NAN, End::Running)
@@ -54,9 +54,9 @@ fn foreign(client: &Client, message: &impl Message, payload: &[u8]) -> Vec<u8> {
 }
 
 /// Returns messages that are rejected at the key for chunks, each with words of the reason.
-fn no_chunks(client: &Client) -> Vec<(Vec<u8>, &'static str)> {
+fn invalid_chunks(client: &Client) -> Vec<(Vec<u8>, &'static str)> {
     let chunk = chunk(client, 0);
-    let whole = client.seal(&chunk);
+    let whole = client.encode_chunk(&chunk);
     let mut huge = whole.clone();
     huge[20..28].copy_from_slice(&u64::MAX.to_le_bytes());
     let mut damaged = whole.clone();
@@ -71,7 +71,7 @@ fn no_chunks(client: &Client) -> Vec<(Vec<u8>, &'static str)> {
             "run the same build of driml everywhere",
         ),
         (
-            sealed(client, &leave(0, INCARNATION, 0)),
+            encoded(client, &leave(0, INCARNATION, 0)),
             "a message of kind 8 came where kind 1 is expected",
         ),
         (
@@ -84,10 +84,10 @@ fn no_chunks(client: &Client) -> Vec<(Vec<u8>, &'static str)> {
         (whole[..40].to_vec(), "cut off or padded"),
         ([&whole[..], &[0]].concat(), "cut off or padded"),
     ];
-    all.extend(SENSELESS.map(|(why, spoil)| {
+    all.extend(INVALID_CHUNKS.map(|(why, spoil)| {
         let mut chunk = chunk.clone();
         spoil(&mut chunk);
-        (client.seal(&chunk), why)
+        (client.encode_chunk(&chunk), why)
     }));
     all
 }
@@ -100,16 +100,16 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
     client.join_as_actor(0, INCARNATION);
     client.join_as_learner(LEARNER);
     let keys = &client.keys;
-    let refuses = |row: Row| {
+    let check = |row: Row| {
         let why = format!("{}: {}", row.key, row.expected);
-        let stored = || client.replay().unwrap().transitions_inserted;
+        let stored = || client.replay_status().unwrap().transitions_inserted;
         let before = stored();
-        send_refused(client, &why, [row], 1);
+        check_refused(client, &why, [row], 1);
         assert_eq!(stored(), before, "{why}");
     };
-    let in_place_of_a_chunk =
-        |(bytes, why): (Vec<u8>, _)| refuses(Row::new(keys.of_actor::<ChunkHeader>(0), bytes, why));
-    no_chunks(client).into_iter().for_each(in_place_of_a_chunk);
+    let check_chunk =
+        |(bytes, why): (Vec<u8>, _)| check(Row::new(keys.of_actor::<ChunkHeader>(0), bytes, why));
+    invalid_chunks(client).into_iter().for_each(check_chunk);
 
     let garbage = b"DRML and then nothing that makes sense";
     let batch = |rows| batch_request(LEARNER, rows);
@@ -122,13 +122,13 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
         Row::of(client, &batch(0), "a batch of"),
         Row::of(client, &batch(u32::MAX), "a batch of"),
         // Messages that need no reply get none.
-        Row::new(&leaves, garbage, SILENCE),
-        Row::new(&leaves, foreign(client, &leave, &[]), SILENCE),
-        Row::new(keys.of::<AffinityUpdate>(), garbage, SILENCE),
-        Row::of(client, &affinity(LEARNER, 1, 2), SILENCE),
+        Row::new(&leaves, garbage, NO_REPLY),
+        Row::new(&leaves, foreign(client, &leave, &[]), NO_REPLY),
+        Row::new(keys.of::<AffinityUpdate>(), garbage, NO_REPLY),
+        Row::of(client, &affinity(LEARNER, 1, 2), NO_REPLY),
     ];
-    others.into_iter().for_each(refuses);
-    let status = client.replay().unwrap();
+    others.into_iter().for_each(check);
+    let status = client.replay_status().unwrap();
     assert_eq!((status.affinity_version, status.transitions_lost), (0, 0));
 
     // The server still stores: the chunk arrives, once.
@@ -147,7 +147,7 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
     let mut second_life = chunk(client, 0);
     second_life.header.incarnation = 10;
     assert_eq!(client.insert(&second_life), stored(12));
-    let late = client.seal(&chunk(client, 1));
-    in_place_of_a_chunk((late, "give each actor another number (--id)"));
-    assert_eq!(system.survivors().len(), 1, "the server");
+    let late = client.encode_chunk(&chunk(client, 1));
+    check_chunk((late, "give each actor another number (--id)"));
+    assert_eq!(system.running_processes().len(), 1, "the server");
 }

@@ -22,11 +22,11 @@ use zenoh::qos::Priority;
 use crate::tiny_replay;
 
 /// The expected result of a message that need not be answered.
-const SILENCE: &str = "no answer";
+const NO_REPLY: &str = "no answer";
 
 /// How long to wait for a reply that must not come, and the time-out of one that must.
-const NO_ANSWER: Duration = Duration::from_millis(700);
-const ANSWER_MAX: Duration = Duration::from_secs(20);
+const NO_REPLY_WAIT: Duration = Duration::from_millis(700);
+const REPLY_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A message, and words that the reply must contain.
 pub(crate) struct Row {
@@ -52,7 +52,7 @@ impl Row {
     pub(crate) fn of<M: Keyed>(client: &Client, message: &M, expected: &'static str) -> Self {
         let actor = message.actor().unwrap_or_default();
         let key = client.keys.of_actor::<M>(actor);
-        Self::new(key, sealed(client, message), expected)
+        Self::new(key, encoded(client, message), expected)
     }
 }
 
@@ -103,7 +103,7 @@ fn chunk_header(client: &Client, actor: u32, incarnation: u64) -> ChunkHeader {
     }
 }
 
-fn sealed(client: &Client, message: &impl Message) -> Vec<u8> {
+fn encoded(client: &Client, message: &impl Message) -> Vec<u8> {
     codec::encode(client.spec.hash(), message, &[]).unwrap()
 }
 
@@ -114,7 +114,7 @@ fn newer(mut bytes: Vec<u8>) -> Vec<u8> {
 }
 
 /// Sends each row's message and checks the reply.
-pub(crate) fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
+pub(crate) fn check_replies(client: &Client, rows: impl IntoIterator<Item = Row>) {
     for (i, row) in rows.into_iter().enumerate() {
         let Row {
             key,
@@ -122,41 +122,41 @@ pub(crate) fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
             expected,
         } = row;
         let wait_max = match expected {
-            SILENCE => NO_ANSWER,
-            _ => ANSWER_MAX,
+            NO_REPLY => NO_REPLY_WAIT,
+            _ => REPLY_TIMEOUT,
         };
         let bytes = bytes.into();
-        let said = match session::ask(&client.session, &key, bytes, Priority::Data, wait_max) {
+        let reply = match session::ask(&client.session, &key, bytes, Priority::Data, wait_max) {
             Ok(answer) => describe(&answer.to_bytes()),
             Err(e @ SessionError::Recovering(_)) => e.to_string(),
-            Err(_) => SILENCE.to_owned(),
+            Err(_) => NO_REPLY.to_owned(),
         };
         assert!(
-            said.contains(expected),
-            "{key}, row {i}: wanted {expected:?}, got {said}"
+            reply.contains(expected),
+            "{key}, row {i}: wanted {expected:?}, got {reply}"
         );
     }
 }
 
 /// Sends each row's message and checks the reply, and that the replay server counts exactly `refused` more messages as refused.
-fn send_refused(client: &Client, what: &str, rows: impl IntoIterator<Item = Row>, refused: u64) {
-    let before = client.replay().unwrap().messages_refused;
-    send(client, rows);
+fn check_refused(client: &Client, what: &str, rows: impl IntoIterator<Item = Row>, refused: u64) {
+    let before = client.replay_status().unwrap().messages_refused;
+    check_replies(client, rows);
     // A busy server may not have received the last message yet.
     let status = client.wait_for_replay(what, |replay| replay.messages_refused >= before + refused);
     assert_eq!(status.messages_refused - before, refused, "{what}");
 }
 
 /// Checks that the client's run continues and loses nothing.
-fn continues(client: &Client) {
-    let updates = client.learner().unwrap().updates;
-    let transitions = client.replay().unwrap().transitions_inserted;
+fn check_continues(client: &Client) {
+    let updates = client.learner_status().unwrap().updates;
+    let transitions = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_updates(updates + 20);
     let status = client.wait_for_transitions(transitions + 100);
     check_nothing_lost(&status);
     assert_eq!((status.actors, status.finished), (1, false));
     assert!(status.affinity_version < 1 << 20, "{status:#?}");
-    let learner = client.learner().unwrap();
+    let learner = client.learner_status().unwrap();
     assert!(learner.weights_version < 1 << 20, "{learner:#?}");
 }
 

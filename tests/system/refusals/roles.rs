@@ -10,24 +10,24 @@ use driml_protocol::{
     ActorJoin, Alive, Chunk, ChunkHeader, ChunkPoll, LearnerStatus, Leave, ReplayStatus, RunInfo,
     WeightsRequest, WeightsUpload, WeightsVersion, session, tls::Role,
 };
-use driml_tests::{Client, Process, TestSystem, at_once, new_learner, wait_until};
+use driml_tests::{Client, Process, TestSystem, in_parallel, new_learner, wait_until};
 use zenoh::{Wait, query::Query, sample::Locality};
 
 use super::{
-    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, continues, leave, sealed,
-    send, upload,
+    NO_REPLY, Row, actor_join, affinity, batch_request, check_continues, check_replies,
+    chunk_header, encoded, leave, upload,
 };
 use crate::{LONG, system};
 
 /// A run over TLS, and an observer.
-struct Guarded {
+struct TlsRun {
     system: TestSystem,
     observer: Client,
     _server: Process,
     _processes: [Process; 2],
 }
 
-impl Guarded {
+impl TlsRun {
     fn new() -> Option<Self> {
         let system = system().over_tls()?;
         let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
@@ -42,27 +42,27 @@ impl Guarded {
         })
     }
 
-    fn refused(&self) -> u64 {
-        self.observer.replay().unwrap().messages_refused
+    fn refusals(&self) -> u64 {
+        self.observer.replay_status().unwrap().messages_refused
     }
 }
 
 /// Sends all rows at the same time, because most of them wait for a reply until the time-out.
-fn send_at_once(client: &Client, rows: impl IntoIterator<Item = Row>) {
-    at_once(rows, |row| send(client, [row]));
+fn send_in_parallel(client: &Client, rows: impl IntoIterator<Item = Row>) {
+    in_parallel(rows, |row| check_replies(client, [row]));
 }
 
 #[test]
 fn a_role_does_nothing_but_its_own() {
-    if let Some(run) = Guarded::new() {
+    if let Some(run) = TlsRun::new() {
         an_actor_asks_for_nothing_but_its_own(&run);
         an_actor_declares_nothing_but_its_own(&run);
-        an_observer_only_looks(&run);
-        continues(&run.observer);
+        an_observer_only_reads(&run);
+        check_continues(&run.observer);
     }
 }
 
-fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
+fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
     let one = &run.system.connect_as(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
@@ -75,47 +75,47 @@ fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
         leaving: false,
     };
     let weights = upload(hash, 1, 1 << 19, b"w");
-    let before = run.refused();
-    send_at_once(
+    let before = run.refusals();
+    send_in_parallel(
         one,
         [
-            Row::of(one, &batch_request(1, 16), SILENCE),
-            Row::of(one, &affinity(1, 1, 3), SILENCE),
-            Row::of(one, &new_learner(1), SILENCE),
-            Row::new(keys.of::<WeightsUpload>(), weights, SILENCE),
-            Row::of(one, &join, SILENCE),
-            Row::of(one, &leave, SILENCE),
-            Row::of(one, &poll, SILENCE),
-            Row::new(keys.of_actor::<ChunkHeader>(other), [0; 100], SILENCE),
-            Row::new(keys.of::<Leave>(), sealed(one, &leave), SILENCE),
-            Row::new(keys.of::<ReplayStatus>(), [], SILENCE),
-            Row::new(keys.of::<LearnerStatus>(), [], SILENCE),
-            Row::new("driml/**", [], SILENCE),
+            Row::of(one, &batch_request(1, 16), NO_REPLY),
+            Row::of(one, &affinity(1, 1, 3), NO_REPLY),
+            Row::of(one, &new_learner(1), NO_REPLY),
+            Row::new(keys.of::<WeightsUpload>(), weights, NO_REPLY),
+            Row::of(one, &join, NO_REPLY),
+            Row::of(one, &leave, NO_REPLY),
+            Row::of(one, &poll, NO_REPLY),
+            Row::new(keys.of_actor::<ChunkHeader>(other), [0; 100], NO_REPLY),
+            Row::new(keys.of::<Leave>(), encoded(one, &leave), NO_REPLY),
+            Row::new(keys.of::<ReplayStatus>(), [], NO_REPLY),
+            Row::new(keys.of::<LearnerStatus>(), [], NO_REPLY),
+            Row::new("driml/**", [], NO_REPLY),
         ],
     );
-    assert_eq!(run.refused(), before, "nothing of it reached the server");
+    assert_eq!(run.refusals(), before, "nothing of it reached the server");
 
     // At the actor's own keys, send messages that speak for another actor.
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
     let chunks = keys.of_actor::<ChunkHeader>(1);
-    let said = "speaks for actor 0 at the key";
-    send_at_once(
+    let reason = "speaks for actor 0 at the key";
+    send_in_parallel(
         one,
         [
-            Row::new(chunks, one.seal(&chunk), said),
-            Row::new(keys.of_actor::<Leave>(1), sealed(one, &leave), SILENCE),
-            Row::new(keys.of_actor::<ActorJoin>(1), sealed(one, &join), SILENCE),
-            Row::new(keys.of_actor::<ChunkPoll>(1), sealed(one, &poll), SILENCE),
+            Row::new(chunks, one.encode_chunk(&chunk), reason),
+            Row::new(keys.of_actor::<Leave>(1), encoded(one, &leave), NO_REPLY),
+            Row::new(keys.of_actor::<ActorJoin>(1), encoded(one, &join), NO_REPLY),
+            Row::new(keys.of_actor::<ChunkPoll>(1), encoded(one, &poll), NO_REPLY),
         ],
     );
-    wait_until("four refusals", || run.refused() >= before + 4);
+    wait_until("four refusals", || run.refusals() >= before + 4);
 }
 
 /// An actor can neither answer in place of others, nor publish or receive what is not for it, nor count as another process.
-fn an_actor_declares_nothing_but_its_own(run: &Guarded) {
+fn an_actor_declares_nothing_but_its_own(run: &TlsRun) {
     let one = run.system.connect_as(Role::Actor(1));
     let keys = &one.keys;
-    let asked = Arc::<AtomicUsize>::default();
+    let queries = Arc::<AtomicUsize>::default();
     let mut declared = Vec::new();
     for key in [
         keys.of::<RunInfo>(),
@@ -124,9 +124,9 @@ fn an_actor_declares_nothing_but_its_own(run: &Guarded) {
         keys.of::<LearnerStatus>(),
         keys.of::<ChunkHeader>(),
     ] {
-        let asked = asked.clone();
+        let queries = queries.clone();
         let answer = move |query: Query| {
-            asked.fetch_add(1, Ordering::Relaxed);
+            queries.fetch_add(1, Ordering::Relaxed);
             session::answer(&query, b"lies".to_vec().into());
         };
         let queryable = one.session.declare_queryable(key).complete(true);
@@ -151,20 +151,18 @@ fn an_actor_declares_nothing_but_its_own(run: &Guarded) {
     });
     let lie = WeightsVersion { version: 1 << 60 };
     one.session
-        .put(keys.of::<WeightsVersion>(), sealed(&one, &lie))
+        .put(keys.of::<WeightsVersion>(), encoded(&one, &lie))
         .wait()
         .unwrap();
 
     // A process that joins now gets the right answer.
     let mut two = run.system.start_actor(2);
     two.wait_for_stderr("actor 2 steps");
-    run.observer
-        .wait_for_replay("both", |replay| replay.actors == 2);
-    two.stop_ok().expect_said("leaves: ");
-    run.observer
-        .wait_for_replay("one", |replay| replay.actors == 1);
-    continues(&run.observer);
-    assert_eq!(asked.load(Ordering::Relaxed), 0, "queries to an actor");
+    run.observer.wait_for_replay("both", |it| it.actors == 2);
+    two.stop_ok().expect_stderr("leaves: ");
+    run.observer.wait_for_replay("one", |it| it.actors == 1);
+    check_continues(&run.observer);
+    assert_eq!(queries.load(Ordering::Relaxed), 0, "queries to an actor");
     assert_eq!(
         received.load(Ordering::Relaxed),
         0,
@@ -173,17 +171,17 @@ fn an_actor_declares_nothing_but_its_own(run: &Guarded) {
     drop((declared, everything, tokens));
 }
 
-fn an_observer_only_looks(run: &Guarded) {
+fn an_observer_only_reads(run: &TlsRun) {
     let observer = &run.system.connect_as(Role::Observer);
-    assert!(observer.replay().is_some() && observer.learner().is_some());
+    assert!(observer.replay_status().is_some() && observer.learner_status().is_some());
     let keys = &observer.keys;
-    send_at_once(
+    send_in_parallel(
         observer,
         [
-            Row::of(observer, &WeightsRequest::NewerThan(0), SILENCE),
-            Row::of(observer, &new_learner(1), SILENCE),
-            Row::of(observer, &actor_join(1, 1), SILENCE),
-            Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], SILENCE),
+            Row::of(observer, &WeightsRequest::NewerThan(0), NO_REPLY),
+            Row::of(observer, &new_learner(1), NO_REPLY),
+            Row::of(observer, &actor_join(1, 1), NO_REPLY),
+            Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], NO_REPLY),
         ],
     );
 }

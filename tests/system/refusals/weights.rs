@@ -6,17 +6,17 @@ use driml_protocol::{Keys, RunInfo, WeightsUpload, WeightsVersion, codec, sessio
 use driml_tests::{Client, listen};
 use zenoh::Wait;
 
-use super::{Row, SILENCE, newer, send_refused, upload};
+use super::{NO_REPLY, Row, check_refused, newer, upload};
 use crate::system;
 
 /// The number of the learner that the test plays.
 const LEARNER: u64 = 5;
 
 /// Sends weights that the replay server must reject and count as refused.
-fn refused(client: &Client, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
+fn check_rejected(client: &Client, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
     for (name, bytes) in rows {
         let key = client.keys.of::<WeightsUpload>();
-        send_refused(client, name, [Row::new(key, bytes, SILENCE)], 1);
+        check_refused(client, name, [Row::new(key, bytes, NO_REPLY)], 1);
     }
 }
 
@@ -35,11 +35,12 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         .export_weights()
         .unwrap()
         .safetensors;
-    let of = |version, weights: &[u8], learner| upload(hash, learner, version, weights);
+    let pack = |version, weights: &[u8], learner| upload(hash, learner, version, weights);
     // Uploads weights that the replay server accepts.
-    let send = |version, weights: &[u8]| {
+    let accept = |version, weights: &[u8]| {
         let key = client.keys.of::<WeightsUpload>();
-        client.ask(&key, of(version, weights, LEARNER)).unwrap();
+        let bytes = pack(version, weights, LEARNER);
+        client.request(&key, bytes).unwrap();
     };
     // Announces newer weights, as a stranger could.
     let announce = |version, spec_hash| {
@@ -53,50 +54,50 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     // Until there are usable weights, an actor retries and steps nothing.
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr("waiting for the learner's first weights");
-    refused(&client, [("it has not joined", of(1, &good, LEARNER))]);
+    check_rejected(&client, [("it has not joined", pack(1, &good, LEARNER))]);
     client.join_as_learner(LEARNER);
-    refused(
+    check_rejected(
         &client,
         [("of another run", upload(hash ^ 1, LEARNER, 1, &good))],
     );
-    assert_eq!(client.replay().unwrap().transitions_inserted, 0);
-    send(1, &good);
+    assert_eq!(client.replay_status().unwrap().transitions_inserted, 0);
+    accept(1, &good);
     client.wait_for_transitions(0);
 
     // Then the actor keeps its weights, whatever is sent.
-    let mut damaged = of(2, &good, LEARNER);
+    let mut damaged = pack(2, &good, LEARNER);
     *damaged.last_mut().unwrap() ^= 1;
     let rows = [
-        ("of another protocol", newer(of(2, &good, LEARNER))),
+        ("of another protocol", newer(pack(2, &good, LEARNER))),
         ("damaged", damaged),
         ("not a message", b"not weights".to_vec()),
-        ("of a stranger", of(2, &good, LEARNER ^ 1)),
+        ("of a stranger", pack(2, &good, LEARNER ^ 1)),
         (
             "other weights of the same version",
-            of(1, &good[..40], LEARNER),
+            pack(1, &good[..40], LEARNER),
         ),
         (
             "a count that no learner reaches",
-            of(1 << 60, &good, LEARNER),
+            pack(1 << 60, &good, LEARNER),
         ),
-        ("older", of(0, &good, LEARNER)),
+        ("older", pack(0, &good, LEARNER)),
     ];
-    refused(&client, rows);
+    check_rejected(&client, rows);
     announce(4, hash ^ 1);
     actor
         .wait_for_stderr("an announcement of weights was dropped: the message belongs to run spec");
     // There are no newer weights, so the announcement has no effect.
     announce(1 << 60, hash);
     // These weights come from the right learner but do not fit the network, which shows only when the actor loads them.
-    send(6, &good[..good.len() / 2]);
+    accept(6, &good[..good.len() / 2]);
     actor.wait_for_stderr("weights 6 were refused, the old ones stay");
-    send(7, &good);
+    accept(7, &good);
 
-    let before = client.replay().unwrap().transitions_inserted;
+    let before = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_transitions(before + 1000);
-    let said = actor.stop_ok().stderr;
-    assert!(!said.contains("newer ones did not come"), "{said}");
-    assert_eq!(client.replay().unwrap().transitions_lost, 0);
+    let stderr = actor.stop_ok().stderr;
+    assert!(!stderr.contains("newer ones did not come"), "{stderr}");
+    assert_eq!(client.replay_status().unwrap().transitions_lost, 0);
 }
 
 #[test]

@@ -7,10 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_tests::{Ended, TestSystem, at_once};
+use driml_tests::{Exit, TestSystem, in_parallel};
 use nix::sys::signal::Signal;
 
-use crate::{SHORT, listener, system};
+use crate::{SHORT, listen_on_free_port, system};
 
 /// The commands that connect to a replay server.
 const COMMANDS: [&str; 4] = [
@@ -21,7 +21,7 @@ const COMMANDS: [&str; 4] = [
 ];
 
 /// Runs a command that must exit within `seconds` seconds, and checks that its output names no file of the build machine.
-fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
+fn fails_within(system: &TestSystem, command: &str, seconds: u64) -> Exit {
     let started = Instant::now();
     let ended = system.run(command).expect_code(1);
     // Allow more time on a busy machine.
@@ -39,7 +39,7 @@ fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
 #[test]
 fn a_closed_port_differs_from_an_unknown_host() {
     let system = system();
-    let (endpoint, _) = listener();
+    let (endpoint, _) = listen_on_free_port();
     let unknown = "tcp/no-such-host.invalid:7447";
     for (endpoint, said) in [
         // Processes give the replay server some seconds to start, `driml status` does not.
@@ -49,14 +49,14 @@ fn a_closed_port_differs_from_an_unknown_host() {
         ),
         (unknown, format!("the host of {unknown} is unknown: ")),
     ] {
-        at_once(COMMANDS, |command| {
-            refused(&system, &format!("{command} {endpoint}"), 30).expect_said(&said);
+        in_parallel(COMMANDS, |command| {
+            fails_within(&system, &format!("{command} {endpoint}"), 30).expect_stderr(&said);
         });
     }
     let started = Instant::now();
-    refused(&system, &format!("status --connect {endpoint}"), 0);
-    refused(&system, &system.connected("watch"), 0)
-        .expect_said("there is no such socket. Start the replay server first");
+    fails_within(&system, &format!("status --connect {endpoint}"), 0);
+    fails_within(&system, &system.connect_args("watch"), 0)
+        .expect_stderr("there is no such socket. Start the replay server first");
     system.run("status").expect_code(64);
     assert!(started.elapsed() < Duration::from_secs(10));
 }
@@ -64,7 +64,7 @@ fn a_closed_port_differs_from_an_unknown_host() {
 #[test]
 fn a_web_server_is_no_replay_server() {
     let system = system();
-    let (endpoint, listener) = listener();
+    let (endpoint, listener) = listen_on_free_port();
     thread::spawn(move || {
         for stream in listener.incoming() {
             let mut stream = stream.unwrap();
@@ -78,31 +78,31 @@ fn a_web_server_is_no_replay_server() {
             });
         }
     });
-    at_once(COMMANDS, |command| {
-        refused(&system, &format!("{command} {endpoint}"), 5)
-            .expect_said(&format!(
+    in_parallel(COMMANDS, |command| {
+        fails_within(&system, &format!("{command} {endpoint}"), 5)
+            .expect_stderr(&format!(
                 "something listens on {endpoint} that is not driml"
             ))
-            .expect_said("it says \"HTTP/1.0 404 Not Found\"");
+            .expect_stderr("it says \"HTTP/1.0 404 Not Found\"");
     });
 }
 
 #[test]
 fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     let system = system();
-    let (endpoint, _) = listener();
+    let (endpoint, _) = listen_on_free_port();
     let _router = driml_tests::listen(&endpoint);
-    at_once(&COMMANDS[..2], |command| {
+    in_parallel(&COMMANDS[..2], |command| {
         let started = Instant::now();
         let mut process = system.start_process(&format!("{command} {endpoint}"));
         let words = "a process listens there, but does not answer at driml/run-info";
         process.wait_for_stderr(words);
         assert!(started.elapsed() < Duration::from_secs(30));
     });
-    at_once(&COMMANDS[2..], |command| {
+    in_parallel(&COMMANDS[2..], |command| {
         system
-            .refuses(&format!("{command} {endpoint}"), "a program listens on")
-            .expect_said("but it is not a replay server with the namespace \"driml\"");
+            .rejects(&format!("{command} {endpoint}"), "a program listens on")
+            .expect_stderr("but it is not a replay server with the namespace \"driml\"");
     });
 }
 
@@ -110,7 +110,7 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
 #[test]
 fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
     let system = system();
-    at_once(&COMMANDS[..2], |command| {
+    in_parallel(&COMMANDS[..2], |command| {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nothing listens there.
             let mut process = system.start(&format!("{command} {}", system.endpoint()));
@@ -118,7 +118,7 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
             process.signal(signal);
             process.wait().expect_code(130);
             // Something listens, and sends nothing.
-            let (endpoint, listener) = listener();
+            let (endpoint, listener) = listen_on_free_port();
             let process = system.start(&format!("{command} {endpoint}"));
             let connection = listener.accept().unwrap();
             process.signal(signal);
@@ -131,14 +131,14 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
 #[test]
 fn an_endpoint_that_is_taken_is_named_before_anything_is_made() {
     let system = system();
-    let (endpoint, _listener) = listener();
+    let (endpoint, _listener) = listen_on_free_port();
     for command in ["local --run-dir run", "replay-server"] {
         let ended = system
-            .refuses(
+            .rejects(
                 &format!("{command} {SHORT} --listen {endpoint}"),
                 &format!("error: cannot listen on {endpoint}: another process listens there"),
             )
-            .expect_said("with --listen for this command");
+            .expect_stderr("with --listen for this command");
         assert_eq!(ended.stderr.lines().count(), 1, "{}", ended.stderr);
     }
     assert!(!system.path("run").exists());

@@ -17,13 +17,13 @@ fn twenty_four_actors_wait_for_one_learner() {
         "--agent c51 {} --actors 24 --set replay.replay_ratio=64",
         chain(2_400)
     );
-    // Hold the learner, so that even on a fast machine the run does not end before the last actor waits.
-    system.hold_at(100);
-    let process = system.start(&system.local(&flags));
+    // Pause the learner, so that even on a fast machine the run does not end before the last actor waits.
+    system.pause_learners_at(100);
+    let process = system.start(&system.local_args(&flags));
     system
         .connect()
         .wait_for_replay("24 actors that wait", |replay| replay.actors_waiting == 24);
-    system.let_go();
+    system.release_learners();
     let ended = process.wait_ok();
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
@@ -36,14 +36,14 @@ fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     let system = system();
     let waiting = "--set replay.replay_ratio=512 --set replay.warmup_transitions=2000";
     let flags = format!("--agent c51 {LONG} --actors 32 {waiting}");
-    let process = system.start(&system.local(&flags));
+    let process = system.start(&system.local_args(&flags));
     system
         .connect()
         .wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
     process.interrupt().expect_code(130);
     let summary = system.run_folder("run").check(Outcome::Interrupted);
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
-    assert_eq!(system.survivors(), []);
+    assert_eq!(system.running_processes(), []);
 }
 
 /// The limiter never opens, as without a learner, and the test lasts longer than the time-out for an unreachable server. Actors that wait
@@ -53,11 +53,11 @@ fn an_actor_waits_for_as_long_as_it_must() {
     let system = system();
     let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let client = system.connect();
-    let (patience, stop) = (Duration::from_secs(3), Shutdown::default());
+    let (unreachable_max, stop) = (Duration::from_secs(3), Shutdown::default());
     let limits = DeliveryLimits {
         chunks_in_flight_max: 4,
         ack_timeout: Duration::from_secs(10),
-        unreachable_max: patience,
+        unreachable_max,
     };
     let synthetic = |actor| {
         client.join_as_actor(actor, 1);
@@ -82,15 +82,15 @@ fn an_actor_waits_for_as_long_as_it_must() {
         assert!(before.transitions_inserted <= 200 + 256 + 32, "{before:#?}");
         let started = Instant::now();
         wait_until("twice the time that an actor bears silence", || {
-            started.elapsed() > 2 * patience
+            started.elapsed() > 2 * unreachable_max
         });
-        let after = client.replay().unwrap();
+        let after = client.replay_status().unwrap();
         assert_eq!((after.actors_waiting, after.chunks_retried), (16, 0));
         assert_eq!(after.transitions_inserted, before.transitions_inserted);
         stop.set();
         runs.into_iter().map(|run| run.join().unwrap()).sum()
     });
-    let status = client.replay().unwrap();
+    let status = client.replay_status().unwrap();
     assert_eq!(status.transitions_inserted, produced, "{status:#?}");
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
 }
@@ -113,12 +113,12 @@ fn of_two_processes_with_one_role_the_second_waits_for_the_first_one_s_end() {
         "another process is actor 3 of this run: give each actor another number (--id)",
     );
     // The first actor still plays.
-    let before = client.replay().unwrap();
+    let before = client.replay_status().unwrap();
     client.wait_for_transitions(before.transitions_inserted);
-    actor.stop_ok().expect_said("leaves: ");
+    actor.stop_ok().expect_stderr("leaves: ");
     second.wait_for_stderr("actor 3 steps 4 environments");
     second.stop_ok();
-    let status = client.replay().unwrap();
+    let status = client.replay_status().unwrap();
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
     learner.stop_ok();
 }
