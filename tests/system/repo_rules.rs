@@ -22,7 +22,7 @@ const LINES_MAX: [(&str, usize); 6] = [
 const FILE_LINES_MAX: usize = 450;
 
 /// Each of our packages, its folder, and those of our packages that it may depend on; * for all. Dependencies of tests and benches count.
-const ARROWS: &str = "
+const DEPENDENCIES: &str = "
 driml-protocol      protocol            :
 procgen-sys         actor/procgen-sys   :
 driml-envs          actor/envs          : procgen-sys
@@ -46,9 +46,9 @@ driml-tests         tests               : *
 driml-decoders      tests/decoders      : driml-protocol driml-actor driml-replay-server driml-learner driml-settings
 ";
 
-/// Returns the lines of [`ARROWS`]: name, folder, and the packages that it may depend on.
-fn arrows() -> impl Iterator<Item = (&'static str, &'static str, Vec<&'static str>)> {
-    ARROWS.trim().lines().map(|line| {
+/// Returns the lines of [`DEPENDENCIES`]: name, folder, and the packages that it may depend on.
+fn allowed_dependencies() -> impl Iterator<Item = (&'static str, &'static str, Vec<&'static str>)> {
+    DEPENDENCIES.trim().lines().map(|line| {
         let (package, known) = line
             .split_once(':')
             .expect("a package and what it may know");
@@ -67,7 +67,7 @@ pub(crate) fn root() -> PathBuf {
 
 /// Returns the folders of our packages.
 pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
-    arrows().map(|(_, folder, _)| folder)
+    allowed_dependencies().map(|(_, folder, _)| folder)
 }
 
 /// Returns the text of a file, by its path from the root.
@@ -76,14 +76,14 @@ pub(crate) fn read(path: impl AsRef<Path>) -> String {
 }
 
 /// Reads a TOML file, by its path from the root.
-fn toml(path: impl AsRef<Path>) -> toml::Table {
+fn read_toml(path: impl AsRef<Path>) -> toml::Table {
     read(path).parse().unwrap()
 }
 
 /// Returns the dependencies of each package in `Cargo.lock`, on any platform, with tests and benches. Versions of a package are merged.
-fn locked() -> BTreeMap<String, BTreeSet<String>> {
+fn locked_dependencies() -> BTreeMap<String, BTreeSet<String>> {
     let mut packages = BTreeMap::<_, BTreeSet<_>>::new();
-    for package in toml("Cargo.lock")["package"].as_array().unwrap() {
+    for package in read_toml("Cargo.lock")["package"].as_array().unwrap() {
         let name = package["name"].as_str().unwrap().to_owned();
         let dependencies = package.get("dependencies").into_iter();
         // "name", or "name version" where there are several.
@@ -96,17 +96,17 @@ fn locked() -> BTreeMap<String, BTreeSet<String>> {
 
 #[test]
 fn arrows_between_crates_point_one_way() {
-    let workspace = toml("Cargo.toml");
+    let workspace = read_toml("Cargo.toml");
     let members = workspace["workspace"]["members"].as_array().unwrap();
     let members: BTreeSet<_> = members.iter().map(|it| it.as_str().unwrap()).collect();
     assert_eq!(
         members,
         folders_of_crates().collect(),
-        "a new package needs a line in ARROWS, and a reason"
+        "a new package needs a line in DEPENDENCIES, and a reason"
     );
-    let ours: BTreeSet<_> = arrows().map(|(name, ..)| name).collect();
-    let locked = locked();
-    for (name, _, allowed) in arrows() {
+    let ours: BTreeSet<_> = allowed_dependencies().map(|(name, ..)| name).collect();
+    let locked = locked_dependencies();
+    for (name, _, allowed) in allowed_dependencies() {
         for dependency in &locked[name] {
             let dependency = dependency.as_str();
             assert!(
@@ -118,8 +118,8 @@ fn arrows_between_crates_point_one_way() {
 }
 
 /// Returns everything that `package` depends on, directly or indirectly.
-fn depends_on(package: &str) -> BTreeSet<String> {
-    let locked = locked();
+fn all_dependencies(package: &str) -> BTreeSet<String> {
+    let locked = locked_dependencies();
     let mut seen = BTreeSet::new();
     let mut next = vec![package];
     while let Some(name) = next.pop() {
@@ -131,7 +131,7 @@ fn depends_on(package: &str) -> BTreeSet<String> {
 }
 
 /// A package, and names that none of its dependencies may have: a whole name, or the part before a dash.
-const FREE_OF: &str = "
+const FORBIDDEN_DEPENDENCIES: &str = "
 driml-replay-server : candle gemm safetensors rayon
 driml-model         : zenoh tokio bincode
 driml-envs          : zenoh tokio candle gemm
@@ -140,9 +140,9 @@ procgen-sys         : zenoh tokio candle
 
 #[test]
 fn each_process_is_free_of_what_is_none_of_its_business() {
-    for line in FREE_OF.trim().lines() {
+    for line in FORBIDDEN_DEPENDENCIES.trim().lines() {
         let (package, foreign) = line.split_once(" : ").expect("a package and names");
-        let tree = depends_on(package.trim());
+        let tree = all_dependencies(package.trim());
         for name in foreign.split(' ') {
             let is_it = |it: &&String| *it == name || it.starts_with(&format!("{name}-"));
             let found = tree.iter().find(is_it);
@@ -150,14 +150,14 @@ fn each_process_is_free_of_what_is_none_of_its_business() {
         }
     }
     // Check the spelling of the names: the learner has these dependencies.
-    let learner = depends_on("driml-learner");
+    let learner = all_dependencies("driml-learner");
     for name in "candle-core gemm safetensors rayon zenoh tokio bincode".split(' ') {
         assert!(learner.contains(name), "{name}");
     }
 }
 
 /// Returns the path from the root of every file of the repository that is not built, downloaded or left by a run.
-fn files() -> Vec<String> {
+fn repo_files() -> Vec<String> {
     let root = root();
     let name = |entry: &DirEntry| {
         let name = entry.path().strip_prefix(&root).unwrap();
@@ -186,7 +186,7 @@ pub(crate) struct Source {
 
 /// Returns the files whose names end in one of `endings`.
 pub(crate) fn sources(endings: &[&str]) -> Vec<Source> {
-    let mut names = files();
+    let mut names = repo_files();
     names.retain(|name| endings.iter().any(|it| name.ends_with(it)));
     let source = |name: String| Source {
         text: read(&name),
@@ -196,7 +196,7 @@ pub(crate) fn sources(endings: &[&str]) -> Vec<Source> {
 }
 
 /// Returns the identifiers in a Rust file outside its comments. Strings count as code, which errs on the strict side.
-fn words(text: &str) -> BTreeSet<&str> {
+fn identifiers(text: &str) -> BTreeSet<&str> {
     let code = text
         .lines()
         .map(|line| line.split("//").next().unwrap_or_default());
@@ -250,19 +250,19 @@ fn dangerous_words_stay_where_they_are_needed() {
         ("catch_unwind", &["replay-server/tests/"]),
     ];
     for (word, places) in rules {
-        let mut seen = 0;
+        let mut uses = 0;
         for Source { name, text } in sources(&[".rs"]) {
             // This file has to name them.
-            if name != "tests/system/repo_rules.rs" && words(&text).contains(word) {
+            if name != "tests/system/repo_rules.rs" && identifiers(&text).contains(word) {
                 assert!(
                     places.iter().any(|place| name.starts_with(place)),
                     "{name} uses `{word}`"
                 );
-                seen += 1;
+                uses += 1;
             }
         }
         assert!(
-            seen > 0,
+            uses > 0,
             "no file uses `{word}`: is this rule still needed?"
         );
     }
@@ -283,7 +283,7 @@ fn comments_and_messages_say_who_does_what() {
 fn nothing_points_at_the_machine_it_was_written_on() {
     // Put together here, because this file is checked, too.
     let places = ["work", "root"].map(|folder| format!("/{folder}/"));
-    for name in files() {
+    for name in repo_files() {
         // Binary files, such as parity cases, hold no paths.
         let Ok(text) = fs::read_to_string(root().join(&name)) else {
             continue;
@@ -305,8 +305,8 @@ fn points_at(line: &str, place: &str) -> bool {
 
 #[test]
 fn every_package_takes_the_workspace_s_lints_and_versions() {
-    for (name, folder, _) in arrows() {
-        let manifest = toml(Path::new(folder).join("Cargo.toml"));
+    for (name, folder, _) in allowed_dependencies() {
+        let manifest = read_toml(Path::new(folder).join("Cargo.toml"));
         assert_eq!(manifest["package"]["name"].as_str(), Some(name), "{folder}");
         let lints = manifest["lints"]["workspace"].as_bool();
         assert_eq!(lints, Some(true), "{folder}");
