@@ -2,7 +2,7 @@
 //! The test reads the tokens of the sources, including those inside macro calls, but does not expand macros.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeSet,
     fs,
     path::{Path, PathBuf},
 };
@@ -14,7 +14,7 @@ use walkdir::WalkDir;
 type ModulePath = Vec<String>;
 
 /// A file, and another file that its code names.
-type Arrow = (PathBuf, PathBuf);
+type Reference = (PathBuf, PathBuf);
 
 /// Returns the module path of a file, given its path in the crate's sources.
 fn module_of(file: &Path) -> ModulePath {
@@ -26,24 +26,24 @@ fn module_of(file: &Path) -> ModulePath {
 }
 
 /// Returns which files of the crate with its sources in `folder` name which others. Each module is a file, except modules of tests.
-fn arrows(folder: &Path) -> BTreeSet<Arrow> {
-    let mut files = BTreeMap::<ModulePath, PathBuf>::new();
+fn references(folder: &Path) -> BTreeSet<Reference> {
+    let mut sources = Vec::new();
     for entry in WalkDir::new(folder).sort_by_file_name() {
         let file = entry.unwrap().into_path();
         if file.extension().is_some_and(|it| it == "rs") {
-            // If a crate has `lib.rs` and `main.rs`, both are the root module; `lib.rs` is the one kept.
             let module = module_of(file.strip_prefix(folder).unwrap());
-            files.entry(module).or_insert(file);
+            sources.push((module, file));
         }
     }
-    let mut arrows = BTreeSet::new();
-    for (module, file) in &files {
+    let modules: BTreeSet<_> = sources.iter().map(|it| it.0.clone()).collect();
+    let mut references = BTreeSet::new();
+    for (module, file) in &sources {
         let tokens = fs::read_to_string(file).unwrap().parse::<TokenStream>();
         let tokens = tokens.unwrap_or_else(|e| panic!("{}: {e}", file.display()));
-        let mut written = Vec::new();
-        note_paths(&without_tests(tokens), &[], &mut written);
-        for path in written {
-            let is_child = |first: String| files.contains_key(&[&module[..], &[first]].concat());
+        let mut paths = Vec::new();
+        collect_paths(&without_tests(tokens), &[], &mut paths);
+        for path in paths {
+            let is_child = |first: String| modules.contains(&[&module[..], &[first]].concat());
             let mut named = match path.first().map(String::as_str) {
                 Some("crate") => vec![],
                 Some("self" | "super") => module.clone(),
@@ -58,15 +58,17 @@ fn arrows(folder: &Path) -> BTreeSet<Arrow> {
                     _ => named.push(segment),
                 }
             }
-            while !files.contains_key(&named) {
+            while !modules.contains(&named) {
                 named.pop().expect("the root is a module");
             }
-            if files[&named] != *file {
-                arrows.insert((file.clone(), files[&named].clone()));
+            if named != *module {
+                // If a package has `lib.rs` and `main.rs`, both are the root module: a path to the root names both.
+                let named = sources.iter().filter(|it| it.0 == named);
+                references.extend(named.map(|it| (file.clone(), it.1.clone())));
             }
         }
     }
-    arrows
+    references
 }
 
 /// Returns the tokens without the items under `#[cfg(test)]`.
@@ -93,14 +95,14 @@ fn without_tests(tokens: TokenStream) -> Vec<TokenTree> {
 }
 
 /// Adds all paths in `tokens` to `found`. `before` is the prefix of paths inside the braces of a `use`.
-fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePath>) {
+fn collect_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePath>) {
     let mut rest = tokens;
     while let [first, after @ ..] = rest {
         rest = after;
         let word = match first {
             TokenTree::Ident(word) => word.to_string(),
             TokenTree::Group(group) => {
-                note_paths(&without_tests(group.stream()), &[], found);
+                collect_paths(&without_tests(group.stream()), &[], found);
                 continue;
             }
             _ => continue,
@@ -123,7 +125,7 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
             match next {
                 TokenTree::Ident(word) => path.push(word.to_string()),
                 TokenTree::Group(group) => {
-                    note_paths(&without_tests(group.stream()), &path, found);
+                    collect_paths(&without_tests(group.stream()), &path, found);
                     path.clear();
                 }
                 // A glob import, or the `<` of type arguments.
@@ -138,14 +140,14 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
     }
 }
 
-/// Returns the arrows in and between circles. Removes, round by round, arrows whose start no arrow enters or whose end no arrow leaves.
-fn circles(mut arrows: BTreeSet<Arrow>) -> BTreeSet<Arrow> {
+/// Returns the references in and between circles. Removes, round by round, those whose start none enters or whose end none leaves.
+fn circles(mut references: BTreeSet<Reference>) -> BTreeSet<Reference> {
     loop {
-        let (from, to): (BTreeSet<_>, BTreeSet<_>) = arrows.iter().cloned().unzip();
-        let before = arrows.len();
-        arrows.retain(|arrow| to.contains(&arrow.0) && from.contains(&arrow.1));
-        if arrows.len() == before {
-            return arrows;
+        let (from, to): (BTreeSet<_>, BTreeSet<_>) = references.iter().cloned().unzip();
+        let before = references.len();
+        references.retain(|reference| to.contains(&reference.0) && from.contains(&reference.1));
+        if references.len() == before {
+            return references;
         }
     }
 }
@@ -156,7 +158,7 @@ fn no_files_of_a_crate_form_a_circle() {
     let mut found = Vec::new();
     for folder in super::repo_rules::folders_of_crates() {
         let sources = root.join(folder).join("src");
-        for (from, to) in circles(arrows(&sources)) {
+        for (from, to) in circles(references(&sources)) {
             let short = |file: &Path| file.strip_prefix(&root).unwrap().display().to_string();
             found.push(format!("{} names {}", short(&from), short(&to)));
         }
@@ -169,19 +171,31 @@ fn no_files_of_a_crate_form_a_circle() {
 }
 
 /// A crate of four files in which `b` and `c` name each other, one within braces and the other within a macro. Only their tests name `a`.
-#[test]
-fn a_circle_is_found() {
-    let folder = tempfile::tempdir().unwrap();
-    let files = r#"
+const LIBRARY: &str = r#"
 lib.rs: mod a; mod b; #[cfg(test)] mod tests; pub use a::f;
 a.rs: use crate::b::g; pub fn f() { g() }
 b/mod.rs: mod c; use self::{c::{h as k}}; pub const N: u32 = 1; pub fn g() { k() }
 b/c.rs: #[cfg(test)] use crate::a::{f}; pub fn h() { println!("{}", super::N) } #[cfg(test)] fn t() { crate::a::f() } #[cfg(test)] mod tests { use crate::a::f; }"#;
-    fs::create_dir(folder.path().join("b")).unwrap();
-    for (name, text) in files.lines().filter_map(|it| it.split_once(": ")) {
-        fs::write(folder.path().join(name), text).unwrap();
+/// A package whose program has a circle beside a library without one.
+const PROGRAM: &str = "
+lib.rs: pub fn f() {}
+main.rs: mod d; pub fn e() { d::i() } fn main() {}
+d.rs: pub fn i() { crate::e() }";
+
+#[test]
+fn a_circle_is_found() {
+    for (files, circle) in [
+        (LIBRARY, ["b/mod.rs", "b/c.rs"]),
+        (PROGRAM, ["main.rs", "d.rs"]),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir(folder.path().join("b")).unwrap();
+        for (name, text) in files.lines().filter_map(|it| it.split_once(": ")) {
+            fs::write(folder.path().join(name), text).unwrap();
+        }
+        let [one, other] = circle.map(|name| folder.path().join(name));
+        let found = circles(references(folder.path()));
+        let expected = [(one.clone(), other.clone()), (other, one)];
+        assert_eq!(found, BTreeSet::from(expected));
     }
-    let [b, c] = ["b/mod.rs", "b/c.rs"].map(|name| folder.path().join(name));
-    let found = circles(arrows(folder.path()));
-    assert_eq!(found, BTreeSet::from([(c.clone(), b.clone()), (b, c)]));
 }
