@@ -2,8 +2,8 @@
 //! No bytes may make a decoder panic, and it must write back unchanged what it reads.
 //! Weights (safetensors) and the line in which a world declares itself are not covered.
 //!
-//! A new decoder needs a function here, a line in [`ALL`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test checks that none of
-//! these is missing.
+//! A new decoder needs a function here, a line in [`DECODERS`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test checks that
+//! none of these is missing.
 
 #![allow(
     clippy::unwrap_used,
@@ -15,14 +15,14 @@ mod messages;
 mod replay;
 mod segments;
 
-pub use messages::forged;
-pub use segments::{held, highest_ordinal, logs};
+pub use messages::messages_input;
+pub use segments::{log_with_highest_ordinal, logs, transitions_held};
 
 /// One decoder: its name, and the function that tries it on some bytes.
 pub type Decoder = (&'static str, fn(&[u8]));
 
 /// Every decoder.
-pub const ALL: &[Decoder] = &[
+pub const DECODERS: &[Decoder] = &[
     ("wire", messages::wire),
     ("messages", messages::messages),
     ("replay", replay::replay),

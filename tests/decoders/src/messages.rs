@@ -10,25 +10,25 @@ use driml_protocol::{
     WeightsUpload, WeightsVersion, codec,
 };
 
-use crate::segments::mend_message;
+use crate::segments::repair_message;
 
 /// The hash of the run spec in these messages.
-const SPEC: u64 = 0x0123_4567_89ab_cdef;
+const SPEC_HASH: u64 = 0x0123_4567_89ab_cdef;
 
 /// Reads bytes as one type of message.
-type Read = fn(&[u8]);
+type ReadFn = fn(&[u8]);
 
 /// Reads a message in one piece and in several. Both ways must agree, and the message must be written back unchanged.
 fn read<M: Message + Debug>(bytes: &[u8]) {
-    let whole = codec::decode::<M>(bytes, Some(SPEC));
+    let whole = codec::decode::<M>(bytes, Some(SPEC_HASH));
     let (first, second) = bytes.split_at(bytes.len() / 3);
     let pool = BufferPool::new(0);
     let pieces = codec::receive::<M>(first.chain(second), bytes.len(), &pool, None);
     match (whole, pieces) {
         (Ok((message, payload)), Ok((same, copy))) => {
             assert_eq!(payload, &copy[..]);
-            let again = codec::encode(SPEC, &message, payload).unwrap();
-            let (back, _) = codec::decode::<M>(&again, Some(SPEC)).unwrap();
+            let again = codec::encode(SPEC_HASH, &message, payload).unwrap();
+            let (back, _) = codec::decode::<M>(&again, Some(SPEC_HASH)).unwrap();
             // Compare the texts, because a NaN does not equal itself.
             assert_eq!(format!("{back:?}"), format!("{message:?}"));
             assert_eq!(format!("{same:?}"), format!("{message:?}"));
@@ -40,7 +40,7 @@ fn read<M: Message + Debug>(bytes: &[u8]) {
 
 fn read_chunk(bytes: &[u8]) {
     read::<ChunkHeader>(bytes);
-    if let Ok(chunk) = Chunk::decode(bytes, SPEC) {
+    if let Ok(chunk) = Chunk::decode(bytes, SPEC_HASH) {
         for row in 0..chunk.header.transitions() {
             let _ = (chunk.end(row), chunk.reward(row));
         }
@@ -53,7 +53,7 @@ fn read_chunk(bytes: &[u8]) {
 
 fn read_batch(bytes: &[u8]) {
     read::<BatchReply>(bytes);
-    let reply = codec::decode::<BatchReply>(bytes, Some(SPEC)).ok();
+    let reply = codec::decode::<BatchReply>(bytes, Some(SPEC_HASH)).ok();
     if let Some((BatchReply::Batch(header), payload)) = reply {
         // The counts of states in the header may contradict the rows.
         let Ok(batch) = Batch::from_payload(header, payload.to_vec().into()) else {
@@ -74,7 +74,7 @@ fn read_batch(bytes: &[u8]) {
 }
 
 /// Every kind of message and how it is read.
-const KINDS: [(Kind, Read); 24] = [
+const KINDS: [(Kind, ReadFn); 24] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
     (Kind::BatchRequest, read::<BatchRequest>),
@@ -103,14 +103,14 @@ const KINDS: [(Kind, Read); 24] = [
 
 fn read_affinity(bytes: &[u8]) {
     read::<AffinityUpdate>(bytes);
-    if let Ok((update, _)) = codec::decode::<AffinityUpdate>(bytes, Some(SPEC)) {
+    if let Ok((update, _)) = codec::decode::<AffinityUpdate>(bytes, Some(SPEC_HASH)) {
         let _ = update.validate(update.num_actions.min(255));
     }
 }
 
 fn read_status(bytes: &[u8]) {
     read::<ReplayStatus>(bytes);
-    if let Ok((status, _)) = codec::decode::<ReplayStatus>(bytes, Some(SPEC)) {
+    if let Ok((status, _)) = codec::decode::<ReplayStatus>(bytes, Some(SPEC_HASH)) {
         let _ = (status.replay_ratio(), status.mean_k());
         let _ = ReplayStatus::merged(&[ReplayStatus::default(), status]);
     }
@@ -131,16 +131,16 @@ pub(crate) fn messages(bytes: &[u8]) {
     let mut message = b"DRML".to_vec();
     message.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
     message.extend_from_slice(&(kind as u16).to_le_bytes());
-    message.extend_from_slice(&SPEC.to_le_bytes());
+    message.extend_from_slice(&SPEC_HASH.to_le_bytes());
     message.extend_from_slice(&header.to_le_bytes());
     message.resize(codec::PREFIX_BYTES, 0);
     message.extend_from_slice(rest);
-    mend_message(&mut message);
+    repair_message(&mut message);
     read(&message);
 }
 
 /// Converts the bytes of a message to input of the decoder `messages`.
-pub fn forged(message: &[u8]) -> Vec<u8> {
+pub fn messages_input(message: &[u8]) -> Vec<u8> {
     let kind = u16::from_le_bytes([message[6], message[7]]);
     let at = KINDS.iter().position(|(known, _)| *known as u16 == kind);
     let header = u16::from_le_bytes([message[16], message[17]]);

@@ -21,9 +21,9 @@ pub(crate) const ACTIONS: u32 = 3;
 const MESSAGES_MAX: usize = 64;
 
 /// Reads numbers from the remaining bytes.
-struct Numbers<'a>(&'a [u8]);
+struct NumberReader<'a>(&'a [u8]);
 
-impl Numbers<'_> {
+impl NumberReader<'_> {
     fn byte(&mut self) -> Option<u8> {
         let (&first, rest) = self.0.split_first()?;
         self.0 = rest;
@@ -69,7 +69,7 @@ pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
 
 /// Sends the messages that the bytes encode, one after the other.
 pub(crate) fn replay(bytes: &[u8]) {
-    let mut numbers = Numbers(bytes);
+    let mut numbers = NumberReader(bytes);
     let Some(byte) = numbers.byte() else {
         return;
     };
@@ -89,7 +89,7 @@ pub(crate) fn replay(bytes: &[u8]) {
     };
     let mut replay = Replay::new(&spec(2), &config, 4).unwrap();
     for _ in 0..MESSAGES_MAX {
-        if message(&mut replay, &mut numbers).is_none() {
+        if send_message(&mut replay, &mut numbers).is_none() {
             break;
         }
     }
@@ -99,7 +99,7 @@ pub(crate) fn replay(bytes: &[u8]) {
     assert!(status.transitions_held <= stored);
 }
 
-fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
+fn send_message(replay: &mut Replay, numbers: &mut NumberReader<'_>) -> Option<()> {
     match numbers.byte()? % 8 {
         0 => {
             let (actor, incarnation) = (numbers.actor()?, numbers.count()?);
@@ -107,7 +107,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
         }
         1 | 2 => {
             let stored = replay.inserted_total();
-            let chunk = chunk(numbers)?;
+            let chunk = read_chunk(numbers)?;
             let reply = replay.insert(&chunk);
             if matches!(reply, InsertReply::Refused { .. }) {
                 assert_eq!(replay.inserted_total(), stored);
@@ -202,7 +202,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
     Some(())
 }
 
-fn chunk(numbers: &mut Numbers<'_>) -> Option<Chunk> {
+fn read_chunk(numbers: &mut NumberReader<'_>) -> Option<Chunk> {
     let header = ChunkHeader {
         actor: numbers.actor()?,
         incarnation: numbers.count()?,

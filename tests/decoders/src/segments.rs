@@ -49,7 +49,7 @@ fn spec() -> RunSpec {
     replay::spec(FRAME_BYTES as u32)
 }
 
-fn open(dir: &Path) -> Result<Replay, String> {
+fn open_replay(dir: &Path) -> Result<Replay, String> {
     let args = PersistArgs {
         dir: dir.to_owned(),
         shard: 0,
@@ -67,7 +67,7 @@ fn open(dir: &Path) -> Result<Replay, String> {
 }
 
 /// Creates a folder, in memory if possible, because these tests do not check that a real disk keeps its data.
-fn folder() -> tempfile::TempDir {
+fn temp_folder() -> tempfile::TempDir {
     let memory = tempfile::tempdir_in("/dev/shm");
     memory.or_else(|_| tempfile::tempdir()).unwrap()
 }
@@ -83,25 +83,25 @@ pub(crate) fn segments(bytes: &[u8]) {
     let Some((&[mode, first], rest)) = bytes.split_first_chunk() else {
         return;
     };
-    let dir = folder();
+    let dir = temp_folder();
     let mut stored = HashSet::new();
-    for (number, mut segment) in split(rest).into_iter().enumerate() {
+    for (number, mut segment) in split_segments(rest).into_iter().enumerate() {
         if mode % 2 == 1 {
-            mend(&mut segment);
+            repair_segment(&mut segment);
         }
         add_stored(&segment, &mut stored);
         fs::write(path(dir.path(), usize::from(first) + number), segment).unwrap();
     }
-    let Ok(mut replay) = open(dir.path()) else {
+    let Ok(mut replay) = open_replay(dir.path()) else {
         return;
     };
     replay.check_valid();
     let status = replay.status();
     assert!(status.transitions_held <= status.transitions_inserted.min(CAPACITY));
-    draw(&mut replay, &stored);
+    check_draws(&mut replay, &stored);
     let before = replay.stored_bytes().unwrap();
     drop(replay);
-    let mut replay = open(dir.path()).unwrap();
+    let mut replay = open_replay(dir.path()).unwrap();
     assert_eq!(replay.stored_bytes().unwrap(), before);
     // The reopened replay still works.
     let actor = 1000;
@@ -111,17 +111,17 @@ pub(crate) fn segments(bytes: &[u8]) {
     };
     if replay.join_actor(join).is_ok() {
         let mut chunk = Chunk::zeroed(header(actor, 0, 0));
-        set(&mut chunk, &mut 1);
+        fill_chunk(&mut chunk, &mut 1);
         let reply = replay.insert(&chunk);
         if matches!(reply, InsertReply::Stored { .. }) {
             add_chunk(&chunk, &mut stored);
         }
-        draw(&mut replay, &stored);
+        check_draws(&mut replay, &stored);
     }
     replay.check_valid();
 }
 
-fn draw(replay: &mut Replay, stored: &HashSet<Step>) {
+fn check_draws(replay: &mut Replay, stored: &HashSet<Step>) {
     for client in 0..BATCHES {
         let id = RequestId::first(1_000 + client);
         let Ok(batch) = replay.draw_for(id, ROWS, Buffer::zeroed) else {
@@ -141,7 +141,7 @@ fn draw(replay: &mut Replay, stored: &HashSet<Step>) {
 }
 
 /// Splits the bytes into segments.
-fn split(mut bytes: &[u8]) -> Vec<Vec<u8>> {
+fn split_segments(mut bytes: &[u8]) -> Vec<Vec<u8>> {
     let mut all = Vec::new();
     while let Some((length, rest)) = bytes.split_first_chunk()
         && all.len() < SEGMENTS_MAX
@@ -178,32 +178,32 @@ fn add_chunk(chunk: &Chunk, stored: &mut HashSet<Step>) {
 /// Returns the length of the message that begins here, if it is complete.
 fn message_bytes(bytes: &[u8]) -> Option<usize> {
     let prefix = bytes.get(..codec::PREFIX_BYTES)?;
-    let header = number(&prefix[HEADER_BYTES]);
+    let header = read_number(&prefix[HEADER_BYTES]);
     let length = header
-        .checked_add(number(&prefix[PAYLOAD_BYTES]))?
+        .checked_add(read_number(&prefix[PAYLOAD_BYTES]))?
         .checked_add(codec::PREFIX_BYTES)?;
     (length <= bytes.len()).then_some(length)
 }
 
 /// Reads a little-endian number of up to 8 bytes.
-fn number(bytes: &[u8]) -> usize {
+fn read_number(bytes: &[u8]) -> usize {
     let number = |sum: u64, &byte: &u8| sum << 8 | u64::from(byte);
     usize::try_from(bytes.iter().rev().fold(0, number)).unwrap_or(usize::MAX)
 }
 
 /// Repairs the lengths and checksums of all records and of the chunks in them, so that the code behind these checks is reached.
-fn mend(segment: &mut [u8]) {
+fn repair_segment(segment: &mut [u8]) {
     let mut at = 0;
     while segment.len() - at >= HEAD_BYTES {
         let (head, rest) = segment[at..].split_at_mut(HEAD_BYTES);
         head[..4].copy_from_slice(b"DRL1");
-        let length = number(&head[BODY_BYTES]).min(rest.len());
+        let length = read_number(&head[BODY_BYTES]).min(rest.len());
         let body = &mut rest[..length];
-        let is_chunk = number(&head[KIND]) == CHUNK as usize;
+        let is_chunk = read_number(&head[KIND]) == CHUNK as usize;
         let mut checked = length;
         if is_chunk {
-            checked = number(&head[CHECKED_BYTES]).min(length);
-            mend_message(body);
+            checked = read_number(&head[CHECKED_BYTES]).min(length);
+            repair_message(body);
         }
         head[BODY_BYTES].copy_from_slice(&(length as u64).to_le_bytes());
         head[CHECKED_BYTES].copy_from_slice(&(checked as u32).to_le_bytes());
@@ -214,12 +214,12 @@ fn mend(segment: &mut [u8]) {
 }
 
 /// Repairs the lengths and the checksum of a message.
-pub(crate) fn mend_message(body: &mut [u8]) {
+pub(crate) fn repair_message(body: &mut [u8]) {
     if body.len() < codec::PREFIX_BYTES {
         return;
     }
     let after = body.len() - codec::PREFIX_BYTES;
-    let header = number(&body[HEADER_BYTES]).min(after);
+    let header = read_number(&body[HEADER_BYTES]).min(after);
     body[HEADER_BYTES].copy_from_slice(&(header as u32).to_le_bytes());
     body[PAYLOAD_BYTES].copy_from_slice(&((after - header) as u64).to_le_bytes());
     let sum = crc32fast::hash(&[&body[..MESSAGE_SUM.start], &body[MESSAGE_SUM.end..]].concat());
@@ -241,7 +241,7 @@ fn header(actor: u32, sequence: u64, first_transition: u64) -> ChunkHeader {
 }
 
 /// Fills a chunk with frames numbered from `frame`.
-fn set(chunk: &mut Chunk, frame: &mut u32) {
+fn fill_chunk(chunk: &mut Chunk, frame: &mut u32) {
     for row in 0..chunk.header.transitions() {
         chunk.frame_mut(row).copy_from_slice(&frame.to_le_bytes());
         let end = match *frame % 13 {
@@ -259,7 +259,7 @@ fn set(chunk: &mut Chunk, frame: &mut u32) {
 pub fn logs() -> Vec<(String, Vec<u8>)> {
     let mut all = Vec::new();
     for (name, chunks) in [("short", 2), ("long", 12)] {
-        let log = log(chunks);
+        let log = write_log(chunks);
         for (mode, suffix) in [(0, ""), (1, "-mended")] {
             let bytes = [vec![mode], log.clone()].concat();
             all.push((format!("{name}{suffix}"), bytes));
@@ -269,9 +269,9 @@ pub fn logs() -> Vec<(String, Vec<u8>)> {
 }
 
 /// Returns the segments of a replay in which every kind of record was written.
-fn log(chunks: u64) -> Vec<u8> {
-    let dir = folder();
-    let mut replay = open(dir.path()).unwrap();
+fn write_log(chunks: u64) -> Vec<u8> {
+    let dir = temp_folder();
+    let mut replay = open_replay(dir.path()).unwrap();
     for actor in 0..2 {
         let incarnation = 1;
         replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
@@ -291,7 +291,7 @@ fn log(chunks: u64) -> Vec<u8> {
     let (mut frame, mut id) = (1, RequestId::first(5));
     for sequence in 0..chunks {
         let mut chunk = Chunk::zeroed(header(0, sequence, 8 * sequence));
-        set(&mut chunk, &mut frame);
+        fill_chunk(&mut chunk, &mut frame);
         let reply = replay.insert(&chunk);
         assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
         let _ = replay.draw_for(id, ROWS, Buffer::zeroed);
@@ -325,19 +325,19 @@ fn log(chunks: u64) -> Vec<u8> {
 }
 
 /// Returns the first of [`logs`] with a number in its first record that no replay reaches.
-pub fn highest_ordinal() -> Vec<u8> {
+pub fn log_with_highest_ordinal() -> Vec<u8> {
     let mut log = logs().swap_remove(0).1;
     let segment = &mut log[4..];
     segment[8..16].copy_from_slice(&(1u64 << 60).to_le_bytes());
-    mend(segment);
+    repair_segment(segment);
     log
 }
 
 /// Returns the number of transitions held in a log from [`logs`], or why the log is rejected.
-pub fn held(log: &[u8]) -> Result<u64, String> {
-    let dir = folder();
-    for (number, segment) in split(&log[2..]).iter().enumerate() {
+pub fn transitions_held(log: &[u8]) -> Result<u64, String> {
+    let dir = temp_folder();
+    for (number, segment) in split_segments(&log[2..]).iter().enumerate() {
         fs::write(path(dir.path(), usize::from(log[1]) + number), segment).unwrap();
     }
-    open(dir.path()).map(|replay| replay.status().transitions_held)
+    open_replay(dir.path()).map(|replay| replay.status().transitions_held)
 }

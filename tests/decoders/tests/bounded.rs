@@ -9,7 +9,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_decoders::{ALL, forged, held, highest_ordinal, logs};
+use driml_decoders::{DECODERS, log_with_highest_ordinal, logs, messages_input, transitions_held};
 use driml_settings::config::RunConfig;
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
@@ -21,14 +21,14 @@ const SEGMENTS_RUNS: u64 = 3_000;
 /// The most bytes of a changed seed; the rest is cut off.
 const BYTES_MAX: usize = 1 << 14;
 
-fn folder(decoder: &str) -> PathBuf {
+fn seeds_folder(decoder: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("fuzz/corpus")
         .join(decoder)
 }
 
 fn seeds(decoder: &str) -> Vec<Vec<u8>> {
-    let mut files: Vec<_> = fs::read_dir(folder(decoder))
+    let mut files: Vec<_> = fs::read_dir(seeds_folder(decoder))
         .unwrap_or_else(|e| panic!("{decoder} has no seeds: {e}"))
         .map(|entry| entry.unwrap().path())
         .collect();
@@ -38,7 +38,7 @@ fn seeds(decoder: &str) -> Vec<Vec<u8>> {
 }
 
 /// Changes some bytes, as a fuzzer does.
-fn change(bytes: &mut Vec<u8>, seeds: &[Vec<u8>], rng: &mut ChaCha8Rng) {
+fn mutate(bytes: &mut Vec<u8>, seeds: &[Vec<u8>], rng: &mut ChaCha8Rng) {
     const EDGES: [u64; 8] = [0, 1, 250, 251, 1 << 31, 1 << 60, u64::MAX - 1, u64::MAX];
     for _ in 0..rng.random_range(1..5) {
         let at = rng.random_range(0..=bytes.len());
@@ -73,39 +73,39 @@ fn change(bytes: &mut Vec<u8>, seeds: &[Vec<u8>], rng: &mut ChaCha8Rng) {
     bytes.truncate(BYTES_MAX);
 }
 
-fn run(name: &str) {
+fn run_decoder(name: &str) {
     let runs = std::env::var("DRIML_DECODER_RUNS").ok();
-    let usual = if name == "segments" {
+    let default = if name == "segments" {
         SEGMENTS_RUNS
     } else {
         RUNS
     };
-    let runs = runs.map_or(usual, |it| it.parse().expect("a number of executions"));
-    let (_, decoder) = ALL.iter().find(|(it, _)| *it == name).unwrap();
+    let runs = runs.map_or(default, |it| it.parse().expect("a number of executions"));
+    let (_, decoder) = DECODERS.iter().find(|(it, _)| *it == name).unwrap();
     let seeds = seeds(name);
     seeds.iter().for_each(|seed| decoder(seed));
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     for number in 0..runs {
         let mut bytes = seeds.choose(&mut rng).unwrap().clone();
-        change(&mut bytes, &seeds, &mut rng);
-        let ran = Said {
+        mutate(&mut bytes, &seeds, &mut rng);
+        let report = ReportOnPanic {
             name,
             number,
             bytes: &bytes,
         };
-        decoder(ran.bytes);
-        std::mem::forget(ran);
+        decoder(report.bytes);
+        std::mem::forget(report);
     }
 }
 
 /// Reports the bytes of an execution if the decoder panics.
-struct Said<'a> {
+struct ReportOnPanic<'a> {
     name: &'a str,
     number: u64,
     bytes: &'a [u8],
 }
 
-impl Drop for Said<'_> {
+impl Drop for ReportOnPanic<'_> {
     fn drop(&mut self) {
         let Self {
             name,
@@ -115,8 +115,8 @@ impl Drop for Said<'_> {
         let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
         // The panic fails the test; the file with its bytes is only a help.
         let _ = fs::write(&file, bytes);
-        let said = format!("{name}, execution {number}: {}\n", file.display());
-        let _ = std::io::stderr().write_all(said.as_bytes());
+        let message = format!("{name}, execution {number}: {}\n", file.display());
+        let _ = std::io::stderr().write_all(message.as_bytes());
     }
 }
 
@@ -127,7 +127,7 @@ macro_rules! bounded {
 
         $(#[test]
         fn $name() {
-            run(stringify!($name));
+            run_decoder(stringify!($name));
         })*
     };
 }
@@ -135,7 +135,7 @@ macro_rules! bounded {
 bounded!(wire messages replay state config segments);
 
 /// Reads a stored seed. With `UPDATE_CORPUS=1`, first stores these bytes.
-fn stored(file: &Path, bytes: &[u8]) -> Vec<u8> {
+fn stored_seed(file: &Path, bytes: &[u8]) -> Vec<u8> {
     if std::env::var_os("UPDATE_CORPUS").is_some() {
         fs::create_dir_all(file.parent().unwrap()).unwrap();
         fs::write(file, bytes).unwrap();
@@ -147,22 +147,22 @@ fn stored(file: &Path, bytes: &[u8]) -> Vec<u8> {
 /// their prefix: `UPDATE_CORPUS=1` writes them.
 #[test]
 fn every_decoder_has_a_target_and_seeds() {
-    assert!(ALL.iter().map(|(name, _)| name).eq(BOUNDED));
+    assert!(DECODERS.iter().map(|(name, _)| name).eq(BOUNDED));
     let fuzz = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz");
     let manifest = fs::read_to_string(fuzz.join("Cargo.toml")).unwrap();
     assert!(fuzz.join("fuzz_targets/decoder.rs").exists());
-    for (name, _) in ALL {
+    for (name, _) in DECODERS {
         let target = format!("name = \"{name}\"\npath = \"fuzz_targets/decoder.rs\"");
         assert!(manifest.contains(&target), "{name} has no target");
     }
-    for entry in fs::read_dir(folder("wire")).unwrap() {
+    for entry in fs::read_dir(seeds_folder("wire")).unwrap() {
         let sample = entry.unwrap().path();
-        let bytes = forged(&fs::read(&sample).unwrap());
-        let file = folder("messages").join(sample.file_name().unwrap());
-        let is_todays = stored(&file, &bytes) == bytes;
+        let bytes = messages_input(&fs::read(&sample).unwrap());
+        let file = seeds_folder("messages").join(sample.file_name().unwrap());
+        let is_current = stored_seed(&file, &bytes) == bytes;
         let file = file.display();
         assert!(
-            is_todays,
+            is_current,
             "{file} is not today's: UPDATE_CORPUS=1 writes it"
         );
     }
@@ -180,11 +180,12 @@ fn the_states_among_the_seeds_can_be_read() {
 #[test]
 fn the_logs_among_the_seeds_can_be_read() {
     for (name, log) in logs() {
-        let file = folder("segments").join(name);
-        let stored = stored(&file, &log);
+        let file = seeds_folder("segments").join(name);
+        let stored = stored_seed(&file, &log);
         let file = file.display();
         assert!(log.len() < BYTES_MAX, "{file}: too long");
-        let is_read = !stored.is_empty() && held(&stored) == held(&log) && held(&log) > Ok(0);
+        let held = transitions_held(&log);
+        let is_read = !stored.is_empty() && transitions_held(&stored) == held && held > Ok(0);
         assert!(
             is_read,
             "{file} cannot be read any more: UPDATE_CORPUS=1 writes it"
@@ -194,7 +195,7 @@ fn the_logs_among_the_seeds_can_be_read() {
 
 #[test]
 fn a_log_with_the_highest_number_is_refused() {
-    let refused = held(&highest_ordinal()).unwrap_err();
+    let refused = transitions_held(&log_with_highest_ordinal()).unwrap_err();
     assert!(refused.contains("which no replay reaches"), "{refused}");
 }
 
