@@ -18,7 +18,7 @@ pub(super) const ENGINE_THREADS: [usize; 2] = [0, 2];
 const STEPS: usize = 64;
 
 /// Returns the name of the figure of a Procgen game.
-pub(super) fn name(game: &str, threads: usize) -> String {
+pub(super) fn label(game: &str, threads: usize) -> String {
     format!("{game}, {ENVS} environments, {threads} engine threads")
 }
 
@@ -31,24 +31,24 @@ pub(super) fn measure(worlds: &[String], bench: &mut Bench<'_>) -> anyhow::Resul
     if worlds.is_empty() {
         procgen_sys::Engine::install(&mut console::line)?;
         for game in GAMES {
-            let of_game = |threads| (name(game, threads), format!("procgen:{game}"), threads);
-            cases.extend(ENGINE_THREADS.map(of_game));
+            let case = |threads| (label(game, threads), format!("procgen:{game}"), threads);
+            cases.extend(ENGINE_THREADS.map(case));
         }
     }
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     for (name, world, threads) in cases {
         let rate = rate(&world, threads, &bench.effort, &mut rng)?;
-        bench.figures.found(name, rate, "steps/s");
+        bench.figures.record(name, rate, "steps/s");
     }
     Ok(())
 }
 
 fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> anyhow::Result<f64> {
-    let config = settings::of_run(world, "c51", "paper", &[])?;
+    let config = settings::run_config(world, "c51", "paper", &[])?;
     let mut world = config.world.build(ENVS, 1, threads)?;
     let num_actions = world.num_actions() as u8;
-    let mut of_step = |_| std::array::from_fn(|_| rng.random_range(0..num_actions));
-    let actions: Vec<[u8; ENVS]> = (0..STEPS).map(&mut of_step).collect();
+    let mut draw_actions = |_| std::array::from_fn(|_| rng.random_range(0..num_actions));
+    let actions: Vec<[u8; ENVS]> = (0..STEPS).map(&mut draw_actions).collect();
     let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
     let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
     // A step that starts episodes takes longer than others, so measure the mean.

@@ -14,12 +14,12 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     recording::{CHUNKS, INCARNATION, Recording},
     report::Bench,
-    settings::{self, AGENT, CAPACITY},
+    settings::{self, AGENT, CAPACITY, WORLD},
 };
 
-/// The names of [`assembling`]'s figures.
-pub(super) const ASSEMBLED: &str = "batch of 3 states, without a wire";
-pub(super) const COPIED: &str = "plain copy of a batch's bytes";
+/// The names of [`time_assembly`]'s figures.
+pub(super) const ASSEMBLY: &str = "batch of 3 states, without a wire";
+pub(super) const PLAIN_COPY: &str = "plain copy of a batch's bytes";
 
 /// The side of the black frames, in pixels: so small that the bench measures the draw, not the copying of states.
 const SIDE: u32 = 8;
@@ -32,15 +32,15 @@ const PRIORITISED: Sampling = Sampling::Prioritised {
 };
 
 /// Measures batches of recorded frames per second, and plain copies of as many bytes.
-pub(super) fn assembling(recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
-    let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
+pub(super) fn time_assembly(recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
+    let config = settings::run_config(WORLD, AGENT, "paper", &settings::REPLAY_SETS)?;
     let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes);
-    let mut filled = Filled::new(&config, CAPACITY, recording)?;
+    let mut filled = FullReplay::new(&config, CAPACITY, recording)?;
     let sampling = bench.effort.rate_by_median(|| {
         black_box(filled.draw()?);
         Ok(())
     })?;
-    bench.figures.found(ASSEMBLED, sampling, "batches/s");
+    bench.figures.record(ASSEMBLY, sampling, "batches/s");
     drop(filled);
 
     let held = vec![1_u8; CAPACITY as usize * frame_bytes];
@@ -54,30 +54,30 @@ pub(super) fn assembling(recording: &Recording, bench: &mut Bench<'_>) -> anyhow
         black_box(copy);
         Ok(())
     })?;
-    bench.figures.found(COPIED, copying, "batches/s");
+    bench.figures.record(PLAIN_COPY, copying, "batches/s");
     Ok(())
 }
 
 /// Measures batches per second of a replay that holds `held` transitions, in turn: drawn uniformly, by priority, and by priority with new
 /// priorities set after each draw.
-pub(super) fn sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
+pub(super) fn time_sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let blank = Recording::blank((SIDE * SIDE) as usize);
     let filled = |sampling| {
-        let mut config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
+        let mut config = settings::run_config(WORLD, AGENT, "paper", &settings::REPLAY_SETS)?;
         (config.run.frame_height, config.run.frame_width) = (SIDE, SIDE);
         config.run.frame_channels = 1;
         config.replay.capacity_transitions = held;
         config.replay.sampling = sampling;
-        Filled::new(&config, held, &blank)
+        FullReplay::new(&config, held, &blank)
     };
     let mut uniform = filled(Sampling::Uniform {})?;
     let mut prioritised = filled(PRIORITISED)?;
-    let mut learned_from = filled(PRIORITISED)?;
+    let mut updated = filled(PRIORITISED)?;
     let rows = uniform.rows;
     // Give most transitions an individual priority, as after a while of learning.
     for _ in 0..2 * held / u64::from(rows) {
-        prioritised.learn()?;
-        learned_from.learn()?;
+        prioritised.draw_and_update()?;
+        updated.draw_and_update()?;
     }
     let names = [
         "drawn uniformly",
@@ -87,24 +87,24 @@ pub(super) fn sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let mut works: [Work<'_>; 3] = [
         Box::new(|| uniform.draw().map(|batch| drop(black_box(batch)))),
         Box::new(|| prioritised.draw().map(|batch| drop(black_box(batch)))),
-        Box::new(|| learned_from.learn()),
+        Box::new(|| updated.draw_and_update()),
     ];
     for (what, rate) in names.iter().zip(bench.effort.rates_in_turn(&mut works)?) {
         let what = format!("{rows} rows of {held} transitions {what}");
-        bench.figures.found(what, rate, "batches/s");
+        bench.figures.record(what, rate, "batches/s");
     }
     Ok(())
 }
 
 /// A full replay, and the state of a learner that sets priorities.
-struct Filled {
+struct FullReplay {
     replay: Replay,
     rows: u32,
     updates: u64,
     rng: ChaCha8Rng,
 }
 
-impl Filled {
+impl FullReplay {
     /// Fills a replay with the chunks of one actor, until it has stored more than `held` transitions.
     fn new(config: &RunConfig, held: u64, recording: &Recording) -> anyhow::Result<Self> {
         let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
@@ -133,11 +133,11 @@ impl Filled {
     }
 
     /// Draws a batch and sets random priorities for its rows.
-    fn learn(&mut self) -> anyhow::Result<()> {
+    fn draw_and_update(&mut self) -> anyhow::Result<()> {
         let batch = self.draw()?;
-        let found: Vec<f32> = (0..self.rows).map(|_| self.rng.random()).collect();
+        let priorities: Vec<f32> = (0..self.rows).map(|_| self.rng.random()).collect();
         self.updates += 1;
-        if let Some(update) = batch.priority_update(1, self.updates, &found) {
+        if let Some(update) = batch.priority_update(1, self.updates, &priorities) {
             let set = self.replay.set_priorities(&update);
             set.map_err(anyhow::Error::msg)?;
         }

@@ -8,8 +8,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    learner::counted_updates,
-    report::{Bench, named},
+    learner::work_and_gflop,
+    report::{Bench, with_precision},
 };
 
 const ROWS: usize = 256;
@@ -24,40 +24,40 @@ const TILES: usize = 10_000;
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let effort = bench.effort;
     for precision in bench.flags.precisions(DeviceName::Cpu) {
-        let mut found = |what: &str, gflop: f64, calls: f64| {
+        let mut record = |what: &str, gflop: f64, calls: f64| {
             let figures = &mut bench.figures;
-            figures.found(named(what, precision), gflop * calls, "GFLOP/s");
+            figures.record(with_precision(what, precision), gflop * calls, "GFLOP/s");
         };
         let gflop = multiply_in_first_cache(precision, TILES) / 1e9;
         let calls = effort.rate_by_median(|| {
             multiply_in_first_cache(precision, TILES);
             Ok(())
         })?;
-        found("products in the first cache", gflop, calls);
+        record("products in the first cache", gflop, calls);
         for (side, channels) in STAGES {
-            let maps = numbers(&[ROWS, side + 2, side + 2, channels])?;
-            let (weight, bias) = (numbers(&[channels, channels, 3, 3])?, numbers(&[channels])?);
+            let maps = random(&[ROWS, side + 2, side + 2, channels])?;
+            let (weight, bias) = (random(&[channels, channels, 3, 3])?, random(&[channels])?);
             let gflop = (2 * ROWS * side * side * 9 * channels * channels) as f64 / 1e9;
             let calls = effort.rate_by_median(|| {
                 conv2d_relu(&maps, &weight, &bias, 1, precision)?;
                 Ok(())
             })?;
             let what = format!("convolution of 256 maps, {side}x{side}x{channels}");
-            found(&what, gflop, calls);
+            record(&what, gflop, calls);
         }
         let compute = DeviceName::Cpu.open(precision)?;
         for torso in TORSOS {
             let set = format!("model.torso={torso}");
-            let (work, gflop) = counted_updates("c51", &[&set], &compute)?;
+            let (work, gflop) = work_and_gflop("c51", &[&set], &compute)?;
             let what = format!("update of C51, {torso}: {gflop:.2} GFLOP");
-            found(&what, gflop, effort.rate_by_median(work)?);
+            record(&what, gflop, effort.rate_by_median(work)?);
         }
     }
     Ok(())
 }
 
 /// Returns a tensor of random numbers in [-1, 1).
-fn numbers(shape: &[usize]) -> candle_core::Result<Tensor> {
+fn random(shape: &[usize]) -> candle_core::Result<Tensor> {
     let rng = ChaCha8Rng::seed_from_u64(1);
     let values = rng.random_iter::<f32>().map(|it| 2.0 * it - 1.0);
     Tensor::from_iter(values.take(shape.iter().product()), &Device::Cpu)?.reshape(shape)

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     flags::BenchLearnerArgs,
-    report::{Bench, named},
+    report::{Bench, with_precision},
     settings::{self, AGENT, WORLD},
 };
 
@@ -26,9 +26,9 @@ C51, impala, 64x64x3|c51|paper|model.torso=impala
 C51, impala, 64x64x3, 64 rows|c51|paper|model.torso=impala|learner.batch_size=64
 C51 + global-global DIM, impala, 64x64x3|driml-ada|paper|model.torso=impala";
 /// The update that is also computed with candle's own operations, as on a GPU, instead of our kernels.
-pub(super) const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
+pub(super) const GLOBAL_DIM_CASE: &str = "C51 + global-global DIM, 64x64x3";
 /// The end of that figure's name.
-pub(super) const CANDLE: &str = "candle's own operations";
+pub(super) const CANDLE_SUFFIX: &str = "candle's own operations";
 /// Shares of s_t and s_{t+k}, and of s_{t+n}, that are copies of another state.
 const REPEATED: [(f64, &str); 3] = [
     (0.0, "no states repeat"),
@@ -78,21 +78,21 @@ fn paper(
     bench: &mut Bench<'_>,
 ) -> anyhow::Result<()> {
     let effort = bench.effort;
-    let mut found = |what: &str, rate| {
+    let mut record = |what: &str, rate| {
         let figures = &mut bench.figures;
-        figures.found(named(what, precision), rate, "updates/s");
+        figures.record(with_precision(what, precision), rate, "updates/s");
     };
     for case in CASES.lines() {
         let words: Vec<&str> = case.split('|').collect();
         let (name, sets) = (words[0], &words[3..]);
-        let config = settings::of_run(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
+        let config = settings::run_config(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
         let rate = effort.rate_by_median(updates(&config, compute, 0.0)?)?;
-        found(name, rate);
-        if name == GLOBAL_DIM && on_cpu && precision == Precision::F32 {
-            let mut stock = compute.clone();
-            stock.kernels = Kernels::Candle;
-            let rate = effort.rate_by_median(updates(&config, &stock, 0.0)?)?;
-            found(&format!("{name}, {CANDLE}"), rate);
+        record(name, rate);
+        if name == GLOBAL_DIM_CASE && on_cpu && precision == Precision::F32 {
+            let mut candle = compute.clone();
+            candle.kernels = Kernels::Candle;
+            let rate = effort.rate_by_median(updates(&config, &candle, 0.0)?)?;
+            record(&format!("{name}, {CANDLE_SUFFIX}"), rate);
         }
     }
     if !on_cpu {
@@ -101,7 +101,7 @@ fn paper(
     let (mut names, mut works) = (Vec::new(), Vec::new());
     for (share, repeated) in REPEATED {
         for (set, computed) in DEDUPLICATION {
-            let config = settings::of_run(WORLD, AGENT, "paper", &[set])?;
+            let config = settings::run_config(WORLD, AGENT, "paper", &[set])?;
             works.push(updates(&config, compute, share)?);
             names.push(format!(
                 "C51 + global-global DIM, 60x60x3, {repeated}, {computed}"
@@ -109,7 +109,7 @@ fn paper(
         }
     }
     for (name, rate) in names.iter().zip(effort.rates_in_turn(&mut works)?) {
-        found(name, rate);
+        record(name, rate);
     }
     Ok(())
 }
@@ -118,24 +118,24 @@ fn paper(
 fn growth(precision: Precision, compute: &Compute, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     for (name, sets) in SIZES {
         let sets = [sets, &["learner.deduplicate_states=false"]].concat();
-        let (work, gflop) = counted_updates(AGENT, &sets, compute)?;
+        let (work, gflop) = work_and_gflop(AGENT, &sets, compute)?;
         let rate = bench.effort.rate_by_median(work)?;
         let name = format!("{name}: {gflop:.2} GFLOP");
-        let (what, figures) = (named(&name, precision), &mut bench.figures);
-        figures.found(what, rate, "updates/s");
-        let what = named(&format!("{name}, arithmetic"), precision);
-        figures.found(what, rate * gflop, "GFLOP/s");
+        let (what, figures) = (with_precision(&name, precision), &mut bench.figures);
+        figures.record(what, rate, "updates/s");
+        let what = with_precision(&format!("{name}, arithmetic"), precision);
+        figures.record(what, rate * gflop, "GFLOP/s");
     }
     Ok(())
 }
 
 /// Returns the work of an update of this agent with settings that override the paper's, and the GFLOP of that update.
-pub(super) fn counted_updates(
+pub(super) fn work_and_gflop(
     agent: &str,
     sets: &[&str],
     compute: &Compute,
 ) -> anyhow::Result<(Work<'static>, f64)> {
-    let config = settings::of_run(WORLD, agent, "paper", sets)?.with_whole_frames()?;
+    let config = settings::run_config(WORLD, agent, "paper", sets)?.with_whole_frames()?;
     let shape = UpdateShape::for_learner(&config.learner, config.run.horizon.positives());
     let gflop = UpdateCost::compute(&config.model, &shape).total() as f64 / 1e9;
     Ok((updates(&config, compute, 0.0)?, gflop))
@@ -144,8 +144,8 @@ pub(super) fn counted_updates(
 /// Returns the work of an update with these settings, on a synthetic batch with the share `repeated` of repeated states.
 fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Result<Work<'static>> {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut rows = synthetic(config, &mut rng);
-    repeat(&mut rows, repeated);
+    let mut rows = synthetic_batch(config, &mut rng);
+    repeat_states(&mut rows, repeated);
     let (model, update) = (config.model.clone(), config.learner.update.clone());
     let agent = Agent::new(model, update, compute, &mut rng)?;
     let mut agent = agent.with_deduplication(config.learner.deduplicate_states);
@@ -156,7 +156,7 @@ fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Resu
 }
 
 /// Makes a synthetic batch with the sizes of `config`: random bytes, actions and returns.
-fn synthetic(config: &RunConfig, rng: &mut ChaCha8Rng) -> OwnedBatch {
+fn synthetic_batch(config: &RunConfig, rng: &mut ChaCha8Rng) -> OwnedBatch {
     let rows = config.learner.batch_size as usize;
     let mut states = || {
         let mut states = vec![0; rows * config.model.frame_len()];
@@ -184,18 +184,18 @@ fn synthetic(config: &RunConfig, rng: &mut ChaCha8Rng) -> OwnedBatch {
 }
 
 /// Replaces this share of s_t and s_{t+k} together, and of s_{t+n}, by copies of states before them, spread evenly.
-fn repeat(batch: &mut OwnedBatch, share: f64) {
+fn repeat_states(batch: &mut OwnedBatch, share: f64) {
     let len = batch.states_t.len() / batch.action.len();
     for plane in [
         &mut batch.states_t,
         &mut batch.states_k,
         &mut batch.states_n,
     ] {
-        let mut owed = 0.0;
+        let mut copies_due = 0.0;
         for row in 1..plane.len() / len {
-            owed += share;
-            if owed >= 1.0 {
-                owed -= 1.0;
+            copies_due += share;
+            if copies_due >= 1.0 {
+                copies_due -= 1.0;
                 plane.copy_within((row - 1) * len..row * len, row * len);
             }
         }

@@ -48,19 +48,19 @@ use crate::{
 /// Runs one bench and reports its figures. A bench that computes in this process first re-executes the program, if its number of threads is
 /// not that of the flags.
 pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
-    let on = match command {
+    let device_name = match command {
         BenchCommand::Learner(args) => args.on.device,
         _ => DeviceName::Cpu,
     };
-    device::ready_for(on)?;
-    let of_processes = matches!(
+    device::ready_for(device_name)?;
+    let starts_processes = matches!(
         command,
         BenchCommand::System { .. } | BenchCommand::Scale { .. } | BenchCommand::Peers(_)
     );
-    if !of_processes {
+    if !starts_processes {
         subprocess::ensure_threads(flags.threads)?;
     }
-    let machine = MachineNote::this(device::gpu(on));
+    let machine = MachineNote::this(device::gpu(device_name));
     let mut bench = Bench {
         flags,
         effort: Effort::new(flags.quick),

@@ -7,7 +7,7 @@ use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    report::{Bench, named},
+    report::{Bench, with_precision},
     settings,
 };
 
@@ -24,7 +24,7 @@ const NETWORKS: [(&str, &str, &[&str]); 3] = [
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     for precision in bench.flags.precisions(DeviceName::Cpu) {
         for (network, preset, sets) in NETWORKS {
-            let config = settings::of_run(settings::WORLD, "c51", preset, sets)?;
+            let config = settings::run_config(settings::WORLD, "c51", preset, sets)?;
             let model = config.with_whole_frames()?.model;
             let mut rng = ChaCha8Rng::seed_from_u64(1);
             let parameters = Parameters::init(&model, &mut rng, &candle_core::Device::Cpu)?;
@@ -38,8 +38,8 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
                     policy.greedy_actions(&frames, &mut actions)?;
                     Ok(())
                 })?;
-                let name = named(&format!("{batch} frames of {network}"), precision);
-                bench.figures.found(name, rate * batch as f64, "frames/s");
+                let name = with_precision(&format!("{batch} frames of {network}"), precision);
+                bench.figures.record(name, rate * batch as f64, "frames/s");
             }
         }
     }

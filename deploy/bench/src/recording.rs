@@ -62,9 +62,9 @@ struct Step {
 }
 
 impl Recording {
-    pub(super) fn play() -> anyhow::Result<Self> {
+    pub(super) fn record() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
-        let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
+        let config = settings::run_config(settings::WORLD, "c51", "paper", &[])?;
         let run = &config.run;
         let sent = (run.frame_height as usize, run.frame_width as usize);
         let whole = config.world.build(STREAMS, 1, 0)?;

@@ -25,16 +25,16 @@ const ROUNDS_ON_DISK: u32 = 3;
 /// memory. Figures are medians of the rounds.
 pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     if args.sampling {
-        return in_process::sampling(args.held, bench);
+        return in_process::time_sampling(args.held, bench);
     }
-    let recording = Recording::play()?;
+    let recording = Recording::record()?;
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     let socket = format!("unixsock-stream/{}/s", folder.path().display());
     let wire = |name, endpoint: &str| Wire {
         name,
         endpoint: endpoint.to_owned(),
         shared_memory: endpoint == socket && name != "unix socket",
-        held: args.held,
+        capacity: args.held,
         folder: None,
     };
     let tcp = wire("tcp", &format!("tcp/{}", free_port()?));
@@ -61,17 +61,17 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     for _ in 0..args.rounds.unwrap_or(rounds) {
         for wire in &wires {
             let on_disk = dir.as_deref().filter(|_| wire.name == "on disk");
-            on_disk.map_or(Ok(()), empty)?;
+            on_disk.map_or(Ok(()), remove_folder)?;
             let mut server = Server::start(wire, folder.path())?;
             rates(&mut server, &recording, bench)?;
             match on_disk {
                 Some(dir) => restart(server, folder.path(), dir, bench)?,
-                None => drop(server.end(ManagedProcess::ask_to_stop)),
+                None => drop(server.shut_down(ManagedProcess::ask_to_stop)),
             }
-            on_disk.map_or(Ok(()), empty)?;
+            on_disk.map_or(Ok(()), remove_folder)?;
         }
         if dir.is_none() && args.tls_dir.is_none() {
-            in_process::assembling(&recording, bench)?;
+            in_process::time_assembly(&recording, bench)?;
         }
     }
     Ok(())
@@ -84,16 +84,16 @@ pub(super) fn insert_name(transitions: u32, wire: &str) -> String {
 
 /// Measures the transitions that a server stores per second and the batches that it serves per second, once its replay is full.
 fn rates(server: &mut Server, recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
-    let (effort, held) = (bench.effort, server.wire.held);
+    let (effort, held) = (bench.effort, server.wire.capacity);
     server.deliver(recording, CHUNKS[3], |sent, _| sent >= held)?;
     for chunk in CHUNKS {
         let rate = server.deliver(recording, chunk, |_, started| effort.is_spent(started))?;
         let name = insert_name(chunk.transitions(), server.wire.name);
-        bench.figures.found(name, rate, "transitions/s");
+        bench.figures.record(name, rate, "transitions/s");
     }
     let (rate, wire) = (server.fetch(&effort)?, server.wire.name);
     let name = format!("batch of 3 states, {wire}");
-    bench.figures.found(name, rate, "batches/s");
+    bench.figures.record(name, rate, "batches/s");
     Ok(())
 }
 
@@ -104,20 +104,20 @@ fn restart(server: Server, logs: &Path, dir: &Path, bench: &mut Bench<'_>) -> an
         bytes += entry?.metadata()?.len();
     }
     let megabytes = bytes as f64 / 1e6;
-    let wire = server.end(ManagedProcess::kill);
+    let wire = server.shut_down(ManagedProcess::kill);
     let started = Instant::now();
     let server = Server::start(&wire, logs)?;
     let took = started.elapsed().max(Duration::from_millis(1));
     let seconds = took.as_secs_f64();
-    server.end(ManagedProcess::kill);
-    bench.figures.found("log", megabytes, "MB");
-    bench.figures.found("restart", seconds, "s");
+    server.shut_down(ManagedProcess::kill);
+    bench.figures.record("log", megabytes, "MB");
+    bench.figures.record("restart", seconds, "s");
     let rate = megabytes / seconds;
-    bench.figures.found("restart, rate", rate, "MB/s");
+    bench.figures.record("restart, rate", rate, "MB/s");
     Ok(())
 }
 
-fn empty(dir: &Path) -> anyhow::Result<()> {
+fn remove_folder(dir: &Path) -> anyhow::Result<()> {
     if dir.exists() {
         fs::remove_dir_all(dir).with_context(|| format!("emptying {}", dir.display()))?;
     }

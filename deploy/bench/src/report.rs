@@ -41,7 +41,7 @@ pub(super) struct Figures(Vec<(Measurement, Vec<f64>)>);
 
 impl Figures {
     /// Adds a figure, or its value in another round, and prints it to stderr at once.
-    pub(super) fn found(&mut self, what: impl Into<String>, value: f64, unit: &str) {
+    pub(super) fn record(&mut self, what: impl Into<String>, value: f64, unit: &str) {
         let (what, unit) = (what.into(), unit.to_owned());
         console::line(&format!("  {what}: {} {unit}", number(value)));
         self.add(Measurement { what, value, unit });
@@ -56,7 +56,7 @@ impl Figures {
     }
 
     /// Returns a figure's values and its unit; `None` if it was not measured.
-    pub(super) fn of(&self, what: &str) -> Option<(&[f64], &str)> {
+    pub(super) fn values_of(&self, what: &str) -> Option<(&[f64], &str)> {
         let (figure, values) = self.0.iter().find(|(it, _)| it.what == what)?;
         Some((&values[..], figure.unit.as_str()))
     }
@@ -72,7 +72,7 @@ impl Figures {
 }
 
 /// Returns `what`, followed by the precision if that is not f32.
-pub(super) fn named(what: &str, precision: Precision) -> String {
+pub(super) fn with_precision(what: &str, precision: Precision) -> String {
     match precision {
         Precision::F32 => what.to_owned(),
         other => format!("{what}, {other}"),
@@ -130,9 +130,9 @@ mod tests {
     fn a_report_is_a_table_and_reads_back_as_it_was_written() {
         let mut figures = Figures::default();
         for value in [5.25, 1.0, 9.0] {
-            figures.found("C51 + DIM", value, "updates/s");
+            figures.record("C51 + DIM", value, "updates/s");
         }
-        figures.found("32 rows: 1.20 GFLOP", 61_234.5, "GFLOP/s");
+        figures.record("32 rows: 1.20 GFLOP", 61_234.5, "GFLOP/s");
         let report = Report {
             bench: "learner".into(),
             quick: true,

@@ -45,7 +45,7 @@ pub(super) struct Wire {
     pub(super) endpoint: String,
     pub(super) shared_memory: bool,
     /// The capacity of the server's replay, in transitions.
-    pub(super) held: u64,
+    pub(super) capacity: u64,
     /// The flag for a folder of the server, and the folder: certificates of all roles, or a replay on disk.
     pub(super) folder: Option<(&'static str, String)>,
 }
@@ -67,8 +67,8 @@ impl Server {
     /// Starts a server with its log in `folder`, and waits until it answers.
     pub(super) fn start(wire: &Wire, folder: &Path) -> anyhow::Result<Self> {
         let shared_memory = format!("transport.shared_memory={}", wire.shared_memory);
-        let held = format!("replay.capacity_transitions={}", wire.held);
-        let sets = [&settings::REPLAY[..], &[&*shared_memory, &*held]].concat();
+        let held = format!("replay.capacity_transitions={}", wire.capacity);
+        let sets = [&settings::REPLAY_SETS[..], &[&*shared_memory, &*held]].concat();
         let mut args = vec!["replay-server", "--keep-alive"];
         if let Some((flag, dir)) = &wire.folder {
             args.extend([*flag, dir]);
@@ -104,7 +104,7 @@ impl Server {
             incarnation: INCARNATION,
         };
         let who = Alive::actor(actor, INCARNATION);
-        let (client, alive) = self.take_part(Role::Actor(actor), who, &join)?;
+        let (client, alive) = self.join_run(Role::Actor(actor), who, &join)?;
         let limits = DeliveryLimits::of(&self.actor.actor);
         let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
         let mut chunks = recording.chunks(actor, shape, pool);
@@ -130,7 +130,7 @@ impl Server {
             run: LEARNER,
             ..LearnerJoin::default()
         };
-        let (client, _alive) = self.take_part(Role::Learner, Alive::learner(LEARNER), &join)?;
+        let (client, _alive) = self.join_run(Role::Learner, Alive::learner(LEARNER), &join)?;
         let LearnerConfig {
             learner, transport, ..
         } = &self.learner;
@@ -165,7 +165,7 @@ impl Server {
     }
 
     /// Returns a client that joins the run with `join`, and counts as connected until the token is dropped.
-    fn take_part(
+    fn join_run(
         &mut self,
         role: Role,
         who: Alive,
@@ -184,14 +184,14 @@ impl Server {
         Ok((client, alive))
     }
 
-    /// Ends the server by `tell` and waits until it exits. Another server can use the returned wire.
-    pub(super) fn end(mut self, tell: fn(&mut ManagedProcess)) -> Wire {
+    /// Ends the server by `stop` and waits until it exits. Another server can use the returned wire.
+    pub(super) fn shut_down(mut self, stop: fn(&mut ManagedProcess)) -> Wire {
         for session in &self.sessions {
             if let Err(e) = session.close().wait() {
                 tracing::debug!("closing a session: {e}");
             }
         }
-        tell(&mut self.process);
+        stop(&mut self.process);
         let deadline = Instant::now() + ANSWER_MAX;
         self.process.wait_until(deadline, || false);
         self.wire

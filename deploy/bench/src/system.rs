@@ -28,7 +28,7 @@ const FRAMES: (u64, u64) = (12_000, 5_000);
 /// The number of updates before the measurement: by then all threads run and all memory is allocated.
 const WARMUP_UPDATES: u64 = 10;
 /// The time between two requests for the statuses of a run.
-const POLL: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// The time-out of each wait, including that for the end of a run.
 const WAIT_MAX: Duration = Duration::from_secs(300);
 /// Exit code of a run that was interrupted.
@@ -48,22 +48,22 @@ pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Res
     });
     let threads = format!("local.learner_threads={}", bench.flags.threads);
     let mut run = Run::start(&["--frames", &frames.to_string()], &[&threads])?;
-    let seen = run.watch_to_end()?;
+    let samples = run.watch_to_end()?;
     let summary = run.finish(0)?;
-    let [before, after] = seen.each_ref().map(|it| &it.learner);
+    let [before, after] = samples.each_ref().map(|it| &it.learner);
     let computing = after.computing_s - before.computing_s;
     let waiting = after.waiting_s - before.waiting_s;
     let share = 100.0 * computing / (computing + waiting);
-    let updates = rate(&seen, |it| it.learner.updates);
-    let frames = rate(&seen, |it| it.replay.transitions_inserted);
+    let updates = per_second(&samples, |it| it.learner.updates);
+    let frames = per_second(&samples, |it| it.replay.transitions_inserted);
     let computes = "share of its time in which the learner computes";
     let figures = &mut bench.figures;
-    figures.found("updates", updates, "updates/s");
-    figures.found("frames", frames, "frames/s");
-    figures.found(computes, share, "%");
+    figures.record("updates", updates, "updates/s");
+    figures.record("frames", frames, "frames/s");
+    figures.record(computes, share, "%");
     for (process, mib) in &summary.rss_mib_max {
         if let Some(mib) = *mib {
-            figures.found(format!("memory of {process}"), mib, "MiB");
+            figures.record(format!("memory of {process}"), mib, "MiB");
         }
     }
     Ok(())
@@ -88,7 +88,7 @@ pub(super) fn scale(
         for &actors in actors {
             let mut heads = ["ratio", "actors"].map(String::from).to_vec();
             let mut row = vec![ratio.to_string(), actors.to_string()];
-            for (column, value) in columns(actors, ratio, slack, seconds)? {
+            for (column, value) in measure_columns(actors, ratio, slack, seconds)? {
                 row.push(value.map_or("-".into(), number));
                 if let Some(value) = value {
                     let what = format!("ratio {ratio}, {actors} actors: {column}");
@@ -110,7 +110,7 @@ pub(super) fn scale(
 }
 
 /// Returns a row of the table: what was measured of a run with `actors` actors, from its start until it was watched for `seconds`.
-fn columns(
+fn measure_columns(
     actors: u32,
     ratio: f64,
     slack: u64,
@@ -126,15 +126,15 @@ fn columns(
     ];
     let started = Instant::now();
     let mut run = Run::start(&["--actors", &actors.to_string()], &sets)?;
-    let acting = run.wait_until(|now| now.replay.actors_acting >= actors)?;
-    let first = run.wait_until(|now| now.learner.updates > 2)?;
+    let acting = run.wait_for(|now| now.replay.actors_acting >= actors)?;
+    let first = run.wait_for(|now| now.learner.updates > 2)?;
     let until = first.at + Duration::from_secs(seconds.into());
     thread::sleep(until.saturating_duration_since(Instant::now()));
-    let seen = [first, run.wait_until(|_| true)?];
+    let samples = [first, run.wait_for(|_| true)?];
     run.launcher.ask_to_stop();
     let summary = run.finish(INTERRUPTED)?;
-    let frames = rate(&seen, |it| it.replay.transitions_inserted);
-    let updates = rate(&seen, |it| it.learner.updates);
+    let frames = per_second(&samples, |it| it.replay.transitions_inserted);
+    let updates = per_second(&samples, |it| it.learner.updates);
     // From the launcher's start to the last actor's first frame.
     let all_act_after_s = (acting.at - started).as_secs_f64();
     let mut columns = vec![
@@ -142,7 +142,7 @@ fn columns(
         ("updates/s".to_owned(), Some(updates)),
         ("all act after s".to_owned(), Some(all_act_after_s)),
     ];
-    let replay = &seen[1].replay;
+    let replay = &samples[1].replay;
     for (name, unit, quantiles) in [
         ("answer", "ms", replay.answer_ms),
         ("insert", "ms", replay.insert_ms),
@@ -160,15 +160,15 @@ fn columns(
     Ok(columns)
 }
 
-/// Returns the growth of `count` per second from the first moment to the last.
-fn rate([first, last]: &[Moment; 2], count: fn(&Moment) -> u64) -> f64 {
+/// Returns the growth of `count` per second from the first sample to the last.
+fn per_second([first, last]: &[StatusSample; 2], count: fn(&StatusSample) -> u64) -> f64 {
     let seconds = (last.at - first.at).as_secs_f64();
     (count(last) - count(first)) as f64 / seconds
 }
 
 /// The statuses of the processes, and when they were read.
 #[derive(Clone)]
-struct Moment {
+struct StatusSample {
     at: Instant,
     replay: ReplayStatus,
     learner: LearnerStatus,
@@ -184,7 +184,7 @@ struct Run {
 impl Run {
     /// Starts `driml local` with these flags and settings, and waits until it listens.
     fn start(flags: &[&str], sets: &[&str]) -> anyhow::Result<Self> {
-        let config = settings::of_run(WORLD, AGENT, "paper", sets)?;
+        let config = settings::run_config(WORLD, AGENT, "paper", sets)?;
         let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
         let endpoint = format!("unixsock-stream/{}", folder.path().join("s").display());
         let run_dir = folder.path().join("run").display().to_string();
@@ -199,7 +199,7 @@ impl Run {
     }
 
     /// Requests the statuses; `None` while a process does not answer, as they start after the replay server and end before it.
-    fn look(&mut self) -> anyhow::Result<Option<Moment>> {
+    fn sample_status(&mut self) -> anyhow::Result<Option<StatusSample>> {
         if self.launcher.end().is_some() {
             bail!("{}", self.launcher.exit_report());
         }
@@ -207,41 +207,41 @@ impl Run {
         if answers.and_then(|()| self.poller.ask_learner()).is_err() {
             return Ok(None);
         }
-        Ok(Some(Moment {
+        Ok(Some(StatusSample {
             at: Instant::now(),
             replay: self.poller.view.replay.clone(),
             learner: self.poller.view.learner.clone(),
         }))
     }
 
-    /// Waits for the first moment that satisfies `wanted`.
-    fn wait_until(&mut self, wanted: impl Fn(&Moment) -> bool) -> anyhow::Result<Moment> {
+    /// Waits for the first sample that satisfies `wanted`.
+    fn wait_for(&mut self, wanted: impl Fn(&StatusSample) -> bool) -> anyhow::Result<StatusSample> {
         let started = Instant::now();
         loop {
-            if let Some(moment) = self.look()?.filter(&wanted) {
-                return Ok(moment);
+            if let Some(sample) = self.sample_status()?.filter(&wanted) {
+                return Ok(sample);
             }
             ensure!(
                 started.elapsed() < WAIT_MAX,
                 "the run has not come as far as is to be measured within {} s",
                 WAIT_MAX.as_secs()
             );
-            thread::sleep(POLL / 2);
+            thread::sleep(POLL_INTERVAL / 2);
         }
     }
 
-    /// Returns the first moment after the learner's warm-up, and the last one at which both sides were still at work.
-    fn watch_to_end(&mut self) -> anyhow::Result<[Moment; 2]> {
+    /// Returns the first sample after the learner's warm-up, and the last one at which both sides were still at work.
+    fn watch_to_end(&mut self) -> anyhow::Result<[StatusSample; 2]> {
         let (mut first, mut last) = (None, None);
         // The run ends by itself; then it no longer answers.
-        while let Ok(moment) = self.look() {
-            thread::sleep(POLL);
-            let Some(moment) = moment else { continue };
-            if moment.replay.finished || moment.learner.finished {
+        while let Ok(sample) = self.sample_status() {
+            thread::sleep(POLL_INTERVAL);
+            let Some(sample) = sample else { continue };
+            if sample.replay.finished || sample.learner.finished {
                 break;
             }
-            if moment.learner.updates >= WARMUP_UPDATES {
-                last = Some(moment);
+            if sample.learner.updates >= WARMUP_UPDATES {
+                last = Some(sample);
                 first = first.or_else(|| last.take());
             }
         }

@@ -89,12 +89,12 @@ pub(super) fn run(
         only => only.iter().copied().collect(),
     };
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
-    for (name, text) in script::FILES {
+    for (name, text) in script::SCRIPTS {
         fs::write(folder.path().join(name), text).with_context(|| format!("writing {name}"))?;
     }
     let frames = folder.path().join("frames");
     if components.contains(&Component::Replay) {
-        Recording::play()?.write_frames(&frames)?;
+        Recording::record()?.write_frames(&frames)?;
     }
     let mut sides = BTreeMap::new();
     for component in components {
@@ -125,7 +125,7 @@ pub(super) fn run(
     }
     let rows = pairs().into_iter().filter_map(|pair| {
         let (_, sides) = sides.get(&pair.component)?;
-        row(&pair, sides)
+        compare(&pair, sides)
     });
     let comparison = Comparison {
         rounds,
@@ -134,7 +134,7 @@ pub(super) fn run(
         machine,
         rows: rows.collect(),
     };
-    let table = describe(&comparison);
+    let table = format_table(&comparison);
     report::publish(&comparison, &table, flags.json.as_deref())
 }
 
@@ -154,14 +154,14 @@ impl Sides {
 }
 
 /// Returns medians and ratio of one pair; `None` if ours was not measured, as in a precision that was not selected.
-fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
-    let (ours, unit) = sides.ours.of(&pair.ours)?;
+fn compare(pair: &Pair, sides: &Sides) -> Option<Row> {
+    let (ours, unit) = sides.ours.values_of(&pair.ours)?;
     let what = &pair.theirs;
-    let theirs = match pair.of_ours {
-        Some(_) => sides.ours.of(what).map(|(values, _)| values),
+    let theirs = match pair.own_figure {
+        Some(_) => sides.ours.values_of(what).map(|(values, _)| values),
         None => sides.theirs.get(what).map(Vec::as_slice),
     };
-    let peer = match pair.of_ours {
+    let peer = match pair.own_figure {
         Some(name) => name.to_owned(),
         None if *what == pair.ours => sides.peer.clone(),
         None => format!("{}: {what}", sides.peer),
@@ -173,7 +173,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
         None => format!("{peer} was not measured"),
     };
     // A peer may fail in a later round; its earlier values are not the whole comparison.
-    let failed = pair.of_ours.is_none() && sides.absent.is_some();
+    let failed = pair.own_figure.is_none() && sides.absent.is_some();
     Some(Row {
         component: pair.component.name(),
         what: pair.ours.clone(),
@@ -189,7 +189,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
 }
 
 /// Returns the table, and below it the reasons why rows were skipped.
-fn describe(comparison: &Comparison) -> String {
+fn format_table(comparison: &Comparison) -> String {
     let heads = ["what", "ours", "theirs", "", "", "ratio", "goal", ""];
     let mut cells = vec![heads.map(String::from).to_vec()];
     let mut skipped = BTreeSet::new();

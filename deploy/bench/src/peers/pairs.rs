@@ -5,7 +5,7 @@ use crate::{
     env,
     flags::Component::{self, Env, Learner, Policy, Replay},
     in_process,
-    learner::{CANDLE, GLOBAL_DIM},
+    learner::{CANDLE_SUFFIX, GLOBAL_DIM_CASE},
     recording::CHUNKS,
     replay::insert_name,
 };
@@ -20,7 +20,7 @@ pub(super) struct Pair {
     /// The name of the figure that it is compared with.
     pub(super) theirs: String,
     /// `None` if `theirs` is a figure of the peer. Else it is another figure of ours, and this describes it.
-    pub(super) of_ours: Option<&'static str>,
+    pub(super) own_figure: Option<&'static str>,
     /// The lowest ratio of ours to theirs that is wanted; `None` without a goal.
     pub(super) goal: Option<f64>,
 }
@@ -33,9 +33,9 @@ pub(super) fn pairs() -> Vec<Pair> {
             component,
             ours: ours.to_owned(),
             theirs: theirs.to_owned(),
-            of_ours: match theirs {
-                in_process::COPIED => Some("a plain copy of the same bytes"),
-                _ if theirs.ends_with(CANDLE) => Some(CANDLE),
+            own_figure: match theirs {
+                in_process::PLAIN_COPY => Some("a plain copy of the same bytes"),
+                _ if theirs.ends_with(CANDLE_SUFFIX) => Some(CANDLE_SUFFIX),
                 _ => None,
             },
             goal,
@@ -57,8 +57,8 @@ pub(super) fn pairs() -> Vec<Pair> {
         let name = format!("{name}, bf16");
         add(Learner, &name, &name, bf16);
     }
-    let candle = format!("{GLOBAL_DIM}, {CANDLE}");
-    add(Learner, GLOBAL_DIM, &candle, None);
+    let candle = format!("{GLOBAL_DIM_CASE}, {CANDLE_SUFFIX}");
+    add(Learner, GLOBAL_DIM_CASE, &candle, None);
     for (network, f32, bf16) in [
         ("64x64x3", 1.3, None),
         ("104x80x3", 1.3, None),
@@ -88,11 +88,11 @@ pub(super) fn pairs() -> Vec<Pair> {
         let sequences = "batch of sequences of 8 states";
         add(Replay, &name, sequences, None);
     }
-    let copied = in_process::COPIED;
-    add(Replay, in_process::ASSEMBLED, copied, Some(1.0 / 1.5));
+    let copied = in_process::PLAIN_COPY;
+    add(Replay, in_process::ASSEMBLY, copied, Some(1.0 / 1.5));
     for game in env::GAMES {
         for threads in env::ENGINE_THREADS {
-            let name = env::name(game, threads);
+            let name = env::label(game, threads);
             add(Env, &name, &name, Some(1.0));
         }
     }

@@ -17,7 +17,7 @@ use crate::{
 };
 
 /// The scripts, which are embedded in the program so that it can be started anywhere.
-pub(super) const FILES: [(&str, &str); 6] = [
+pub(super) const SCRIPTS: [(&str, &str); 6] = [
     ("measure.py", include_str!("../../peers/measure.py")),
     ("driml_net.py", include_str!("../../../python/driml_net.py")),
     (
@@ -42,7 +42,7 @@ pub(super) struct Script {
     /// The Python module that the script needs.
     module: &'static str,
     /// The peer's short name, in the name of its requirements file and of the flag for its interpreter.
-    short: &'static str,
+    short_name: &'static str,
     python: PathBuf,
     file: &'static str,
     args: Vec<String>,
@@ -72,7 +72,7 @@ impl Script {
             Component::Replay => ("Reverb", "reverb", "reverb_replay.py"),
             Component::Env => ("gym3", "procgen", "gym3_steps.py"),
         };
-        let (short, own) = match component {
+        let (short_name, own) = match component {
             Component::Learner | Component::Policy => ("torch", &args.torch_python),
             Component::Replay => ("reverb", &args.reverb_python),
             Component::Env => ("gym3", &args.gym3_python),
@@ -85,7 +85,7 @@ impl Script {
         Self {
             peer,
             module,
-            short,
+            short_name,
             python: own.as_ref().unwrap_or(&args.python).clone(),
             file,
             args: words,
@@ -101,14 +101,14 @@ impl Script {
             .stdin(Stdio::null())
             .stderr(Stdio::null())
             .status();
-        let (python, peer, short) = (self.python.display(), self.peer, self.short);
+        let (python, peer, short_name) = (self.python.display(), self.peer, self.short_name);
         match found {
             Ok(status) if status.success() => Ok(()),
             Ok(_) => Err(format!(
-                "{python} has no {peer}: {python} -m pip install -r deploy/bench/peers/requirements-{short}.txt, or name one that has it with --{short}-python"
+                "{python} has no {peer}: {python} -m pip install -r deploy/bench/peers/requirements-{short_name}.txt, or name one that has it with --{short_name}-python"
             )),
             Err(e) => Err(format!(
-                "{python} cannot be started ({e}): name a Python that has {peer} with --{short}-python"
+                "{python} cannot be started ({e}): name a Python that has {peer} with --{short_name}-python"
             )),
         }
     }
@@ -117,7 +117,7 @@ impl Script {
     pub(super) fn run(&self, folder: &Path) -> anyhow::Result<(String, BTreeMap<String, f64>)> {
         let mut command = Command::new(&self.python);
         command.arg(folder.join(self.file)).args(&self.args);
-        let text = output(command, &format!("the script of {}", self.peer))?;
+        let text = run_for_stdout(command, &format!("the script of {}", self.peer))?;
         let line = text.lines().last().unwrap_or_default();
         match serde_json::from_str::<Answer>(line) {
             Ok(answer) => Ok((answer.peer, answer.figures)),
@@ -135,13 +135,13 @@ pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<V
     for precision in &flags.precision {
         command.args(["--precision", precision.name()]);
     }
-    let text = output(command, &format!("the bench of the {}", component.name()))?;
+    let text = run_for_stdout(command, &format!("the bench of the {}", component.name()))?;
     let report: Report = serde_json::from_str(&text).context("reading a bench's figures")?;
     Ok(report.figures)
 }
 
 /// Runs a process and returns its standard output.
-fn output(mut command: Command, what: &str) -> anyhow::Result<String> {
+fn run_for_stdout(mut command: Command, what: &str) -> anyhow::Result<String> {
     command.stdin(Stdio::null()).stderr(Stdio::inherit());
     let output = command.output();
     let output = output.with_context(|| format!("{what} could not be started"))?;

@@ -11,18 +11,18 @@ fn sides(ours: &[(&str, &[f64])]) -> Sides {
     };
     for (what, values) in ours {
         for value in *values {
-            sides.ours.found(*what, *value, "updates/s");
+            sides.ours.record(*what, *value, "updates/s");
         }
     }
     sides
 }
 
-fn pair(theirs: &str, of_ours: Option<&'static str>) -> Pair {
+fn pair(theirs: &str, own_figure: Option<&'static str>) -> Pair {
     Pair {
         component: Component::Learner,
         ours: "C51".into(),
         theirs: theirs.into(),
-        of_ours,
+        own_figure,
         goal: Some(1.5),
     }
 }
@@ -33,11 +33,11 @@ fn a_ratio_is_the_median_of_the_rounds_ratios() {
     for value in [3.0, 4.0, 3.0] {
         sides.add_theirs("PyTorch 9".into(), [("C51".into(), value)].into());
     }
-    let found = row(&pair("C51", None), &sides).unwrap();
+    let found = compare(&pair("C51", None), &sides).unwrap();
     let numbers = (found.ours, found.theirs, found.ratio);
     assert_eq!(numbers, (6.0, Some(3.0), Some(2.0)));
     assert_eq!((found.peer.as_str(), found.skipped), ("PyTorch 9", None));
-    let found = row(&pair("stock", Some("candle")), &sides).unwrap();
+    let found = compare(&pair("stock", Some("candle")), &sides).unwrap();
     assert_eq!((found.ratio, found.peer.as_str()), (Some(12.0), "candle"));
 }
 
@@ -55,7 +55,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
             load: 6.6,
             gpu: None,
         },
-        rows: vec![row(&pair("C51", None), &sides).unwrap()],
+        rows: vec![compare(&pair("C51", None), &sides).unwrap()],
     };
     expect![[r#"
         what  ours  theirs                      ratio  goal
@@ -65,7 +65,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
         The machine was not idle before: 6.60 tasks wanted a core. These figures are not reliable.
         Quick: a few iterations only; these figures are not reliable.
     "#]]
-    .assert_eq(&describe(&comparison));
+    .assert_eq(&format_table(&comparison));
     let json = serde_json::to_value(&comparison).unwrap();
     assert_eq!(json["rows"][0]["part"], "learner");
 }
@@ -77,10 +77,10 @@ fn every_peer_s_figure_is_named_in_its_script() {
         let name = pair.theirs.as_str();
         let name = name.strip_suffix(", bf16").unwrap_or(name);
         let is_whole = matches!(pair.component, Component::Learner | Component::Replay);
-        if is_whole && pair.of_ours.is_none() {
+        if is_whole && pair.own_figure.is_none() {
             let quoted = format!("\"{name}\"");
             let named = |(_, text): &(_, &str)| text.contains(&quoted);
-            assert!(script::FILES.iter().any(named), "{name}");
+            assert!(script::SCRIPTS.iter().any(named), "{name}");
         }
     }
 }
