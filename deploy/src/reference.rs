@@ -18,7 +18,7 @@ const GENERATED: &str =
     "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml --lib reference` rewrites this page. -->";
 
 /// Returns the entry of a flag or argument in the list of its command.
-fn entry(arg: &Arg) -> String {
+fn flag_entry(arg: &Arg) -> String {
     let takes_values = arg.get_action().takes_values();
     let value = match arg.get_value_names() {
         Some([name]) if takes_values => format!(" <{name}>"),
@@ -53,26 +53,26 @@ fn first_clause(help: &str) -> &str {
 }
 
 /// Collects every command that does something or has flags for its subcommands, with the words that call it.
-fn commands_of(command: &Command, name: &str, found: &mut Vec<(String, Command)>) {
+fn collect_commands(command: &Command, name: &str, found: &mut Vec<(String, Command)>) {
     let has_flags = command.get_arguments().any(|it| !it.is_hide_set());
     if has_flags || !command.has_subcommands() {
         found.push((name.to_owned(), command.clone()));
     }
     for sub in command.get_subcommands() {
-        commands_of(sub, &format!("{name} {}", sub.get_name()), found);
+        collect_commands(sub, &format!("{name} {}", sub.get_name()), found);
     }
 }
 
 /// Returns the page of all commands. A flag that several commands have in the same words appears once.
 fn commands() -> String {
     let mut found = Vec::new();
-    commands_of(&Cli::command(), "driml", &mut found);
+    collect_commands(&Cli::command(), "driml", &mut found);
     let mut uses = BTreeMap::<String, usize>::new();
     let arguments = found.iter().flat_map(|(_, it)| it.get_arguments());
     for arg in arguments.filter(|it| !it.is_hide_set()) {
-        *uses.entry(entry(arg)).or_default() += 1;
+        *uses.entry(flag_entry(arg)).or_default() += 1;
     }
-    let is_shared = |arg: &Arg| arg.get_long().is_some() && uses[&entry(arg)] > 1;
+    let is_shared = |arg: &Arg| arg.get_long().is_some() && uses[&flag_entry(arg)] > 1;
 
     let mut page = format!("# Commands\n\n{GENERATED}\n\n");
     page += "`driml COMMAND --help` says more about each flag.\n";
@@ -88,7 +88,7 @@ fn commands() -> String {
         let shown = command.get_arguments().filter(|it| !it.is_hide_set());
         let (shared, own): (Vec<_>, Vec<_>) = shown.partition(|it| is_shared(it));
         for arg in own {
-            page += &entry(arg);
+            page += &flag_entry(arg);
         }
         let flags: Vec<_> = shared.iter().filter_map(|it| it.get_long()).collect();
         if !flags.is_empty() {
@@ -109,7 +109,7 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-fn presets(folder: &str) -> Vec<(String, PathBuf)> {
+fn preset_files(folder: &str) -> Vec<(String, PathBuf)> {
     let folder = root().join("deploy/settings/presets").join(folder);
     let files = fs::read_dir(folder).unwrap().map(|it| it.unwrap().path());
     let name = |file: &Path| file.file_stem().unwrap().to_str().unwrap().to_owned();
@@ -130,14 +130,14 @@ fn settings() -> String {
     let link = |folder: &str, name: &str| {
         format!("[`{name}`](../../../settings/presets/{folder}/{name}.toml)")
     };
-    for (name, file) in presets("variant") {
+    for (name, file) in preset_files("variant") {
         let text = fs::read_to_string(&file).unwrap();
         let first = text.lines().next().unwrap().trim_start_matches("# ");
         let first = first.split_inclusive(". ").next().unwrap().trim();
         writeln!(page, "* {}: {first}", link("variant", &name)).unwrap();
     }
     for (folder, title) in [("agent", "Agents"), ("world", "Worlds")] {
-        let presets = presets(folder);
+        let presets = preset_files(folder);
         let links: Vec<_> = presets.iter().map(|it| link(folder, &it.0)).collect();
         write!(page, "\n## {title}\n\n{}\n", links.join(", ")).unwrap();
     }
@@ -153,13 +153,13 @@ fn the_generated_pages_are_up_to_date() {
 }
 
 /// The words of a shell's line, without its comment and redirection.
-fn words(line: &str) -> Vec<String> {
+fn split_words(line: &str) -> Vec<String> {
     let words = shlex::split(line).unwrap().into_iter();
     words.take_while(|it| !it.starts_with('>')).collect()
 }
 
 /// The lines of a page's shell blocks that call the program.
-fn calls(page: &str) -> impl Iterator<Item = &str> {
+fn program_calls(page: &str) -> impl Iterator<Item = &str> {
     let blocks = page.split("```sh\n").skip(1);
     let lines = blocks.flat_map(|it| it.split("```").next().unwrap().lines());
     lines.filter(|it| it.starts_with("driml "))
@@ -170,15 +170,15 @@ fn every_command_in_the_pages_parses() {
     let files = WalkDir::new(root().join("deploy/docs/src")).into_iter();
     let files = files.map(|entry| entry.unwrap().into_path());
     let pages = files.filter(|path| path.extension().is_some_and(|it| it == "md"));
-    let mut seen = 0;
+    let mut num_calls = 0;
     for path in pages.chain([root().join("README.md")]) {
         let text = fs::read_to_string(&path).unwrap();
-        for call in calls(&text) {
-            if let Err(e) = Cli::try_parse_from(words(call)) {
+        for call in program_calls(&text) {
+            if let Err(e) = Cli::try_parse_from(split_words(call)) {
                 panic!("{}: {call}\n{e}", path.display());
             }
-            seen += 1;
+            num_calls += 1;
         }
     }
-    assert!(seen > 50, "only {seen} commands were found");
+    assert!(num_calls > 50, "only {num_calls} commands were found");
 }

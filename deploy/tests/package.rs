@@ -19,7 +19,7 @@ const RECIPES: [(&str, &str); 6] = [
 ];
 
 /// The values of the placeholders in the recipes.
-const VALUES: [(&str, &str); 8] = [
+const PLACEHOLDERS: [(&str, &str); 8] = [
     ("${DRIML_ENV:-procgen:coinrun}", "procgen:coinrun"),
     ("${DRIML_AGENT:-driml-ada}", "driml-ada"),
     ("${DRIML_FRAMES:-120000}", "120000"),
@@ -30,14 +30,14 @@ const VALUES: [(&str, &str); 8] = [
     ("%i", "7"),
 ];
 
-fn recipe(name: &str) -> String {
+fn read_recipe(name: &str) -> String {
     let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("package");
     let path = package.join(name);
     std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
 /// Runs a call without its effect: clap checks the flags in their order, and the last one asks for help.
-fn help(words: &[String]) -> Output {
+fn run_with_help(words: &[String]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_driml"))
         .args(words)
         .arg("--help")
@@ -47,14 +47,14 @@ fn help(words: &[String]) -> Output {
         .unwrap()
 }
 
-fn words(text: &str) -> Vec<String> {
+fn split_words(text: &str) -> Vec<String> {
     let plain = |word: &str| word.trim_matches(['"', ',', '\'', '[', ']']).to_owned();
     let words = text.split_whitespace().map(plain);
     words.filter(|word| !word.is_empty()).collect()
 }
 
 /// Returns the calls of the program in a recipe: lines of a shell or of systemd, or a YAML list in one line or with an item per line.
-fn calls(text: &str) -> Vec<Vec<String>> {
+fn find_calls(text: &str) -> Vec<Vec<String>> {
     let lines = text.lines().map(str::trim);
     let mut lines = lines.filter(|line| !line.starts_with('#')).peekable();
     let mut found = Vec::new();
@@ -73,10 +73,10 @@ fn calls(text: &str) -> Vec<Vec<String>> {
         while let Some(item) = lines.next_if(|line| of_yaml == Some("") && line.starts_with("- ")) {
             call += &item[1..];
         }
-        for (holder, value) in VALUES {
+        for (holder, value) in PLACEHOLDERS {
             call = call.replace(holder, value);
         }
-        found.push(words(&call));
+        found.push(split_words(&call));
     }
     found
 }
@@ -84,23 +84,23 @@ fn calls(text: &str) -> Vec<Vec<String>> {
 #[test]
 fn every_call_in_a_recipe_has_flags_that_the_program_knows() {
     for (name, expected) in RECIPES {
-        let calls = calls(&recipe(name));
+        let calls = find_calls(&read_recipe(name));
         let commands: Vec<_> = calls.iter().map(|words| words[0].as_str()).collect();
         assert_eq!(commands.join(" "), expected, "{name}");
         for words in calls {
-            let output = help(&words);
-            let said = String::from_utf8(output.stderr).unwrap();
+            let output = run_with_help(&words);
+            let stderr = String::from_utf8(output.stderr).unwrap();
             let call = words.join(" ");
-            assert!(output.status.success(), "{name}: driml {call}: {said}");
+            assert!(output.status.success(), "{name}: driml {call}: {stderr}");
         }
     }
-    let output = help(&words("actor --conect tcp/127.0.0.1:1"));
+    let output = run_with_help(&split_words("actor --conect tcp/127.0.0.1:1"));
     assert_eq!(output.status.code(), Some(64), "a flag that is not there");
 }
 
 #[test]
 fn the_batch_script_is_a_shell_s() {
-    let script = recipe("driml.sbatch");
+    let script = read_recipe("driml.sbatch");
     let checked = Command::new("bash").args(["-n", "-c", &script]).output();
     let checked = checked.unwrap();
     assert!(checked.status.success(), "{checked:?}");
@@ -109,7 +109,7 @@ fn the_batch_script_is_a_shell_s() {
 /// The files that the image installs and copies exist.
 #[test]
 fn the_image_is_made_of_what_is_there() {
-    let file = recipe("Dockerfile");
+    let file = read_recipe("Dockerfile");
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..");
     for copied in file.lines().filter_map(|line| line.strip_prefix("COPY ")) {
         let from = copied.split_whitespace().next().unwrap();

@@ -70,16 +70,16 @@ impl Island {
             treasure: (0, 0),
             steps: 0,
         };
-        island.begin(side);
+        island.begin_episode(side);
         island
     }
 
-    fn begin(&mut self, side: usize) {
-        let mut place = || {
+    fn begin_episode(&mut self, side: usize) {
+        let mut random_place = || {
             let (row, column) = (0..side, 0..side);
             (self.rng.random_range(row), self.rng.random_range(column))
         };
-        (self.agent, self.treasure) = (place(), place());
+        (self.agent, self.treasure) = (random_place(), random_place());
         if self.agent == self.treasure {
             self.treasure.0 = (self.agent.0 + 1) % side;
         }
@@ -147,7 +147,7 @@ impl Environment for Islands {
                 (0.0, StepEnd::Running)
             };
             if ends[env] != StepEnd::Running {
-                island.begin(config.side);
+                island.begin_episode(config.side);
             }
         }
         Ok(())

@@ -6,7 +6,7 @@ use driml_machine::error::usage;
 use driml_protocol::{Shutdown, tls::Role};
 use driml_settings::presets;
 
-use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, TlsFlags, clean_up_after, prepare_join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ActorArgs {
@@ -52,7 +52,7 @@ pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
     let credentials = args.tls.credentials(Role::Actor(args.id))?;
     let world = args.env.as_deref().map(presets::world).transpose();
     let world = world.map_err(|e| usage!("--env: {e}"))?;
-    let shutdown = join(&args.join, Shutdown::on_signals)?;
+    let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;
     let run = driml_actor::RunArgs {
         connect: args.connect,
         credentials,

@@ -61,7 +61,7 @@ impl TlsFlags {
 }
 
 /// Checks the flags, and calls `listen` to listen for signals.
-pub(super) fn join<T>(
+pub(super) fn prepare_join<T>(
     flags: &JoinFlags,
     listen: fn(Option<u32>) -> io::Result<T>,
 ) -> anyhow::Result<T> {

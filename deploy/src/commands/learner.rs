@@ -7,7 +7,7 @@ use driml_launch::endpoint::check_endpoints;
 use driml_machine::device::{DeviceFlag, ready_for};
 use driml_protocol::{Shutdown, tls::Role};
 
-use super::join::{JoinFlags, KeepAliveFlag, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, KeepAliveFlag, TlsFlags, clean_up_after, prepare_join};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
@@ -23,7 +23,7 @@ pub(crate) struct LearnerArgs {
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
     #[command(flatten)]
-    pub(crate) until: KeepAliveFlag,
+    pub(crate) lifetime: KeepAliveFlag,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -34,7 +34,7 @@ pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Learner)?;
     ready_for(args.on.device)?;
-    let shutdown = join(&args.join, Shutdown::on_signals)?;
+    let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;
     let run = driml_learner::RunArgs {
         connect: args.connect,
         credentials,
@@ -42,7 +42,7 @@ pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
         run_dir: args.run_dir,
         device: args.on.device,
         restart: args.restart,
-        keep_alive: args.until.keep_alive,
+        keep_alive: args.lifetime.keep_alive,
     };
     clean_up_after(driml_learner::run(run, &shutdown))
 }

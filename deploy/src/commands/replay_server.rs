@@ -11,7 +11,7 @@ use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::{GracefulShutdown, tls::Role};
 use driml_settings::flags::{self, RunFlags};
 
-use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_after, prepare_join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
@@ -31,7 +31,7 @@ pub(crate) struct ReplayServerArgs {
     #[command(flatten)]
     pub(crate) run: RunFlags,
     #[command(flatten)]
-    pub(crate) until: KeepAliveFlag,
+    pub(crate) lifetime: KeepAliveFlag,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -55,7 +55,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         let checked = config.replay.check_in_memory("--replay-dir DIR");
         checked.map_err(|e| usage!("{e}"))?;
     }
-    let GracefulShutdown { ending, now } = join(&args.join, GracefulShutdown::on_signals)?;
+    let GracefulShutdown { ending, now } = prepare_join(&args.join, GracefulShutdown::on_signals)?;
     config.notes.iter().for_each(|it| tracing::warn!("{it}"));
     open_files::warn_of_server(&config);
     let run = driml_replay_server::RunArgs {
@@ -66,7 +66,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         shard: args.shard,
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
-        keep_alive: args.until.keep_alive,
+        keep_alive: args.lifetime.keep_alive,
         drain: ending,
         config_toml: config.to_toml(),
     };

@@ -16,7 +16,7 @@ use super::join::TlsFlags;
 /// Flags that select a run.
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("whose").required(true))]
-pub(crate) struct LookFlags {
+pub(crate) struct RunSelection {
     /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", group = "whose")]
     connect: Vec<String>,
@@ -33,7 +33,7 @@ pub(crate) struct LookFlags {
 #[derive(Debug, Args)]
 pub(crate) struct WatchArgs {
     #[command(flatten)]
-    look: LookFlags,
+    selection: RunSelection,
     #[command(flatten)]
     flags: WatchFlags,
 }
@@ -41,7 +41,7 @@ pub(crate) struct WatchArgs {
 #[derive(Debug, Args)]
 pub(crate) struct StatusArgs {
     #[command(flatten)]
-    look: LookFlags,
+    selection: RunSelection,
     /// Repeat every two seconds until the run is over or Ctrl-C
     #[arg(long)]
     pub(crate) watch: bool,
@@ -51,20 +51,20 @@ pub(crate) struct StatusArgs {
 }
 
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    watch::run(args.look.open(), &args.flags)
+    watch::run(args.selection.open(), &args.flags)
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    match args.look.open()? {
+    match args.selection.open()? {
         Ok(mut poller) => {
-            let folder = args.look.folder();
+            let folder = args.selection.folder();
             watch::look(&mut poller, folder.as_ref(), args.watch, args.json)
         }
         Err(over) => over.print(args.json),
     }
 }
 
-impl LookFlags {
+impl RunSelection {
     /// Opens a connection to the run, or returns the run's state if it cannot be asked.
     fn open(&self) -> anyhow::Result<Asked<Poller>> {
         check_endpoints(&self.connect, self.tls.is_set())?;

@@ -112,7 +112,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         let judged = shutdown.unless_set("evaluation", play);
         let judged = judged.context("starting a thread")?.ok_or(Interrupted)??;
         let earned = judged.earned.describe();
-        return print(&format!("{earned}{}\n", verdict(&judged)));
+        return print(&format!("{earned}{}\n", compare_with_best(&judged)));
     }
     let mut player = match pretrained {
         Some(player) => player,
@@ -143,8 +143,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         Levels::TrainSingle => "on the levels trained on, one an episode",
         Levels::Unseen => "on unseen levels",
     };
-    let said = |text: &str| if args.json { Ok(()) } else { print(text) };
-    said(&format!(
+    let print_text = |text: &str| if args.json { Ok(()) } else { print(text) };
+    print_text(&format!(
         "{} {on}, {} episodes each, {} {} weights after {} updates played in {}, seed {}{}\n",
         spec.world,
         args.episodes,
@@ -157,12 +157,12 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
             .map_or(String::new(), |it| format!(", epsilon {it}"))
     ))?;
     let episodes = args.episodes as usize;
-    let mut played: Vec<Played<'_>> = Vec::new();
+    let mut played: Vec<PolicyReturns<'_>> = Vec::new();
     for (who, name) in [(Who::Agent, &*spec.agent), (Who::Random, "random")] {
         let mut screen = Screen::new(episodes as u64, TEMPLATE);
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
-            film.iter_mut().for_each(|film| film.see(step));
+            film.iter_mut().for_each(|film| film.add_step(step));
             match shutdown.is_set() {
                 true => ControlFlow::Break(()),
                 false => ControlFlow::Continue(()),
@@ -176,16 +176,16 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         }
         // Only the agent is filmed.
         if let Some(film) = film.take() {
-            said(&film.finish()?)?;
+            print_text(&film.finish()?)?;
         }
-        said(&describe(name, &returns))?;
+        print_text(&describe_returns(name, &returns))?;
         played.push((name, returns));
     }
     if let Some((path, file)) = &table {
         write_returns(file, &played).with_context(|| format!("writing {}", path.display()))?;
     }
     if args.json {
-        print(&json(&player, args.levels, args.seed, &played)?)?;
+        print(&json_report(&player, args.levels, args.seed, &played)?)?;
     }
     Ok(())
 }
@@ -209,7 +209,7 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
 }
 
 /// Returns how the checkpoint compares with the run's best one, as the end of a sentence.
-fn verdict(judged: &Judged) -> String {
+fn compare_with_best(judged: &Judged) -> String {
     match &judged.best_before {
         _ if judged.is_best => ", the most so far".into(),
         Some(best) if best.episodes > judged.earned.episodes => format!(
@@ -220,15 +220,15 @@ fn verdict(judged: &Judged) -> String {
     }
 }
 
-fn describe(name: &str, returns: &[f64]) -> String {
+fn describe_returns(name: &str, returns: &[f64]) -> String {
     let (mean, deviation) = mean_and_deviation(returns);
     format!("{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n")
 }
 
 /// The name of a policy, and the returns of its episodes.
-type Played<'a> = (&'a str, Vec<f64>);
+type PolicyReturns<'a> = (&'a str, Vec<f64>);
 
-fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
+fn write_returns(mut file: &File, played: &[PolicyReturns<'_>]) -> io::Result<()> {
     let mut text = "policy,episode,return\n".to_owned();
     for (name, returns) in played {
         for (episode, value) in (1..).zip(returns) {
@@ -241,11 +241,11 @@ fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
     file.write_all(text.as_bytes())
 }
 
-fn json(
+fn json_report(
     player: &Player,
     levels: Levels,
     seed: u64,
-    played: &[Played<'_>],
+    played: &[PolicyReturns<'_>],
 ) -> anyhow::Result<String> {
     let spec = &player.config.run;
     let policies: serde_json::Map<_, _> = played
@@ -287,7 +287,7 @@ mod tests {
     #[test]
     fn progress_is_episodes_and_their_mean() {
         assert_eq!(progress("c51", &[], 100), "c51: 0 of 100 episodes");
-        let said = progress("c51", &[1.0, 2.0], 100);
-        assert_eq!(said, "c51: 2 of 100 episodes, mean return 1.500");
+        let text = progress("c51", &[1.0, 2.0], 100);
+        assert_eq!(text, "c51: 2 of 100 episodes, mean return 1.500");
     }
 }

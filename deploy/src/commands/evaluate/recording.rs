@@ -49,12 +49,12 @@ pub(crate) struct Recording {
     steps_max: u32,
     steps: u32,
     /// Steps that are not drawn yet, because local DIM compares them with later states.
-    waiting: VecDeque<Moment>,
-    failed: Option<anyhow::Error>,
+    waiting: VecDeque<FilmedStep>,
+    error: Option<anyhow::Error>,
 }
 
 /// One step of all environments.
-struct Moment {
+struct FilmedStep {
     shots: Vec<Shot>,
     seen: Option<NetworkOutputs>,
     actions: Vec<u8>,
@@ -87,7 +87,7 @@ impl Recording {
         });
         let layout = Layout::new(&player.config, envs, viewer.is_some(), local);
         let rate = player.config.world.steps_per_second();
-        let film = Film::create(path, layout.size, rate).map_err(cannot)?;
+        let film = Film::create(path, layout.size, rate).map_err(film_error)?;
         // Start as if an episode had ended before the first.
         let before = Shot {
             is_last: true,
@@ -103,94 +103,94 @@ impl Recording {
             steps_max: args.record_steps,
             steps: 0,
             waiting: VecDeque::new(),
-            failed: None,
+            error: None,
         }))
     }
 
     /// Films a step. [`finish`](Self::finish) returns the errors.
-    pub(crate) fn see(&mut self, step: &Step<'_>) {
+    pub(crate) fn add_step(&mut self, step: &Step<'_>) {
         let is_over = |shot: &Shot| shot.is_over(self.episodes_max);
-        if self.failed.is_none()
+        if self.error.is_none()
             && self.steps < self.steps_max
             && !self.shots.iter().all(is_over)
-            && let Err(e) = self.add(step)
+            && let Err(e) = self.try_add_step(step)
         {
-            self.failed = Some(e);
+            self.error = Some(e);
         }
     }
 
-    fn add(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
+    fn try_add_step(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
         let played = step.actions.len();
         let frames = step.frames.chunks_exact(step.frames.len() / played);
         let mut seen = None;
         if let Some(viewer) = &mut self.viewer {
             // Local DIM tells a state from those of all environments, not only of the filmed ones.
-            let looked_at = match self.layout.local {
+            let num_states = match self.layout.local {
                 Some(_) => played,
                 None => self.shots.len(),
             };
-            let states = &step.states[..step.states.len() / played * looked_at];
+            let states = &step.states[..step.states.len() / played * num_states];
             seen = Some(viewer.look(states)?);
         }
         for (i, (shot, frame)) in self.shots.iter_mut().zip(frames).enumerate() {
             if !shot.is_over(self.episodes_max) {
-                shot.follow(frame, step, i);
-                let look = |seen| self.layout.look(seen, i, shot.action);
-                shot.look = seen.as_ref().map(look);
+                shot.advance(frame, step, i);
+                let outputs = |seen| self.layout.outputs_of(seen, i, shot.action);
+                shot.outputs = seen.as_ref().map(outputs);
             }
         }
-        self.waiting.push_back(Moment {
+        self.waiting.push_back(FilmedStep {
             shots: self.shots.clone(),
             seen,
             actions: step.actions.to_vec(),
             ends: step.ends.to_vec(),
         });
         self.steps += 1;
-        if self.waiting.len() > self.ahead() {
+        if self.waiting.len() > self.steps_ahead() {
             self.draw_next()?;
         }
         Ok(())
     }
 
     /// Returns the number of steps from a state to the later state that local DIM is asked about; 0 without local DIM.
-    fn ahead(&self) -> usize {
+    fn steps_ahead(&self) -> usize {
         self.layout.local.as_ref().map_or(0, |it| it.k)
     }
 
-    /// Draws the oldest waiting step, with local DIM's result for the state [`ahead`](Self::ahead) of it if that was played.
+    /// Draws the oldest waiting step, with local DIM's result for the state [`Self::steps_ahead`] of it if that was played.
     fn draw_next(&mut self) -> anyhow::Result<()> {
-        let Some(moment) = self.waiting.pop_front() else {
+        let Some(filmed) = self.waiting.pop_front() else {
             return Ok(());
         };
-        let between = self.ahead().saturating_sub(1);
+        let between = self.steps_ahead().saturating_sub(1);
         let later = self.waiting.get(between).and_then(|it| it.seen.as_ref());
-        let matches = match (&self.viewer, &moment.seen, later) {
+        let matches = match (&self.viewer, &filmed.seen, later) {
             (Some(viewer), Some(now), Some(later)) => {
                 let insight = &viewer.insight;
-                insight.local_matches(now, &moment.actions, later)?
+                insight.local_matches(now, &filmed.actions, later)?
             }
             _ => None,
         };
         let (width, height) = self.layout.size;
         let mut picture = Picture::new(width, height)?;
-        for (i, shot) in moment.shots.iter().enumerate() {
+        for (i, shot) in filmed.shots.iter().enumerate() {
             // If the episode ends between a state and the later one, local DIM has nothing to recognise.
-            let mut before = self.waiting.iter().take(between).chain([&moment]);
+            let mut before = self.waiting.iter().take(between).chain([&filmed]);
             let continues = !shot.is_last && before.all(|it| it.ends[i] == StepEnd::Running);
             let matches = matches.as_deref().filter(|_| continues);
             self.layout.draw(&mut picture, i, shot, matches);
         }
-        let ended = matches!(moment.shots[..], [Shot { is_last: true, .. }]);
+        let ended = matches!(filmed.shots[..], [Shot { is_last: true, .. }]);
         self.film.add(&picture, if ended { PAUSE } else { 1.0 })?;
         Ok(())
     }
 
     /// Ends the film, and returns a sentence about its content.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
-        while self.failed.is_none() && !self.waiting.is_empty() {
-            self.failed = self.draw_next().err();
+        while self.error.is_none() && !self.waiting.is_empty() {
+            self.error = self.draw_next().err();
         }
-        let ended = match self.failed {
+        let ended = match self.error {
             Some(e) => Err(e),
             None => self.film.finish().map_err(anyhow::Error::from),
         };
@@ -206,7 +206,7 @@ impl Shot {
     }
 
     /// Updates this shot with the next step of its environment `i`.
-    fn follow(&mut self, frame: &[u8], step: &Step<'_>, i: usize) {
+    fn advance(&mut self, frame: &[u8], step: &Step<'_>, i: usize) {
         if self.is_last {
             (self.episode, self.step, self.total) = (self.episode + 1, 0, 0.0);
         } else {
@@ -221,7 +221,7 @@ impl Shot {
 }
 
 /// Reports a film that cannot be begun as a wrong flag.
-fn cannot(error: FigureError) -> Usage {
+fn film_error(error: FigureError) -> Usage {
     match &error {
         FigureError::Write { path, source } => {
             let path = path.display();

@@ -31,12 +31,12 @@ pub(super) struct Shot {
     pub(super) action: u8,
     pub(super) is_last: bool,
     /// `None` if the network is not asked.
-    pub(super) look: Option<Look>,
+    pub(super) outputs: Option<NetworkOutputs>,
 }
 
 /// The network's outputs for a state.
 #[derive(Clone, Debug)]
-pub(super) struct Look {
+pub(super) struct NetworkOutputs {
     /// Q-values [A].
     q_values: Vec<f32>,
     /// The return distribution [N] of the action that was taken.
@@ -112,10 +112,10 @@ impl Layout {
     }
 
     /// Returns the outputs in `seen` for environment `i`, in which `action` was taken.
-    pub(super) fn look(&self, seen: &NetworkOutputs, i: usize, action: u8) -> Look {
+    pub(super) fn outputs_of(&self, seen: &NetworkOutputs, i: usize, action: u8) -> NetworkOutputs {
         let (actions, atoms) = (self.action_names.len(), self.support.len());
         let taken = i * actions + usize::from(action);
-        Look {
+        NetworkOutputs {
             q_values: row_of(&seen.q_values, actions, i).to_vec(),
             probabilities: row_of(&seen.probabilities, atoms, taken).to_vec(),
         }
@@ -141,10 +141,10 @@ impl Layout {
             channels: self.frame.channels,
         };
         picture.image((x as usize, y as usize), self.zoom, image);
-        let Some(look) = &shot.look else { return };
+        let Some(outputs) = &shot.outputs else { return };
         let (frame_width, frame_height) = self.enlarged;
         let panel = Rect::new(x + frame_width + MARGIN, y, PANEL_WIDTH, tile_height);
-        self.draw_panel(picture, panel, shot, look);
+        self.draw_panel(picture, panel, shot, outputs);
         if let Some(local) = &self.local {
             let x = panel.x + PANEL_WIDTH + MARGIN;
             let map = Rect::new(x, y, frame_width, frame_height);
@@ -158,10 +158,10 @@ impl Layout {
         }
     }
 
-    fn draw_panel(&self, picture: &mut Picture, area: Rect, shot: &Shot, look: &Look) {
+    fn draw_panel(&self, picture: &mut Picture, area: Rect, shot: &Shot, outputs: &NetworkOutputs) {
         let action = usize::from(shot.action);
-        let (q, name) = (look.q_values[action], &self.action_names[action]);
-        let q_values = look.q_values.iter().copied();
+        let (q, name) = (outputs.q_values[action], &self.action_names[action]);
+        let q_values = outputs.q_values.iter().copied();
         let best = q_values.fold(f32::NEG_INFINITY, f32::max);
         let chance = if q < best { " (by chance)" } else { "" };
         let mut y = area.y + 13.0;
@@ -183,7 +183,7 @@ impl Layout {
         let top = y - 5.0;
         let bottom = area.y + area.height - LEADING;
         let bars = Rect::new(area.x, top, area.width, bottom - top);
-        let probabilities = look.probabilities.iter();
+        let probabilities = outputs.probabilities.iter();
         let most = probabilities.clone().copied();
         let most = most.fold(f32::MIN_POSITIVE, f32::max);
         let heights: Vec<_> = probabilities.map(|p| f64::from(p / most)).collect();
