@@ -38,7 +38,7 @@ pub(crate) enum Command {
     Train(train::TrainArgs),
     /// Run one actor of a run whose replay server is at ENDPOINT
     Actor(actor::ActorArgs),
-    /// Run the replay server, to which the other processes connect and which has the settings
+    /// Run the replay server, to which the other processes connect and which sends them their settings
     ReplayServer(replay_server::ReplayServerArgs),
     /// Run the learner of a run whose replay server is at ENDPOINT
     Learner(learner::LearnerArgs),
@@ -60,7 +60,7 @@ pub(crate) enum Command {
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
-    /// Measure the speed that settings give and the return that they cost
+    /// Measure how settings change speed and return
     Tradeoff(TradeoffArgs),
     /// Measure the speed of learner, policy, replay, worlds and whole runs, also beside PyTorch, Reverb and gym3
     Bench(BenchArgs),

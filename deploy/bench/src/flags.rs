@@ -85,7 +85,7 @@ pub struct BenchLearnerArgs {
     /// Measure C51 + global DIM with growing batch, observation, atoms and vectors instead
     #[arg(long)]
     pub(crate) growth: bool,
-    /// Measure GFLOP/s of convolutions and updates, and the most that the processor reaches, instead
+    /// Measure GFLOP/s of convolutions and updates, and the processor's peak, instead
     #[arg(long, conflicts_with_all = ["growth", "device"])]
     pub(crate) kernels: bool,
     #[command(flatten)]
@@ -101,7 +101,7 @@ pub struct BenchReplayArgs {
     /// Measure uniform and prioritised sampling instead, without transport
     #[arg(long, conflicts_with_all = ["replay_dir", "tls_dir", "rounds"])]
     pub(crate) sampling: bool,
-    /// Stored transitions, of 10.8 kB each, with --sampling 96 bytes each
+    /// Transitions to store: 10.8 kB each, 96 bytes with --sampling
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = whole_number::within(1_000..=100_000_000))]
     pub(crate) held: u64,
     /// Rounds per server [default: 3 with --replay-dir, else 1]

@@ -76,7 +76,7 @@ pub(crate) struct EvaluateArgs {
     pub(crate) json: bool,
     #[command(flatten)]
     pub(crate) film: RecordArgs,
-    /// End when the process that started this one, which has this number, ends
+    /// Exit when the parent process PID exits
     #[arg(long, value_name = "PID", hide = true, requires = "keep")]
     pub(crate) exit_with_parent: Option<u32>,
 }
