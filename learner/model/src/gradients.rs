@@ -20,9 +20,9 @@ thread_local! {
 }
 
 /// Restores the outer pass's sums, also if the inner pass panics.
-struct PassBelow(Option<Sums>);
+struct RestoreOuterPass(Option<Sums>);
 
-impl Drop for PassBelow {
+impl Drop for RestoreOuterPass {
     fn drop(&mut self) {
         SUMS.set(self.0.take());
     }
@@ -38,7 +38,7 @@ pub struct Backward {
 impl Backward {
     /// Runs the backward pass of `loss`, a scalar.
     pub fn of(loss: &Tensor) -> Result<Self> {
-        let _below = PassBelow(SUMS.replace(Some(Sums::new())));
+        let _restore = RestoreOuterPass(SUMS.replace(Some(Sums::new())));
         let store = loss.backward();
         let sums = SUMS.take().unwrap_or_default();
         Ok(Self {
@@ -61,21 +61,21 @@ impl Backward {
     }
 }
 
-/// Returns the gradient of `parameter` as `add` computes it. `None` if none is wanted, or if [`add_in_place`] added it to a sum.
-pub(crate) fn summed(
+/// Returns the gradient of `parameter` as `add` computes it. `None` if none is wanted, or if [`try_add_in_place`] added it to a sum.
+pub(crate) fn accumulate(
     parameter: &Tensor,
     add: impl Fn(Option<Vec<f32>>) -> Vec<f32>,
 ) -> Option<Vec<f32>> {
-    let is_wanted = parameter.track_op() && !add_in_place(parameter, &add);
+    let is_wanted = parameter.track_op() && !try_add_in_place(parameter, &add);
     is_wanted.then(|| add(None))
 }
 
 /// Adds to the gradient of `parameter`. Does nothing if it is not a variable. Fails if [`Backward::of`] does not run this pass.
-pub(crate) fn sum_in_place(
+pub(crate) fn accumulate_in_place(
     parameter: &Tensor,
     add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
 ) -> Result<()> {
-    if parameter.is_variable() && !add_in_place(parameter, add) {
+    if parameter.is_variable() && !try_add_in_place(parameter, add) {
         bail!("a backward pass through these layers has to be one of Backward::of");
     }
     Ok(())
@@ -84,13 +84,13 @@ pub(crate) fn sum_in_place(
 /// Adds to the gradient of `parameter` in place if it is a variable and [`Backward::of`] runs this pass. Returns whether it did.
 ///
 /// `add` receives the sum so far, in the parameter's layout, and returns the sum including the new gradient.
-fn add_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> bool {
+fn try_add_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> bool {
     if !parameter.is_variable() {
         return false;
     }
-    let kept = SUMS.with_borrow_mut(|sums| Some(sums.as_mut()?.remove(&parameter.id())));
-    let Some(kept) = kept else { return false };
-    let sum = add(kept);
+    let so_far = SUMS.with_borrow_mut(|sums| Some(sums.as_mut()?.remove(&parameter.id())));
+    let Some(so_far) = so_far else { return false };
+    let sum = add(so_far);
     SUMS.with_borrow_mut(|sums| {
         if let Some(sums) = sums {
             sums.insert(parameter.id(), sum);

@@ -180,10 +180,8 @@ impl Enlarge {
             self.input_bytes(),
             self.output_bytes()
         );
-        let (source_line, line) = (
-            self.from.1 * self.channels,
-            self.source_cols.len() * self.channels,
-        );
+        let source_line = self.from.1 * self.channels;
+        let line = self.source_cols.len() * self.channels;
         let images = images.chunks_exact(self.input_bytes());
         for (image, enlarged) in images.zip(enlarged.chunks_exact_mut(self.output_bytes())) {
             let mut previous: Option<usize> = None;

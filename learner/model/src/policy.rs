@@ -15,7 +15,7 @@ use crate::heads::acting::merged;
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::HeadLayer;
-use crate::kernels::dense::{ActiveLayer, active_layer};
+use crate::kernels::dense::{ReluLayer, build_relu_layer};
 use crate::kernels::precision::Precision;
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
@@ -70,7 +70,7 @@ impl PolicyNetwork {
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         let weights = &mut self.weights;
         if let Some(noisy) = &weights.noisy {
-            weights.head = active_layer(self.precision, merged(noisy, noise));
+            weights.head = build_relu_layer(self.precision, merged(noisy, noise));
         }
     }
 
@@ -93,7 +93,7 @@ impl PolicyNetwork {
             let frames = frames.chunks(TILE_FRAMES * frame_len);
             for (frames, values) in frames.zip(values.chunks_mut(TILE_FRAMES * actions)) {
                 let hidden = weights.torso.f4(frames);
-                let logits = weights.head.forward_active(&hidden);
+                let logits = weights.head.forward_relu(&hidden);
                 expected_returns(&logits, support, values);
             }
         };
@@ -152,7 +152,7 @@ pub fn greedy(values: &[f32]) -> u8 {
 /// Weights laid out for the fastest instruction set of this processor.
 struct Weights {
     torso: Box<dyn ActingTorso>,
-    head: Box<dyn ActiveLayer>,
+    head: Box<dyn ReluLayer>,
     /// The layers that `head` is merged from, kept to merge them with new noise. `Some` if the head is noisy.
     noisy: Option<Vec<HeadLayer<Vec<f32>>>>,
 }
@@ -172,7 +172,7 @@ impl Weights {
         let Ok(of_head) = HeadLayer::all(config, take);
         Ok(Self {
             torso: torso.acting(precision, of_torso),
-            head: active_layer(precision, merged(&of_head, None)),
+            head: build_relu_layer(precision, merged(&of_head, None)),
             noisy: config.head.noisy_sigma.map(|_| of_head),
         })
     }

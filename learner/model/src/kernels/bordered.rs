@@ -6,20 +6,20 @@ use crate::kernels::buffer::{ALIGNMENT, Buffer};
 use crate::kernels::convolution::{
     Convolution, add_locations, gradient_panels, multiply_windows, weight_gradient,
 };
-use crate::kernels::images::{Images, Room};
+use crate::kernels::images::{Images, ScratchBuffer};
 use crate::kernels::isa::{Element, Mode, Simd, vectorized};
-use crate::kernels::linear::relu_of;
+use crate::kernels::linear::relu_scalar;
 use crate::kernels::rounding::{store, store_bytes};
 
 /// The content that is written inside a border.
 #[derive(Clone, Copy)]
-pub(crate) enum Inside<'a> {
+pub(crate) enum Interior<'a> {
     /// Pixels. Products with them are scaled afterwards, by `Element::BYTE_SCALE`.
     Bytes(&'a [u8]),
     /// Maps, unchanged.
     Maps(&'a [f32]),
     /// max(x, 0) of maps.
-    Active(&'a [f32]),
+    Relu(&'a [f32]),
 }
 
 /// Methods of shapes from [`ConvShape::bordered`]: the input in memory, with a border of zeros one pixel wide.
@@ -32,31 +32,36 @@ impl ConvShape {
     }
 
     /// Returns the range of row `y` of the maps inside the border.
-    pub(crate) const fn inside(&self, y: usize) -> std::ops::Range<usize> {
+    pub(crate) const fn interior_row(&self, y: usize) -> std::ops::Range<usize> {
         let start = ((y + 1) * self.width + 1) * self.channels_in;
         start..start + (self.width - 2) * self.channels_in
     }
 
     /// Writes the zeros of the border.
-    pub(crate) fn clear_border<E: Element>(&self, room: &mut [E]) {
+    pub(crate) fn clear_border<E: Element>(&self, image: &mut [E]) {
         let mut end = 0;
         for y in 0..self.height - 2 {
-            room[end..self.inside(y).start].fill(E::default());
-            end = self.inside(y).end;
+            image[end..self.interior_row(y).start].fill(E::default());
+            end = self.interior_row(y).end;
         }
-        room[end..].fill(E::default());
+        image[end..].fill(E::default());
     }
 
-    /// Writes the zeros of the border, and `inside` between them.
-    pub(crate) fn put_inside<S: Simd>(&self, simd: S, inside: Inside<'_>, room: &mut [S::Element]) {
-        self.clear_border(room);
+    /// Writes the zeros of the border, and `content` between them.
+    pub(crate) fn write_interior<S: Simd>(
+        &self,
+        simd: S,
+        content: Interior<'_>,
+        image: &mut [S::Element],
+    ) {
+        self.clear_border(image);
         let len = (self.width - 2) * self.channels_in;
         for y in 0..self.height - 2 {
-            let (from, to) = (y * len..(y + 1) * len, &mut room[self.inside(y)]);
-            match inside {
-                Inside::Bytes(bytes) => store_bytes(simd, &bytes[from], to),
-                Inside::Maps(maps) => store(simd, &maps[from], to),
-                Inside::Active(maps) => store_active(simd, &maps[from], to),
+            let (from, to) = (y * len..(y + 1) * len, &mut image[self.interior_row(y)]);
+            match content {
+                Interior::Bytes(bytes) => store_bytes(simd, &bytes[from], to),
+                Interior::Maps(maps) => store(simd, &maps[from], to),
+                Interior::Relu(maps) => store_relu(simd, &maps[from], to),
             }
         }
     }
@@ -64,9 +69,9 @@ impl ConvShape {
 
 vectorized! {
     /// Rounds max(x, 0) of `floats` into `values`, which has the same length.
-    pub(crate) fn store_active<S, M>(simd, floats: &'a [f32], values: &'a mut [M]) {
+    pub(crate) fn store_relu<S, M>(simd, floats: &'a [f32], values: &'a mut [M]) {
         for (value, &float) in values.iter_mut().zip(floats) {
-            *value = M::of(relu_of(float));
+            *value = M::rounded(relu_scalar(float));
         }
     }
 }
@@ -88,18 +93,18 @@ impl<E: Element> BorderedConvolution<E> {
         bias: &[f32],
         backward: bool,
     ) -> Self {
-        let turned = backward.then(|| {
-            let of = ConvShape {
+        let rotated = backward.then(|| {
+            let swapped = ConvShape {
                 channels_in: shape.channels_out,
                 channels_out: shape.channels_in,
                 ..shape
             };
             let bias = vec![0.0; shape.channels_in];
-            Convolution::new(simd, of, &turned(&shape, weight), &bias, false)
+            Convolution::new(simd, swapped, &rotated_weight(&shape, weight), &bias, false)
         });
         Self {
             forward: Convolution::new(simd, shape, weight, bias, false),
-            backward: turned,
+            backward: rotated,
         }
     }
 
@@ -134,12 +139,12 @@ impl<E: Element> BorderedConvolution<E> {
     ) {
         let backward = self.backward.as_ref();
         let backward = backward.expect("a convolution whose input has a gradient is made for it");
-        let mut room = Buffer::new(backward.shape.bordered_len::<E>());
+        let mut image = Buffer::new(backward.shape.bordered_len::<E>());
         backward
             .shape
-            .put_inside(simd, Inside::Maps(grad_map), &mut room);
+            .write_interior(simd, Interior::Maps(grad_map), &mut image);
         let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_in);
-        multiply_windows(simd, backward, &room, &mut row, then);
+        multiply_windows(simd, backward, &image, &mut row, then);
     }
 
     /// Adds the gradients of weight [3, 3, in, out] and bias [out] for an image with its border and the
@@ -152,23 +157,24 @@ impl<E: Element> BorderedConvolution<E> {
         [weight, bias]: [&mut [f32]; 2],
     ) {
         let shape = self.shape();
-        let (len, shift) = (shape.image_len(), shape.shift());
-        let (mut rooms, mut panels) = ([Room::new(), Room::new()], gradient_panels(simd, shape));
+        let (len, shift) = (shape.image_len(), shape.window_stride());
+        let mut scratch = [const { ScratchBuffer::new() }; 2];
+        let mut panels = gradient_panels(simd, shape);
         let images = Images::Maps(&image[..len]);
-        let steps = images.steps(simd, 0, (len, shift), &mut rooms);
+        let steps = images.steps(simd, 0, (len, shift), &mut scratch);
         weight_gradient(simd, shape, steps, grad_map, &mut panels, weight, Mode::Add);
         add_locations(simd, grad_map, bias);
     }
 }
 
 /// Reorders `weight` [out, in, 3, 3] to [in, out, 3, 3] and rotates each kernel by 180 degrees.
-fn turned(shape: &ConvShape, weight: &[f32]) -> Vec<f32> {
+fn rotated_weight(shape: &ConvShape, weight: &[f32]) -> Vec<f32> {
     let (inputs, taps) = (shape.channels_in, shape.kernel * shape.kernel);
-    let mut turned = Vec::with_capacity(weight.len());
+    let mut rotated = Vec::with_capacity(weight.len());
     for input in 0..inputs {
         for kernels in weight.chunks_exact(inputs * taps) {
-            turned.extend(kernels[input * taps..][..taps].iter().rev());
+            rotated.extend(kernels[input * taps..][..taps].iter().rev());
         }
     }
-    turned
+    rotated
 }

@@ -9,7 +9,7 @@ use half::bf16;
 /// Alignment of a buffer in bytes: one cache line. AMX takes six times as long for rows that cross cache lines.
 pub(crate) const ALIGNMENT: usize = 64;
 /// Largest number of free buffers in each type's pool. Beyond it, the smallest one returns to the allocator.
-const KEPT_MAX: usize = 1024;
+const POOL_LEN_MAX: usize = 1024;
 
 /// A scalar type with a buffer pool.
 pub(crate) trait Pooled: Copy + Default + 'static {
@@ -41,13 +41,13 @@ pub(crate) struct Buffer<T: Pooled> {
 impl<T: Pooled> Buffer<T> {
     /// Takes a buffer of `len` scalars with arbitrary old content.
     pub(crate) fn new(len: usize) -> Self {
-        let most = len + ALIGNMENT / size_of::<T>();
+        let min_len = len + ALIGNMENT / size_of::<T>();
         let mut pool = T::pool().lock().unwrap_or_else(PoisonError::into_inner);
-        let fitting = pool.partition_point(|memory| memory.len() < most);
-        let memory = (fitting < pool.len()).then(|| pool.remove(fitting));
+        let index = pool.partition_point(|memory| memory.len() < min_len);
+        let memory = (index < pool.len()).then(|| pool.remove(index));
         drop(pool);
         // A little larger than requested, so that it also serves slightly longer requests.
-        let memory = memory.unwrap_or_else(|| vec![T::default(); most + len / 8]);
+        let memory = memory.unwrap_or_else(|| vec![T::default(); min_len + len / 8]);
         let start = memory.as_ptr().align_offset(ALIGNMENT);
         Self { memory, start, len }
     }
@@ -78,9 +78,9 @@ impl<T: Pooled> Drop for Buffer<T> {
     fn drop(&mut self) {
         let memory = std::mem::take(&mut self.memory);
         let mut pool = T::pool().lock().unwrap_or_else(PoisonError::into_inner);
-        let place = pool.partition_point(|kept| kept.len() < memory.len());
-        pool.insert(place, memory);
-        if pool.len() > KEPT_MAX {
+        let index = pool.partition_point(|free| free.len() < memory.len());
+        pool.insert(index, memory);
+        if pool.len() > POOL_LEN_MAX {
             // The smallest is the cheapest to allocate again.
             drop(pool.remove(0));
         }

@@ -16,7 +16,7 @@ pub(crate) type BorderedTensors<'a> = (&'a Tensor, &'a Tensor);
 
 /// As `conv::conv_stack`: images [B, H, W, C] to maps [B, h, w, c].
 pub(crate) fn conv_stack(images: &Tensor, layers: &[ConvLayerTensors<'_>]) -> Result<Tensor> {
-    let mut maps = scaled(images)?;
+    let mut maps = scale_pixels(images)?;
     for &(weight, bias, stride) in layers {
         maps = relu(&conv2d(&maps, weight, bias, stride)?)?;
     }
@@ -24,7 +24,7 @@ pub(crate) fn conv_stack(images: &Tensor, layers: &[ConvLayerTensors<'_>]) -> Re
 }
 
 /// Scales bytes to floats from 0 to 1, and returns floats unchanged.
-fn scaled(images: &Tensor) -> Result<Tensor> {
+fn scale_pixels(images: &Tensor) -> Result<Tensor> {
     match images.dtype() {
         DType::U8 => images.to_dtype(DType::F32)?.affine(1.0 / 255.0, 0.0),
         _ => Ok(images.clone()),
@@ -33,19 +33,19 @@ fn scaled(images: &Tensor) -> Result<Tensor> {
 
 /// As `impala::residual_stages`: images [B, H, W, C] to f3 [B, h, w, c].
 pub(crate) fn residual_stages(images: &Tensor, layers: &[BorderedTensors<'_>]) -> Result<Tensor> {
-    let mut x = scaled(images)?;
+    let mut x = scale_pixels(images)?;
     for stage in layers.chunks_exact(STAGE_CONVOLUTIONS) {
-        x = max_pool(&bordered(&x, stage[0])?)?;
+        x = max_pool(&padded_conv2d(&x, stage[0])?)?;
         for block in stage[1..].chunks_exact(2) {
-            let inner = bordered(&relu(&x)?, block[0])?;
-            x = (x + bordered(&relu(&inner)?, block[1])?)?;
+            let inner = padded_conv2d(&relu(&x)?, block[0])?;
+            x = (x + padded_conv2d(&relu(&inner)?, block[1])?)?;
         }
     }
     relu(&x)
 }
 
 /// A 3 x 3 convolution of images [B, H, W, in] with zero padding, without ReLU.
-fn bordered(images: &Tensor, (weight, bias): BorderedTensors<'_>) -> Result<Tensor> {
+fn padded_conv2d(images: &Tensor, (weight, bias): BorderedTensors<'_>) -> Result<Tensor> {
     let images = images.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
     conv2d(&images, weight, bias, 1)
 }
@@ -120,8 +120,8 @@ pub(crate) fn grouped_linear(
 
 /// max(x, 0). Its gradient at exactly 0 is 0, unlike that of candle's `relu`. It keeps NaN.
 pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
-    let above = x.gt(0f32)?.to_dtype(x.dtype())?.detach();
-    x * above
+    let is_positive = x.gt(0f32)?.to_dtype(x.dtype())?.detach();
+    x * is_positive
 }
 
 /// As `dots::dot_products`: psi and phi [B, L, R] or [B, R] to [L, B, B].
@@ -140,10 +140,10 @@ fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Res
     let (outputs, _, kernel, _) = weight.dims4()?;
     if !kernel.is_multiple_of(stride) {
         // candle's backward pass computes the covered width from the height, so uncovered pixels are cut off first.
-        let reached = |side: usize| (side - kernel) / stride * stride + kernel;
+        let covered = |side: usize| (side - kernel) / stride * stride + kernel;
         let maps = images
-            .narrow(1, 0, reached(height))?
-            .narrow(2, 0, reached(width))?
+            .narrow(1, 0, covered(height))?
+            .narrow(2, 0, covered(width))?
             .permute((0, 3, 1, 2))?
             .contiguous()?
             .conv2d(weight, 0, stride, 1, 1)?
@@ -153,7 +153,7 @@ fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Res
     let out = |side: usize| (side - kernel) / stride + 1;
     let (rows, cols) = (out(height), out(width));
     let patches = patches(images, (rows, cols), kernel / stride, stride)?;
-    linear(&patches, &as_patches(weight, stride)?, bias)?.reshape((batch, rows, cols, outputs))
+    linear(&patches, &patch_weight(weight, stride)?, bias)?.reshape((batch, rows, cols, outputs))
 }
 
 /// Returns the patches [B * h * w, k * k * c] under each output of a convolution whose kernel is `blocks` strides wide.
@@ -187,7 +187,7 @@ fn patches(
 }
 
 /// Reorders a kernel [out, in, k, k] to a matrix [out, k * k * in], in the order of [`patches`].
-fn as_patches(weight: &Tensor, stride: usize) -> Result<Tensor> {
+fn patch_weight(weight: &Tensor, stride: usize) -> Result<Tensor> {
     let (outputs, inputs, kernel, _) = weight.dims4()?;
     let blocks = kernel / stride;
     weight

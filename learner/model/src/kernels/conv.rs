@@ -10,11 +10,11 @@ use candle_core::{DType, Result, Tensor, bail};
 use crate::geometry::{ConvLayer, ConvShape};
 use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
-use crate::kernels::operation::{Operation, apply_to_two};
+use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::{SavedActivations, Stack};
 use crate::kernels::tasks::Tasks;
-use crate::kernels::tensors::{Input, cpu, values_of};
+use crate::kernels::tensors::{Input, cpu_storage, values_of};
 
 /// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
 const TASK_IMAGES: usize = 16;
@@ -45,17 +45,17 @@ pub fn conv_stack(
     layers: &[ConvLayerTensors<'_>],
     precision: Precision,
 ) -> Result<Tensor> {
-    let (shapes, parameters) = stack_of(images, layers)?;
+    let (shapes, parameters) = flatten_layers(images, layers)?;
     let count = images.dim(0)?;
     let (height, width, channels) = shapes[shapes.len() - 1].output();
-    with_simd!(AnySimd::of(precision), simd => {
+    with_simd!(AnySimd::fastest(precision), simd => {
         let stack = ConvStack { simd, shapes, count };
-        apply_to_two(stack, [images, &parameters], (count, height, width, channels))
+        apply_op2(stack, [images, &parameters], (count, height, width, channels))
     })
 }
 
 /// Returns the shapes of `layers` on `images`, and all parameters as one vector, because an operation has at most three arguments.
-pub(crate) fn stack_of(
+pub(crate) fn flatten_layers(
     images: &Tensor,
     layers: &[ConvLayerTensors<'_>],
 ) -> Result<(Vec<ConvShape>, Tensor)> {
@@ -94,13 +94,13 @@ pub(crate) struct ConvStack<S: Simd> {
 }
 
 impl<S: Simd> ConvStack<S> {
-    pub(crate) fn last(&self) -> &ConvShape {
+    pub(crate) fn last_shape(&self) -> &ConvShape {
         &self.shapes[self.shapes.len() - 1]
     }
 
-    /// Prepares the layers of `parameters` for a forward pass, or for a `backward` pass. `images` says whether the images need a gradient.
-    pub(crate) fn layers(&self, parameters: &[f32], backward: bool, images: bool) -> Stack<S> {
-        Stack::new(self.simd, &self.shapes, parameters, backward, images)
+    /// Prepares the layers of `parameters` for a forward pass, or for a `backward` pass. `image_grad` says whether the images need a gradient.
+    pub(crate) fn prepare(&self, parameters: &[f32], backward: bool, image_grad: bool) -> Stack<S> {
+        Stack::new(self.simd, &self.shapes, parameters, backward, image_grad)
     }
 
     pub(crate) fn tasks(&self) -> Tasks {
@@ -108,7 +108,7 @@ impl<S: Simd> ConvStack<S> {
             count: self.count,
             images: TASK_IMAGES,
             image_len: self.shapes[0].image_len(),
-            map_len: self.last().map_len(),
+            map_len: self.last_shape().map_len(),
         }
     }
 }
@@ -117,37 +117,37 @@ impl<S: Simd> Operation<2> for ConvStack<S> {
     const NAME: &'static str = "conv-stack";
 
     /// The maps of all layers but the last, for each task.
-    type Kept = Vec<SavedActivations<S::Element>>;
+    type Saved = Vec<SavedActivations<S::Element>>;
 
-    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
+    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Saved)> {
         let images = images.pixels()?;
-        let layers = self.layers(parameters.floats()?, false, false);
-        let mut maps = vec![0.0; self.count * self.last().map_len()];
-        let of_task = |task, maps: &mut [f32]| layers.forward(images.slice(task), maps);
-        let saved = self.tasks().forward(&mut maps, of_task);
+        let layers = self.prepare(parameters.floats()?, false, false);
+        let mut maps = vec![0.0; self.count * self.last_shape().map_len()];
+        let run_task = |task, maps: &mut [f32]| layers.forward(images.slice(task), maps);
+        let saved = self.tasks().forward(&mut maps, run_task);
         Ok((maps, saved))
     }
 
     fn backward(
         &self,
         [images, parameters]: [&Tensor; 2],
-        saved: &Self::Kept,
+        saved: &Self::Saved,
         maps: &Tensor,
         grad_maps: &[f32],
     ) -> Result<[Option<Vec<f32>>; 2]> {
         let maps = values_of(maps)?;
         let maps = &maps[..];
-        let wanted = images.dtype() == DType::F32 && images.track_op();
+        let image_grad = images.dtype() == DType::F32 && images.track_op();
         let (storage, layout) = images.storage_and_layout();
-        let images = Input::new(cpu(&storage)?, layout).pixels()?;
-        let layers = self.layers(&values_of(parameters)?, true, wanted);
-        let mut grad_images = vec![0.0; if wanted { images.len() } else { 0 }];
-        let (tasks, room) = (self.tasks(), &mut grad_images);
-        let gradient = tasks.backward(&self.shapes, saved, room, |task, saved, to| {
+        let images = Input::new(cpu_storage(&storage)?, layout).pixels()?;
+        let layers = self.prepare(&values_of(parameters)?, true, image_grad);
+        let mut grad_images = vec![0.0; if image_grad { images.len() } else { 0 }];
+        let tasks = self.tasks();
+        let gradient = tasks.backward(&self.shapes, saved, &mut grad_images, |task, saved, to| {
             let (maps, grad_maps) = (&maps[task.maps.clone()], &grad_maps[task.maps]);
             let images = images.slice(task.images);
             layers.backward(images, saved, maps, grad_maps, to)
         });
-        Ok([wanted.then_some(grad_images), Some(gradient)])
+        Ok([image_grad.then_some(grad_images), Some(gradient)])
     }
 }

@@ -7,25 +7,25 @@
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::images::{Images, Room};
-use crate::kernels::isa::{Element, LANES, Left, Mode, Simd, row_tiles, vectorized};
-use crate::kernels::linear::{relu_gradient, relu_of};
+use crate::kernels::images::{Images, ScratchBuffer};
+use crate::kernels::isa::{Element, LANES, LeftOperand, Mode, Simd, row_tiles, vectorized};
+use crate::kernels::linear::{relu_gradient, relu_scalar};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::rounding::write_rows;
 
 impl ConvShape {
     /// Scalars in a row of an image.
-    fn line(&self) -> usize {
+    fn line_len(&self) -> usize {
         self.width * self.channels_in
     }
 
     /// Scalars in a row of a window.
-    fn run(&self) -> usize {
+    fn run_len(&self) -> usize {
         self.kernel * self.channels_in
     }
 
     /// Scalars from a window to its neighbour on the right.
-    pub(crate) fn shift(&self) -> usize {
+    pub(crate) fn window_stride(&self) -> usize {
         self.stride * self.channels_in
     }
 
@@ -78,7 +78,7 @@ impl<E: Element> Convolution<E> {
         bias: &[f32],
         backward: bool,
     ) -> Self {
-        let (run, out) = (shape.run(), shape.channels_out);
+        let (run, out) = (shape.run_len(), shape.channels_out);
         let packed = shape.pack_weight(weight);
         let mut forward = Panels::new(simd, shape.kernel * run.div_ceil(E::DEPTH), out);
         let matrix = Matrix::new(&packed, shape.kernel * run, out);
@@ -106,15 +106,15 @@ pub(crate) fn forward<S: Simd, M: Element>(
 ) {
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
-    let (mut room, mut row) = (Room::new(), Buffer::new(out_width * out));
+    let (mut scratch, mut row) = (ScratchBuffer::new(), Buffer::new(out_width * out));
     // If a run is odd, the last step of the last window reads one scalar beyond the image and multiplies it by 0.
-    let len = (shape.image_len(), shape.run() % S::Element::DEPTH);
+    let len = (shape.image_len(), shape.run_len() % S::Element::DEPTH);
     for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
-        let image = images.image(simd, index, len, &mut room);
+        let image = images.image(simd, index, len, &mut scratch);
         let mut lines = maps.chunks_exact_mut(out_width * out);
         multiply_windows(simd, layer, image, &mut row, |_, row| {
             if let Some(maps) = lines.next() {
-                finish_row(simd, row, &layer.bias, images.scale(), maps);
+                store_relu_row(simd, row, &layer.bias, images.scale(), maps);
             }
         });
     }
@@ -133,13 +133,13 @@ pub(crate) fn multiply_windows<S: Simd>(
     let shape = &layer.shape;
     for y in 0..shape.out_height() {
         for (x, windows) in row_tiles::<S>(shape.out_width(), layer.forward.vecs()) {
-            let left = Left {
+            let left = LeftOperand {
                 values: image,
-                start: y * shape.stride * shape.line() + x * shape.shift(),
-                row_stride: shape.shift(),
-                step: S::Element::DEPTH,
-                steps: shape.run().div_ceil(S::Element::DEPTH),
-                run_stride: shape.line(),
+                start: y * shape.stride * shape.line_len() + x * shape.window_stride(),
+                row_stride: shape.window_stride(),
+                step_stride: S::Element::DEPTH,
+                steps: shape.run_len().div_ceil(S::Element::DEPTH),
+                run_stride: shape.line_len(),
                 runs: shape.kernel,
             };
             let out = shape.channels_out;
@@ -153,7 +153,7 @@ pub(crate) fn multiply_windows<S: Simd>(
 
 vectorized! {
     /// Computes relu(scale * row + bias) in place, and stores it in `maps`, rounded.
-    pub(crate) fn finish_row<S, M>(
+    pub(crate) fn store_relu_row<S, M>(
         simd,
         row: &'a mut [f32],
         bias: &'a [f32],
@@ -161,7 +161,7 @@ vectorized! {
         maps: &'a mut [M],
     ) {
         for (value, &bias) in row.iter_mut().zip(bias) {
-            *value = relu_of(*value * scale + bias);
+            *value = relu_scalar(*value * scale + bias);
         }
         M::store(simd, row, maps);
     }
@@ -185,15 +185,16 @@ pub(crate) fn backward<S: Simd, M: Element>(
     let mut masked = Buffer::<f32>::new(map_len);
     let stride = out.next_multiple_of(S::Element::DEPTH);
     let mut rows = Buffer::<S::Element>::new(shape.locations() * stride);
-    let (mut panels, mut rooms) = (gradient_panels(simd, shape), [Room::new(), Room::new()]);
+    let mut panels = gradient_panels(simd, shape);
+    let mut scratch = [const { ScratchBuffer::new() }; 2];
     bias.fill(0.0);
     let each = maps
         .chunks_exact(map_len)
         .zip(grad_maps.chunks_exact(map_len));
     for (image, (maps, grad_maps)) in each.enumerate() {
-        pass_active(simd, maps, grad_maps, &mut masked);
+        relu_backward(simd, maps, grad_maps, &mut masked);
         add_locations(simd, &masked, bias);
-        let steps = images.steps(simd, image, (len, shape.shift()), &mut rooms);
+        let steps = images.steps(simd, image, (len, shape.window_stride()), &mut scratch);
         let mode = if image == 0 { Mode::Replace } else { Mode::Add };
         weight_gradient(simd, shape, steps, &masked, &mut panels, packed, mode);
         if let Some(grad_images) = &mut grad_images {
@@ -206,7 +207,7 @@ pub(crate) fn backward<S: Simd, M: Element>(
 
 vectorized! {
     /// Computes the gradients before a ReLU whose output was `active`.
-    pub(crate) fn pass_active<S, M>(simd, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
+    pub(crate) fn relu_backward<S, M>(simd, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, active), &grad) in to.iter_mut().zip(active).zip(grads) {
             *to = relu_gradient(active.value(), grad);
         }
@@ -261,15 +262,15 @@ pub(crate) fn weight_gradient<S: Simd>(
     let gradients = Matrix::new(grad_map, shape.locations(), out);
     panels.fill(simd, gradients, shape.out_width(), Threads::Caller);
     for kernel_y in 0..shape.kernel {
-        let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];
-        for (first, count) in row_tiles::<S>(shape.run(), panels.vecs()) {
-            let left = Left {
+        let rows = &mut packed[kernel_y * shape.run_len() * out..][..shape.run_len() * out];
+        for (first, count) in row_tiles::<S>(shape.run_len(), panels.vecs()) {
+            let left = LeftOperand {
                 values: image,
-                start: (kernel_y * shape.line() + first) * depth,
+                start: (kernel_y * shape.line_len() + first) * depth,
                 row_stride: depth,
-                step: depth * depth * shape.shift(),
+                step_stride: depth * depth * shape.window_stride(),
                 steps: shape.out_width().div_ceil(depth),
-                run_stride: shape.stride * shape.line() * depth,
+                run_stride: shape.stride * shape.line_len() * depth,
                 runs: shape.out_height(),
             };
             panels.multiply(simd, count, left, mode, &mut rows[first * out..], out);
@@ -286,17 +287,17 @@ fn image_gradient<S: Simd>(
 ) {
     let shape = &layer.shape;
     let stride = shape.channels_out.next_multiple_of(S::Element::DEPTH);
-    let left = Left::rows(grad_rows, stride);
+    let left = LeftOperand::rows(grad_rows, stride);
     for y in 0..shape.out_height() {
         for (kernel_y, panels) in layer.backward.iter().enumerate() {
-            let line = (y * shape.stride + kernel_y) * shape.line();
+            let line = (y * shape.stride + kernel_y) * shape.line_len();
             for (x, windows) in row_tiles::<S>(shape.out_width(), panels.vecs()) {
-                let left = Left {
+                let left = LeftOperand {
                     start: (y * shape.out_width() + x) * stride,
                     ..left
                 };
-                let out = &mut image[line + x * shape.shift()..];
-                panels.multiply(simd, windows, left, Mode::Add, out, shape.shift());
+                let out = &mut image[line + x * shape.window_stride()..];
+                panels.multiply(simd, windows, left, Mode::Add, out, shape.window_stride());
             }
         }
     }

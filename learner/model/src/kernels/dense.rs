@@ -1,9 +1,9 @@
 //! A fully connected layer for an actor: on slices, on the calling thread.
 //! It has no gradient; `linear` has one.
 
-use crate::kernels::bordered::store_active;
+use crate::kernels::bordered::store_relu;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::isa::{AnySimd, Element, Left, Mode, Simd, with_simd};
+use crate::kernels::isa::{AnySimd, Element, LeftOperand, Mode, Simd, with_simd};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::precision::Precision;
 use crate::layers::Layer;
@@ -16,24 +16,24 @@ pub(crate) struct Dense<S: Simd> {
 }
 
 /// A fully connected layer after a ReLU, for any instruction set.
-pub(crate) trait ActiveLayer: Send + Sync {
+pub(crate) trait ReluLayer: Send + Sync {
     /// Computes [n, out] from relu(`hidden`) [n, in].
-    fn forward_active(&self, hidden: &[f32]) -> Buffer<f32>;
+    fn forward_relu(&self, hidden: &[f32]) -> Buffer<f32>;
 }
 
 /// Builds the layer for the fastest instruction set of this processor.
-pub(crate) fn active_layer(
+pub(crate) fn build_relu_layer(
     precision: Precision,
     Layer { weight, bias }: Layer<Vec<f32>>,
-) -> Box<dyn ActiveLayer> {
-    with_simd!(AnySimd::of(precision), simd => Box::new(Dense::new(simd, &weight, bias)))
+) -> Box<dyn ReluLayer> {
+    with_simd!(AnySimd::fastest(precision), simd => Box::new(Dense::new(simd, &weight, bias)))
 }
 
-impl<S: Simd> ActiveLayer for Dense<S> {
-    fn forward_active(&self, hidden: &[f32]) -> Buffer<f32> {
+impl<S: Simd> ReluLayer for Dense<S> {
+    fn forward_relu(&self, hidden: &[f32]) -> Buffer<f32> {
         let count = hidden.len() / self.inputs;
         let mut active = Buffer::<S::Element>::new(count * self.row_len());
-        activate(self.simd, hidden, self.inputs, &mut active);
+        write_relu_rows(self.simd, hidden, self.inputs, &mut active);
         self.forward(&active, count)
     }
 }
@@ -53,7 +53,7 @@ impl<S: Simd> Dense<S> {
 
     /// Builds a layer of `weight` [out, in] and `bias` [out] on maps of `channels`. The layer reads inputs in
     /// the order row, column, channel; PyTorch's weight has channel, row, column.
-    pub(crate) fn of_maps(simd: S, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
+    pub(crate) fn for_maps(simd: S, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
         let inputs = weight.len() / bias.len();
         let locations = inputs / channels;
         let mut by_location = Vec::with_capacity(weight.len());
@@ -80,7 +80,7 @@ impl<S: Simd> Dense<S> {
         for row in y.chunks_exact_mut(outputs) {
             row.copy_from_slice(&self.bias);
         }
-        let left = Left::rows(x, self.row_len());
+        let left = LeftOperand::rows(x, self.row_len());
         self.weight
             .multiply_rows(simd, count, left, Mode::Add, &mut y, outputs);
         y
@@ -88,7 +88,7 @@ impl<S: Simd> Dense<S> {
 }
 
 /// Pads rows of `len` scalars with zeros to whole steps of `DEPTH`.
-pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
+pub(crate) fn pad_rows<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
     let stride = len.next_multiple_of(E::DEPTH);
     if stride == len {
         return rows;
@@ -102,11 +102,11 @@ pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> 
 }
 
 /// Writes relu(`hidden`) [rows, cols] into rows padded to whole steps of `DEPTH`.
-fn activate<S: Simd>(simd: S, hidden: &[f32], cols: usize, active: &mut [S::Element]) {
+fn write_relu_rows<S: Simd>(simd: S, hidden: &[f32], cols: usize, active: &mut [S::Element]) {
     let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
     for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
         let (begin, end) = row.split_at_mut(cols);
-        store_active(simd, hidden, begin);
+        store_relu(simd, hidden, begin);
         end.fill(S::Element::default());
     }
 }

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::kernels::buffer::{Buffer, Scalars};
 use crate::kernels::isa::Mode;
-use crate::kernels::operation::{Operation, apply_to_two};
+use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
@@ -28,10 +28,10 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
         bail!("dot products of {:?} and {:?}", psi.shape(), phi.shape());
     };
     let locations = anchors.1.max(candidates.1);
-    let meets = |own: usize| own == locations || own == 1;
+    let broadcasts = |own: usize| own == locations || own == 1;
     let fits = (anchors.0, anchors.2) == (candidates.0, candidates.2)
-        && meets(anchors.1)
-        && meets(candidates.1)
+        && broadcasts(anchors.1)
+        && broadcasts(candidates.1)
         && psi.elem_count() * phi.elem_count() > 0;
     if !fits {
         bail!("dot products of {:?} and {:?}", psi.shape(), phi.shape());
@@ -44,7 +44,7 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
         psi_locations,
         phi_locations: candidates.1,
     };
-    apply_to_two(operation, [psi, phi], (locations, rows, rows))
+    apply_op2(operation, [psi, phi], (locations, rows, rows))
 }
 
 struct DotProducts {
@@ -57,7 +57,7 @@ struct DotProducts {
 
 impl DotProducts {
     /// Returns the vectors [B, R] of location `at` in `vectors` [B, locations, R].
-    fn located<'a>(&self, vectors: &'a [f32], locations: usize, at: usize) -> Scalars<'a, f32> {
+    fn vectors_at<'a>(&self, vectors: &'a [f32], locations: usize, at: usize) -> Scalars<'a, f32> {
         if locations == 1 {
             return Scalars::InPlace(vectors);
         }
@@ -70,7 +70,7 @@ impl DotProducts {
     }
 
     fn product<'a>(&self, a: Matrix<'a>, b: Matrix<'a>) -> Product<'a> {
-        Product::new(Precision::F32, a, b).on(match self.locations {
+        Product::new(Precision::F32, a, b).with_threads(match self.locations {
             1 => Threads::Pool,
             _ => Threads::Caller,
         })
@@ -92,7 +92,7 @@ impl DotProducts {
             .map(|(at, grad)| {
                 let grad = Matrix::new(grad, self.rows, self.rows);
                 let grad = if transposed { grad.transposed() } else { grad };
-                let others = self.located(others, others_locations, at);
+                let others = self.vectors_at(others, others_locations, at);
                 let others = Matrix::new(&others, self.rows, self.embedding_dim);
                 let mut part = Buffer::new(self.rows * self.embedding_dim);
                 self.product(grad, others).write(&mut part, Mode::Replace);
@@ -119,7 +119,7 @@ impl DotProducts {
 impl Operation<2> for DotProducts {
     const NAME: &'static str = "dot-products";
 
-    type Kept = ();
+    type Saved = ();
 
     fn forward(&self, [psi, phi]: [Input<'_>; 2]) -> Result<(Vec<f32>, ())> {
         let (psi, phi) = (psi.floats()?, phi.floats()?);
@@ -128,8 +128,8 @@ impl Operation<2> for DotProducts {
         dots.par_chunks_exact_mut(rows * rows)
             .enumerate()
             .for_each(|(at, dots)| {
-                let psi = self.located(psi, self.psi_locations, at);
-                let phi = self.located(phi, self.phi_locations, at);
+                let psi = self.vectors_at(psi, self.psi_locations, at);
+                let phi = self.vectors_at(phi, self.phi_locations, at);
                 let psi = Matrix::new(&psi, rows, embedding_dim);
                 let phi = Matrix::new(&phi, rows, embedding_dim).transposed();
                 self.product(psi, phi).write(dots, Mode::Replace);

@@ -18,13 +18,13 @@ pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slope
         dots.len() == scores.len() && dots.len() == slopes.len(),
         "a score and a slope for each dot product"
     );
-    with_simd!(AnySimd::of(Precision::F32), simd => clip(simd, dots, scale, bound, scores, slopes));
+    with_simd!(AnySimd::fastest(Precision::F32), simd => clip(simd, dots, scale, bound, scores, slopes));
 }
 
 /// Replaces each value by `exp(value - max)`; no value may exceed `max`. The relative error is at most 1e-15
 /// in addition to the rounding of the difference. A result below 1e-307 is 0; a NaN gives NaN.
 pub fn exp_below(values: &mut [f64], max: f64) {
-    with_simd!(AnySimd::of(Precision::F32), simd => exp_of_differences(simd, values, max));
+    with_simd!(AnySimd::fastest(Precision::F32), simd => exp_of_differences(simd, values, max));
 }
 
 vectorized! {
@@ -38,9 +38,9 @@ vectorized! {
     ) {
         for ((&dot, score), slope) in dots.iter().zip(scores).zip(slopes) {
             let x = f64::from(dot) * scale;
-            let (e, less_one) = exp_pair(-2.0 * x.abs() / bound);
+            let (e, exp_m1) = exp_pair(-2.0 * x.abs() / bound);
             let part = 1.0 / (1.0 + e);
-            *score = bound * (-less_one * part).copysign(x);
+            *score = bound * (-exp_m1 * part).copysign(x);
             *slope = scale * 4.0 * e * part * part;
         }
     }
@@ -55,7 +55,7 @@ vectorized! {
 }
 
 /// Below this x, exp(x) is 0, so that no step computes with a subnormal number.
-const LEAST: f64 = -707.0;
+const X_MIN: f64 = -707.0;
 /// Adding this constant rounds a number of magnitude below 2^51 to an integer, which is then in the sum's lowest bits.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
 /// ln 2 in two parts, the first with so few bits that its multiples up to 1100 are exact.
@@ -67,8 +67,8 @@ const LN_2_LOW: f64 = f64::from_bits(0x3dea_39ef_3579_3c76);
 /// x = k ln 2 + r with |r| <= ln 2 / 2. expm1(r) is a Taylor series up to the 13th power, with an error of 4e-18.
 #[inline(always)]
 fn exp_pair(x: f64) -> (f64, f64) {
-    let tiny = x < LEAST;
-    let x = if tiny { LEAST } else { x };
+    let is_tiny = x < X_MIN;
+    let x = if is_tiny { X_MIN } else { x };
     let rounded = x * std::f64::consts::LOG2_E + ROUNDER;
     let k = rounded - ROUNDER;
     let r = x - k * LN_2_HIGH - k * LN_2_LOW;
@@ -76,14 +76,14 @@ fn exp_pair(x: f64) -> (f64, f64) {
     for factor in &INVERSE_FACTORIALS[1..] {
         tail = tail * r + factor;
     }
-    let less_one = r + r * r * tail;
+    let exp_m1 = r + r * r * tail;
     let power = f64::from_bits((rounded.to_bits() << 52).wrapping_add(1.0f64.to_bits()));
-    let exp = power + power * less_one;
-    let exp_less_one = power * less_one + (power - 1.0);
-    if tiny {
+    let exp = power + power * exp_m1;
+    let exp_minus_one = power * exp_m1 + (power - 1.0);
+    if is_tiny {
         (0.0, -1.0)
     } else {
-        (exp, exp_less_one)
+        (exp, exp_minus_one)
     }
 }
 
@@ -116,10 +116,10 @@ mod tests {
             prop::sample::select(vec![0.0, -0.0, -f64::MIN_POSITIVE, -1e-300, -707.0]),
             (0..1020u32).prop_map(|k| -f64::from(k) * std::f64::consts::LN_2),
         ]) {
-            let (exp, less_one) = exp_pair(x.max(LEAST));
-            let x = x.max(LEAST);
+            let (exp, exp_m1) = exp_pair(x.max(X_MIN));
+            let x = x.max(X_MIN);
             prop_assert!(close(exp, x.exp(), 5e-16), "exp({x}) = {exp}");
-            prop_assert!(close(less_one, x.exp_m1(), 5e-16), "expm1({x}) = {less_one}");
+            prop_assert!(close(exp_m1, x.exp_m1(), 5e-16), "expm1({x}) = {exp_m1}");
         }
 
         #[test]

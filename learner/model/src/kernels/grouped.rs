@@ -13,7 +13,7 @@ use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::Mode;
 use crate::kernels::linear::add_rows;
-use crate::kernels::operation::{Operation, apply_to_three};
+use crate::kernels::operation::{Operation, apply_op3};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
@@ -46,31 +46,30 @@ pub(crate) fn grouped_linear(
     let mut order: Vec<usize> = (0..rows).collect();
     order.sort_by_key(|&row| groups[row]);
     let start = |group: usize| order.partition_point(|&row| usize::from(groups[row]) < group);
-    let parts = (0..count).map(|group| start(group)..start(group + 1));
-    let parts = parts.collect();
-    let operation = Grouped {
+    let ranges = (0..count).map(|g| start(g)..start(g + 1)).collect();
+    let operation = GroupedLinear {
         order,
-        parts,
+        ranges,
         inputs,
         out,
         precision,
     };
-    apply_to_three(operation, [x, w, b], (rows, out))
+    apply_op3(operation, [x, w, b], (rows, out))
 }
 
-struct Grouped {
+struct GroupedLinear {
     /// Row indices, sorted by group and ascending within a group.
     order: Vec<usize>,
     /// The range of each group's rows in `order`.
-    parts: Vec<Range<usize>>,
+    ranges: Vec<Range<usize>>,
     inputs: usize,
     out: usize,
     precision: Precision,
 }
 
-impl Grouped {
+impl GroupedLinear {
     /// Copies the rows of `values`, sorted by group.
-    fn sort(&self, values: &[f32]) -> Buffer<f32> {
+    fn sort_rows(&self, values: &[f32]) -> Buffer<f32> {
         let mut sorted = Buffer::new(values.len());
         let len = values.len() / self.order.len();
         let rows = sorted.par_chunks_exact_mut(len).zip(&self.order);
@@ -79,8 +78,8 @@ impl Grouped {
         sorted
     }
 
-    /// The inverse of `sort`.
-    fn unsort(&self, sorted: &[f32]) -> Vec<f32> {
+    /// The inverse of `sort_rows`.
+    fn unsort_rows(&self, sorted: &[f32]) -> Vec<f32> {
         let mut values = vec![0.0; sorted.len()];
         let len = sorted.len() / self.order.len();
         for (from, &row) in sorted.chunks_exact(len).zip(&self.order) {
@@ -90,14 +89,14 @@ impl Grouped {
     }
 
     /// Calls `each` on the pool with every group, its range in `order`, and its rows of `values`, each `len` scalars long.
-    fn for_each_part(
+    fn for_each_group(
         &self,
         mut values: &mut [f32],
         len: usize,
         each: impl Fn(usize, &Range<usize>, &mut [f32]) + Sync,
     ) {
-        let mut tasks = Vec::with_capacity(self.parts.len());
-        for rows in &self.parts {
+        let mut tasks = Vec::with_capacity(self.ranges.len());
+        for rows in &self.ranges {
             let (own, rest) = std::mem::take(&mut values).split_at_mut(rows.len() * len);
             tasks.push((rows, own));
             values = rest;
@@ -107,79 +106,81 @@ impl Grouped {
     }
 
     /// Returns a group's rows of a sorted matrix.
-    fn rows<'a>(sorted: &'a [f32], rows: &Range<usize>, len: usize) -> Matrix<'a> {
+    fn group_rows<'a>(sorted: &'a [f32], rows: &Range<usize>, len: usize) -> Matrix<'a> {
         Matrix::new(&sorted[rows.start * len..rows.end * len], rows.len(), len)
     }
 
-    fn weight<'a>(&self, w: &'a [f32], group: usize) -> Matrix<'a> {
+    fn group_weight<'a>(&self, w: &'a [f32], group: usize) -> Matrix<'a> {
         let len = self.out * self.inputs;
         Matrix::new(&w[group * len..][..len], self.out, self.inputs)
     }
 
     /// Adds the gradient of the weight to `sum`.
-    fn add_to_weight(&self, sum: &mut [f32], grad: &[f32], x: &[f32]) {
+    fn add_weight_gradient(&self, sum: &mut [f32], grad: &[f32], x: &[f32]) {
         sum.par_chunks_exact_mut(self.out * self.inputs)
-            .zip(&self.parts)
+            .zip(&self.ranges)
             .for_each(|(sum, rows)| {
-                let grad = Self::rows(grad, rows, self.out).transposed();
-                let x = Self::rows(x, rows, self.inputs);
+                let grad = Self::group_rows(grad, rows, self.out).transposed();
+                let x = Self::group_rows(x, rows, self.inputs);
                 Product::new(self.precision, grad, x).write(sum, Mode::Add);
             });
     }
 
     /// Adds the gradient of the bias to `sum`.
-    fn add_to_bias(&self, sum: &mut [f32], grad: &[f32]) {
-        for (sum, rows) in sum.chunks_exact_mut(self.out).zip(&self.parts) {
+    fn add_bias_gradient(&self, sum: &mut [f32], grad: &[f32]) {
+        for (sum, rows) in sum.chunks_exact_mut(self.out).zip(&self.ranges) {
             add_rows(sum, &grad[rows.start * self.out..rows.end * self.out]);
         }
     }
 }
 
-impl Operation<3> for Grouped {
+impl Operation<3> for GroupedLinear {
     const NAME: &'static str = "grouped-linear";
 
     /// x, sorted by group.
-    type Kept = Buffer<f32>;
+    type Saved = Buffer<f32>;
 
-    fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Kept)> {
-        let x = self.sort(x.floats()?);
+    fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Saved)> {
+        let x = self.sort_rows(x.floats()?);
         let (w, b) = (w.floats()?, b.floats()?);
         let mut y = Buffer::new(self.order.len() * self.out);
-        self.for_each_part(&mut y, self.out, |group, rows, y| {
-            let (x, w) = (Self::rows(&x, rows, self.inputs), self.weight(w, group));
+        self.for_each_group(&mut y, self.out, |group, rows, y| {
+            let x = Self::group_rows(&x, rows, self.inputs);
+            let w = self.group_weight(w, group);
             Product::new(self.precision, x, w.transposed())
-                .added_to(&b[group * self.out..][..self.out])
+                .with_biases(&b[group * self.out..][..self.out])
                 .write(y, Mode::Replace);
         });
-        Ok((self.unsort(&y), x))
+        Ok((self.unsort_rows(&y), x))
     }
 
     fn backward(
         &self,
         [x, w, b]: [&Tensor; 3],
-        sorted: &Self::Kept,
+        sorted: &Self::Saved,
         _y: &Tensor,
         grad_y: &[f32],
     ) -> Result<[Option<Vec<f32>>; 3]> {
-        let grad = self.sort(grad_y);
+        let grad = self.sort_rows(grad_y);
         let grad_x = x.track_op().then(|| -> Result<Vec<f32>> {
             let w = values_of(w)?;
             let mut grad_x = Buffer::new(self.order.len() * self.inputs);
-            self.for_each_part(&mut grad_x, self.inputs, |group, rows, grad_x| {
-                let (grad, w) = (Self::rows(&grad, rows, self.out), self.weight(&w, group));
+            self.for_each_group(&mut grad_x, self.inputs, |group, rows, grad_x| {
+                let grad = Self::group_rows(&grad, rows, self.out);
+                let w = self.group_weight(&w, group);
                 Product::new(self.precision, grad, w).write(grad_x, Mode::Replace);
             });
-            Ok(self.unsort(&grad_x))
+            Ok(self.unsort_rows(&grad_x))
         });
         let zeros = |like: &Tensor| vec![0.0; like.elem_count()];
-        let grad_w = gradients::summed(w, |sum| {
+        let grad_w = gradients::accumulate(w, |sum| {
             let mut sum = sum.unwrap_or_else(|| zeros(w));
-            self.add_to_weight(&mut sum, &grad, sorted);
+            self.add_weight_gradient(&mut sum, &grad, sorted);
             sum
         });
-        let grad_b = gradients::summed(b, |sum| {
+        let grad_b = gradients::accumulate(b, |sum| {
             let mut sum = sum.unwrap_or_else(|| zeros(b));
-            self.add_to_bias(&mut sum, &grad);
+            self.add_bias_gradient(&mut sum, &grad);
             sum
         });
         Ok([grad_x.transpose()?, grad_w, grad_b])
@@ -193,7 +194,7 @@ mod tests {
     use super::*;
     use crate::gradients::Backward;
     use crate::kernels::linear::linear;
-    use crate::kernels::reference::apart;
+    use crate::kernels::reference::relative_error;
 
     /// Compares with the whole layer, of which one group a row is kept.
     #[test]
@@ -232,8 +233,8 @@ mod tests {
                 assert_eq!(y, wanted, "{precision}: the same bits");
                 for (got, wanted) in gradients[..3].iter().zip(&gradients[3..]) {
                     // Sums in another order differ in the last places of an f32.
-                    let apart = apart(got, wanted);
-                    assert!(apart <= 1e-6, "{precision}: {apart:e}");
+                    let relative_error = relative_error(got, wanted);
+                    assert!(relative_error <= 1e-6, "{precision}: {relative_error:e}");
                 }
             }
         }

@@ -2,7 +2,7 @@
 
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::{Element, Simd};
-use crate::kernels::rounding::{store, store_bytes, store_steps_of, store_steps_of_bytes};
+use crate::kernels::rounding::{store, store_byte_steps, store_bytes, store_steps};
 
 /// Stored images [n, height, width, channels_in].
 #[derive(Clone, Copy)]
@@ -45,7 +45,7 @@ impl<E: Element> Images<'_, E> {
         }
     }
 
-    /// Returns image `index` as an operand: `len` scalars, then `padding` zeros. `room` is scratch memory for conversions and copies.
+    /// Returns image `index` as an operand: `len` scalars, then `padding` zeros. `scratch` is scratch memory for conversions and copies.
     ///
     /// The next image in memory cannot serve as padding: 0 times a NaN in it is NaN.
     pub(crate) fn image<'r, S: Simd<Element = E>>(
@@ -53,13 +53,13 @@ impl<E: Element> Images<'_, E> {
         simd: S,
         index: usize,
         (len, padding): (usize, usize),
-        room: &'r mut Room<E>,
+        scratch: &'r mut ScratchBuffer<E>,
     ) -> &'r [E] {
         let range = index * len..(index + 1) * len;
         if let (Self::Maps(maps), 0) = (self, padding) {
             return &maps[range];
         }
-        let operand = room.of(len + padding);
+        let operand = scratch.slice(len + padding);
         operand[len..].fill(E::default());
         let image = &mut operand[..len];
         match self {
@@ -77,34 +77,34 @@ impl<E: Element> Images<'_, E> {
         simd: S,
         index: usize,
         (len, shift): (usize, usize),
-        [room, single]: &'r mut [Room<E>; 2],
+        [scratch, image_scratch]: &'r mut [ScratchBuffer<E>; 2],
     ) -> &'r [E] {
         let range = index * len..(index + 1) * len;
         if let Self::Pixels(Pixels::Bytes(bytes)) = self {
-            let steps = room.of(len * E::DEPTH);
-            store_steps_of_bytes(simd, &bytes[range], shift, steps);
+            let steps = scratch.slice(len * E::DEPTH);
+            store_byte_steps(simd, &bytes[range], shift, steps);
             return steps;
         }
-        let image = self.image(simd, index, (len, 0), single);
+        let image = self.image(simd, index, (len, 0), image_scratch);
         if E::DEPTH == 1 {
             return image;
         }
-        let steps = room.of(len * E::DEPTH);
-        store_steps_of(simd, image, shift, steps);
+        let steps = scratch.slice(len * E::DEPTH);
+        store_steps(simd, image, shift, steps);
         steps
     }
 }
 
 /// Scratch memory for one image at a time.
-pub(crate) struct Room<E: Element>(Option<Buffer<E>>);
+pub(crate) struct ScratchBuffer<E: Element>(Option<Buffer<E>>);
 
-impl<E: Element> Room<E> {
+impl<E: Element> ScratchBuffer<E> {
     pub(crate) const fn new() -> Self {
         Self(None)
     }
 
     /// Returns `len` scalars with old content. `len` must be the same in every call.
-    fn of(&mut self, len: usize) -> &mut [E] {
+    fn slice(&mut self, len: usize) -> &mut [E] {
         self.0.get_or_insert_with(|| Buffer::new(len))
     }
 }

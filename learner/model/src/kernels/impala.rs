@@ -7,11 +7,11 @@ use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
 use crate::kernels::candle::BorderedTensors;
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
-use crate::kernels::operation::{Operation, apply_to_two};
+use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::precision::Precision;
-use crate::kernels::stages::{Saved, Stages};
+use crate::kernels::stages::{Stages, Tape};
 use crate::kernels::tasks::Tasks;
-use crate::kernels::tensors::{Input, cpu, values_of};
+use crate::kernels::tensors::{Input, cpu_storage, values_of};
 
 /// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
 const TASK_IMAGES: usize = 8;
@@ -45,9 +45,9 @@ pub(crate) fn residual_stages(
     let parameters = layers.iter().flat_map(|&(weight, bias)| [weight, bias]);
     let parameters: Result<Vec<_>> = parameters.map(Tensor::flatten_all).collect();
     let parameters = Tensor::cat(&parameters?, 0)?;
-    with_simd!(AnySimd::of(precision), simd => {
+    with_simd!(AnySimd::fastest(precision), simd => {
         let operation = ResidualStages { simd, shapes, count };
-        apply_to_two(operation, [images, &parameters], (count, rows, cols, width))
+        apply_op2(operation, [images, &parameters], (count, rows, cols, width))
     })
 }
 
@@ -80,16 +80,16 @@ impl<S: Simd> Operation<2> for ResidualStages<S> {
     const NAME: &'static str = "residual-stages";
 
     /// The state of each task.
-    type Kept = Vec<Saved<S::Element>>;
+    type Saved = Vec<Tape<S::Element>>;
 
-    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
+    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Saved)> {
         let images = bytes(images)?;
         let stages = Stages::new(self.simd, &self.shapes, parameters.floats()?, false);
         let mut f3 = vec![0.0; self.count * stages.output_len()];
         let saved = self.tasks(&stages).forward(&mut f3, |task, f3| {
-            let mut saved = stages.saved(f3.len() / stages.output_len());
-            stages.forward(&images[task], &mut saved, f3);
-            saved
+            let mut tape = stages.allocate_tape(f3.len() / stages.output_len());
+            stages.forward(&images[task], &mut tape, f3);
+            tape
         });
         Ok((f3, saved))
     }
@@ -97,19 +97,19 @@ impl<S: Simd> Operation<2> for ResidualStages<S> {
     fn backward(
         &self,
         [images, parameters]: [&Tensor; 2],
-        saved: &Self::Kept,
+        saved: &Self::Saved,
         f3: &Tensor,
         grad_f3: &[f32],
     ) -> Result<[Option<Vec<f32>>; 2]> {
         let (storage, layout) = images.storage_and_layout();
-        let images = bytes(Input::new(cpu(&storage)?, layout))?;
+        let images = bytes(Input::new(cpu_storage(&storage)?, layout))?;
         let f3 = values_of(f3)?;
         let f3 = &f3[..];
         let stages = Stages::new(self.simd, &self.shapes, &values_of(parameters)?, true);
         let tasks = self.tasks(&stages);
-        let gradient = tasks.backward(&self.shapes, saved, &mut [], |task, saved, _| {
+        let gradient = tasks.backward(&self.shapes, saved, &mut [], |task, tape, _| {
             let (f3, grad_f3) = (&f3[task.maps.clone()], &grad_f3[task.maps]);
-            stages.backward(&images[task.images], saved, f3, grad_f3)
+            stages.backward(&images[task.images], tape, f3, grad_f3)
         });
         Ok([None, Some(gradient)])
     }

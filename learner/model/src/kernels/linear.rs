@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::{AnySimd, Mode, with_simd};
-use crate::kernels::operation::{Operation, apply_to_three};
+use crate::kernels::operation::{Operation, apply_op3};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
@@ -25,7 +25,7 @@ const TASK_ROWS: usize = 256;
 const TASK_LEN: usize = 1 << 15;
 
 /// Scalars of a sum of vectors that one task takes.
-const SUM_LEN: usize = 1 << 12;
+const TASK_SUM_LEN: usize = 1 << 12;
 
 /// y = x w^T + b, differentiable in all arguments.
 ///
@@ -85,7 +85,7 @@ fn apply(
         None => x.rank() - 1,
     };
     let shape = [&x.dims()[..leading], &[outputs]].concat();
-    apply_to_three(operation, [x, w, b], shape)
+    apply_op3(operation, [x, w, b], shape)
 }
 
 struct Linear {
@@ -101,26 +101,26 @@ impl Operation<3> for Linear {
     const NAME: &'static str = "linear";
 
     /// The flattened maps.
-    type Kept = Option<Buffer<f32>>;
+    type Saved = Option<Buffer<f32>>;
 
-    fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Kept)> {
+    fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Saved)> {
         let x = x.floats()?;
         let flat = self.maps.map(|(locations, channels)| {
             let mut flat = Buffer::new(x.len());
-            transpose_each(x, locations, channels, &mut flat);
+            transpose_images(x, locations, channels, &mut flat);
             flat
         });
         let x = Matrix::new(flat.as_deref().unwrap_or(x), self.rows, self.inputs);
         let w = Matrix::new(w.floats()?, self.outputs, self.inputs);
         let product = Product::new(self.precision, x, w.transposed());
-        let y = product.added_to(b.floats()?).to_vec();
+        let y = product.with_biases(b.floats()?).to_vec();
         Ok((y, flat))
     }
 
     fn backward(
         &self,
         [x, w, b]: [&Tensor; 3],
-        flat: &Self::Kept,
+        flat: &Self::Saved,
         _y: &Tensor,
         grad_y: &[f32],
     ) -> Result<[Option<Vec<f32>>; 3]> {
@@ -135,23 +135,23 @@ impl Operation<3> for Linear {
             let mut grad_flat = Buffer::new(self.rows * self.inputs);
             product.write(&mut grad_flat, Mode::Replace);
             let mut grad_x = vec![0.0; grad_flat.len()];
-            transpose_each(&grad_flat, channels, locations, &mut grad_x);
+            transpose_images(&grad_flat, channels, locations, &mut grad_x);
             Ok(grad_x)
         });
         let x = values_of(x)?;
         let x = Matrix::new(flat.as_deref().unwrap_or(&x), self.rows, self.inputs);
         let product = Product::new(self.precision, grad.transposed(), x);
-        let grad_w = gradients::summed(w, |sum| product.summed(sum));
+        let grad_w = gradients::accumulate(w, |sum| product.added_to_sum(sum));
         let sums = || group_sums(grad_y, 1, self.outputs);
-        let grad_b = gradients::summed(b, |sum| add_to(sum, sums()));
+        let grad_b = gradients::accumulate(b, |sum| add_to_sum(sum, sums()));
         Ok([grad_x.transpose()?, grad_w, grad_b])
     }
 }
 
 /// Transposes every image [rows, cols] of a batch.
-pub(crate) fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
+pub(crate) fn transpose_images(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
     // Transposing rounds nothing, so f32 serves both precisions.
-    with_simd!(AnySimd::of(Precision::F32), simd => {
+    with_simd!(AnySimd::fastest(Precision::F32), simd => {
         result
             .par_chunks_mut(rows * cols)
             .zip(values.par_chunks(rows * cols))
@@ -178,7 +178,7 @@ pub(crate) fn group_sums(grads: &[f32], groups: usize, outputs: usize) -> Vec<f3
 }
 
 /// Adds `part` to the sum so far, if there is one.
-pub(crate) fn add_to(sum: Option<Vec<f32>>, part: Vec<f32>) -> Vec<f32> {
+pub(crate) fn add_to_sum(sum: Option<Vec<f32>>, part: Vec<f32>) -> Vec<f32> {
     let Some(mut sum) = sum else { return part };
     add_rows(&mut sum, &part);
     sum
@@ -202,11 +202,11 @@ where
         return vec![0.0; len];
     };
     let mut sum = first.to_vec();
-    sum.par_chunks_mut(SUM_LEN)
+    sum.par_chunks_mut(TASK_SUM_LEN)
         .enumerate()
         .for_each(|(index, sum)| {
             for part in others {
-                for (sum, value) in sum.iter_mut().zip(&part[index * SUM_LEN..]) {
+                for (sum, value) in sum.iter_mut().zip(&part[index * TASK_SUM_LEN..]) {
                     *sum += value;
                 }
             }
@@ -216,13 +216,13 @@ where
 
 pub(crate) fn relu_in_place(values: &mut [f32]) {
     for value in values {
-        *value = relu_of(*value);
+        *value = relu_scalar(*value);
     }
 }
 
 /// max(value, 0). Unlike `f32::max` it keeps NaN, so that a diverged network is noticed.
 #[inline(always)]
-pub(crate) fn relu_of(value: f32) -> f32 {
+pub(crate) fn relu_scalar(value: f32) -> f32 {
     if value < 0.0 { 0.0 } else { value }
 }
 

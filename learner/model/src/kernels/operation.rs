@@ -12,59 +12,59 @@ pub(crate) trait Operation<const N: usize>: Send + Sync + 'static {
     const NAME: &'static str;
 
     /// State that the forward pass keeps for the backward pass.
-    type Kept: Send + Sync;
+    type Saved: Send + Sync;
 
-    fn forward(&self, inputs: [Input<'_>; N]) -> Result<(Vec<f32>, Self::Kept)>;
+    fn forward(&self, inputs: [Input<'_>; N]) -> Result<(Vec<f32>, Self::Saved)>;
 
     /// Computes the gradients of the inputs that need one, given the gradient `grad_y` of the result `y`.
     fn backward(
         &self,
         inputs: [&Tensor; N],
-        kept: &Self::Kept,
+        saved: &Self::Saved,
         y: &Tensor,
         grad_y: &[f32],
     ) -> Result<[Option<Vec<f32>>; N]>;
 }
 
 /// Applies `operation` to two tensors. `shape` is the shape of the result.
-pub(crate) fn apply_to_two<O: Operation<2>>(
+pub(crate) fn apply_op2<O: Operation<2>>(
     operation: O,
     [a, b]: [&Tensor; 2],
     shape: impl Into<Shape>,
 ) -> Result<Tensor> {
-    let pass = Pass::<O, 2>::new(operation, shape);
-    a.contiguous()?.apply_op2(&b.contiguous()?, pass)
+    let op = CandleOp::<O, 2>::new(operation, shape);
+    a.contiguous()?.apply_op2(&b.contiguous()?, op)
 }
 
-/// Applies `operation` to three tensors, as [`apply_to_two`].
-pub(crate) fn apply_to_three<O: Operation<3>>(
+/// Applies `operation` to three tensors, as [`apply_op2`].
+pub(crate) fn apply_op3<O: Operation<3>>(
     operation: O,
     [a, b, c]: [&Tensor; 3],
     shape: impl Into<Shape>,
 ) -> Result<Tensor> {
-    let pass = Pass::<O, 3>::new(operation, shape);
+    let op = CandleOp::<O, 3>::new(operation, shape);
     a.contiguous()?
-        .apply_op3(&b.contiguous()?, &c.contiguous()?, pass)
+        .apply_op3(&b.contiguous()?, &c.contiguous()?, op)
 }
 
-struct Pass<O: Operation<N>, const N: usize> {
+struct CandleOp<O: Operation<N>, const N: usize> {
     operation: O,
     shape: Shape,
-    kept: OnceLock<O::Kept>,
+    saved: OnceLock<O::Saved>,
 }
 
-impl<O: Operation<N>, const N: usize> Pass<O, N> {
+impl<O: Operation<N>, const N: usize> CandleOp<O, N> {
     fn new(operation: O, shape: impl Into<Shape>) -> Self {
         Self {
             operation,
             shape: shape.into(),
-            kept: OnceLock::new(),
+            saved: OnceLock::new(),
         }
     }
 
     fn forward(&self, inputs: [Input<'_>; N]) -> Result<(CpuStorage, Shape)> {
-        let (y, kept) = self.operation.forward(inputs)?;
-        let first = self.kept.set(kept).is_ok();
+        let (y, saved) = self.operation.forward(inputs)?;
+        let first = self.saved.set(saved).is_ok();
         assert!(first, "an operation passes forward once");
         Ok((CpuStorage::F32(y), self.shape.clone()))
     }
@@ -77,8 +77,8 @@ impl<O: Operation<N>, const N: usize> Pass<O, N> {
     ) -> Result<[Option<Tensor>; N]> {
         let grad_y = grad_y.detach().contiguous()?;
         let grad_values = values_of(&grad_y)?;
-        let kept = self.kept.get().expect("a forward pass came before");
-        let gradients = self.operation.backward(inputs, kept, y, &grad_values)?;
+        let saved = self.saved.get().expect("a forward pass came before");
+        let gradients = self.operation.backward(inputs, saved, y, &grad_values)?;
         let mut tensors: [Option<Tensor>; N] = [const { None }; N];
         for ((tensor, gradient), input) in tensors.iter_mut().zip(gradients).zip(inputs) {
             if let Some(gradient) = gradient {
@@ -90,7 +90,7 @@ impl<O: Operation<N>, const N: usize> Pass<O, N> {
     }
 }
 
-impl<O: Operation<2>> CustomOp2 for Pass<O, 2> {
+impl<O: Operation<2>> CustomOp2 for CandleOp<O, 2> {
     fn name(&self) -> &'static str {
         O::NAME
     }
@@ -116,7 +116,7 @@ impl<O: Operation<2>> CustomOp2 for Pass<O, 2> {
     }
 }
 
-impl<O: Operation<3>> CustomOp3 for Pass<O, 3> {
+impl<O: Operation<3>> CustomOp3 for CandleOp<O, 3> {
     fn name(&self) -> &'static str {
         O::NAME
     }

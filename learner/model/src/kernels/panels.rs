@@ -5,7 +5,8 @@ use rayon::prelude::*;
 
 use crate::kernels::buffer::{ALIGNMENT, Buffer, Scalars};
 use crate::kernels::isa::{
-    Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
+    Element, LANES, LeftOperand, Mode, OutputTile, Simd, multiply_tile, row_tiles, tile_vecs,
+    vectorized,
 };
 use crate::kernels::rounding::write_rows;
 
@@ -143,7 +144,7 @@ impl<E: Element> Panels<E> {
         &self,
         simd: S,
         rows: usize,
-        left: Left<'_, E>,
+        left: LeftOperand<'_, E>,
         mode: Mode,
         out: &mut [f32],
         stride: usize,
@@ -155,22 +156,22 @@ impl<E: Element> Panels<E> {
             let blocks = panel.chunks(S::STEPS_IN_CACHE * width * E::DEPTH);
             for (block, panel) in blocks.enumerate() {
                 let mode = if block == 0 { mode } else { Mode::Add };
-                let start = left.start + block * S::STEPS_IN_CACHE * left.step;
+                let start = left.start + block * S::STEPS_IN_CACHE * left.step_stride;
                 let steps = panel.len() / (width * E::DEPTH);
                 for (row, count) in row_tiles::<S>(rows, self.vecs) {
-                    let left = Left {
+                    let left = LeftOperand {
                         start: start + row * left.row_stride,
                         steps,
                         ..left
                     };
-                    let columns = Columns {
+                    let output = OutputTile {
                         out: &mut out[row * stride + first..],
-                        stride,
+                        row_stride: stride,
                         cols: width.min(self.cols - first),
                         vecs: self.vecs,
                         mode,
                     };
-                    multiply_tile(simd, count, left, panel, columns);
+                    multiply_tile(simd, count, left, panel, output);
                 }
             }
         }
@@ -181,7 +182,7 @@ impl<E: Element> Panels<E> {
         &self,
         simd: S,
         rows: usize,
-        left: Left<'_, E>,
+        left: LeftOperand<'_, E>,
         mode: Mode,
         out: &mut [f32],
         stride: usize,
@@ -189,14 +190,14 @@ impl<E: Element> Panels<E> {
         let width = self.vecs * LANES;
         let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
         for (first, panel) in (0..).step_by(width).zip(panels) {
-            let columns = Columns {
+            let output = OutputTile {
                 out: &mut out[first..],
-                stride,
+                row_stride: stride,
                 cols: width.min(self.cols - first),
                 vecs: self.vecs,
                 mode,
             };
-            multiply_tile(simd, rows, left, panel, columns);
+            multiply_tile(simd, rows, left, panel, output);
         }
     }
 }
@@ -212,7 +213,7 @@ vectorized! {
         panel: &'a mut [S::Element],
     ) {
         if b.transposed {
-            return pack_transposed(simd, b, first, width, panel);
+            return pack_transposed_panel(simd, b, first, width, panel);
         }
         let (cols, depth) = (width.min(b.cols - first), S::Element::DEPTH);
         let mut steps = panel.chunks_exact_mut(width * depth);
@@ -223,7 +224,7 @@ vectorized! {
                     _ => lines.get(b.stride + first..).unwrap_or_default(),
                 };
                 let second = second.get(..cols).unwrap_or_default();
-                S::Element::join(simd, &lines[first..first + cols], second, step);
+                S::Element::interleave(simd, &lines[first..first + cols], second, step);
             }
         }
     }
@@ -231,7 +232,7 @@ vectorized! {
 
 /// [`pack_panel`] for a transposed matrix: square blocks of steps are transposed in registers.
 #[inline(always)]
-fn pack_transposed<S: Simd>(
+fn pack_transposed_panel<S: Simd>(
     simd: S,
     b: Matrix<'_>,
     first: usize,
@@ -247,7 +248,7 @@ fn pack_transposed<S: Simd>(
             let mut block = [[0; LANES]; LANES];
             let block_columns = columns.clone().skip(col).take(LANES);
             for (block, column) in block.iter_mut().zip(block_columns) {
-                S::Element::steps(simd, &column[run.clone()], block);
+                S::Element::round_steps(simd, &column[run.clone()], block);
             }
             simd.transpose(&mut block);
             for (at, block) in block.iter().enumerate().take(steps - step) {
@@ -261,14 +262,14 @@ fn pack_transposed<S: Simd>(
 }
 
 /// A left operand, laid out as tiles read it.
-pub(crate) struct Rows<'a, E: Element> {
+pub(crate) struct PackedRows<'a, E: Element> {
     values: Scalars<'a, E>,
     row_stride: usize,
-    step: usize,
+    step_stride: usize,
     steps: usize,
 }
 
-impl<'a, E: Element> Rows<'a, E> {
+impl<'a, E: Element> PackedRows<'a, E> {
     /// Packs the rows of `a` [m, k]: in place if they need no rounding, else as a rounded copy.
     ///
     /// # Panics
@@ -281,8 +282,8 @@ impl<'a, E: Element> Rows<'a, E> {
         let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
         let steps = k.div_ceil(depth);
         let line = ALIGNMENT / size_of::<E>();
-        let (row_stride, step) = match a.transposed && !S::LEFT_STEPS_ADJOIN {
-            false if S::LEFT_STEPS_ADJOIN => ((steps * depth).next_multiple_of(line), depth),
+        let (row_stride, step_stride) = match a.transposed && !S::LEFT_STEPS_ADJACENT {
+            false if S::LEFT_STEPS_ADJACENT => ((steps * depth).next_multiple_of(line), depth),
             false => (steps * depth, depth),
             true => (depth, m * depth),
         };
@@ -290,8 +291,8 @@ impl<'a, E: Element> Rows<'a, E> {
             Scalars::InPlace(values)
         } else {
             let mut values = Buffer::new(m * row_stride.max(steps * depth));
-            if a.transposed && S::LEFT_STEPS_ADJOIN {
-                pack_turned(simd, a.transposed(), row_stride, &mut values, threads);
+            if a.transposed && S::LEFT_STEPS_ADJACENT {
+                pack_transposed_rows(simd, a.transposed(), row_stride, &mut values, threads);
             } else if a.transposed {
                 pack_steps(simd, a.transposed(), &mut values, threads);
             } else {
@@ -302,17 +303,17 @@ impl<'a, E: Element> Rows<'a, E> {
         Self {
             values,
             row_stride,
-            step,
+            step_stride,
             steps,
         }
     }
 
-    pub(crate) fn left(&self, row: usize) -> Left<'_, E> {
-        Left {
+    pub(crate) fn operand_from(&self, row: usize) -> LeftOperand<'_, E> {
+        LeftOperand {
             values: &self.values,
             start: row * self.row_stride,
             row_stride: self.row_stride,
-            step: self.step,
+            step_stride: self.step_stride,
             steps: self.steps,
             run_stride: 0,
             runs: 1,
@@ -346,7 +347,7 @@ fn pack_rows<S: Simd>(
 }
 
 /// Packs the columns of `a` [k, m] as rows of `stride`, a multiple of `LANES` steps, padded with zeros.
-fn pack_turned<S: Simd>(
+fn pack_transposed_rows<S: Simd>(
     simd: S,
     a: Matrix<'_>,
     stride: usize,
@@ -355,7 +356,7 @@ fn pack_turned<S: Simd>(
 ) {
     let rows = (TASK_LEN / stride).max(1).next_multiple_of(LANES);
     let pack = |(part, values): (usize, &mut [S::Element])| {
-        turn(simd, a, part * rows, stride, values);
+        transpose_rows(simd, a, part * rows, stride, values);
     };
     match threads {
         Threads::Caller => pack((0, values)),
@@ -367,8 +368,8 @@ fn pack_turned<S: Simd>(
 }
 
 vectorized! {
-    /// [`pack_turned`] of the columns from the `first` on: square blocks of steps are transposed in registers.
-    fn turn<S>(
+    /// [`pack_transposed_rows`] of the columns from the `first` on: square blocks of steps are transposed in registers.
+    fn transpose_rows<S>(
         simd,
         a: Matrix<'a>,
         first: usize,
@@ -387,7 +388,7 @@ vectorized! {
                 for (k, block) in (at..).step_by(depth).zip(&mut block) {
                     let mut step = [S::Element::default(); 2 * LANES];
                     let step = &mut step[..LANES * depth];
-                    S::Element::join(simd, part(k), part(k + 1), step);
+                    S::Element::interleave(simd, part(k), part(k + 1), step);
                     for (bits, step) in block.iter_mut().zip(step.chunks_exact(depth)) {
                         *bits = S::Element::pack(step);
                     }

@@ -164,7 +164,7 @@ mod tests {
             });
             (largest, grad_maps)
         };
-        AnySimd::every(Precision::F32)
+        AnySimd::all_available(Precision::F32)
             .into_iter()
             .map(of_simd)
             .collect()

@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::kernels::isa::{AnySimd, Element, Mode, Simd, with_simd};
-use crate::kernels::panels::{Matrix, Panels, Rows, Threads};
+use crate::kernels::panels::{Matrix, PackedRows, Panels, Threads};
 use crate::kernels::precision::Precision;
 
 /// Output rows that one task computes. The number is fixed, so that a product's bits do not depend on the number of threads.
@@ -13,7 +13,7 @@ const TASK_ROWS: usize = 32;
 const SPLIT_MIN: usize = 1 << 18;
 
 /// Work on a task's finished output rows. It receives the index of the first row, and the rows one after the other.
-pub(crate) type RowsWork<'a> = &'a (dyn Fn(usize, &mut [f32]) + Sync);
+pub(crate) type RowsCallback<'a> = &'a (dyn Fn(usize, &mut [f32]) + Sync);
 
 /// A product of `a` [m, k] and `b` [k, n], to be computed into rows of n scalars.
 ///
@@ -26,7 +26,7 @@ pub(crate) struct Product<'a> {
     b: Matrix<'a>,
     threads: Threads,
     biases: Option<&'a [f32]>,
-    after: Option<RowsWork<'a>>,
+    after: Option<RowsCallback<'a>>,
 }
 
 impl<'a> Product<'a> {
@@ -53,7 +53,7 @@ impl<'a> Product<'a> {
         }
     }
 
-    pub(crate) fn on(self, threads: Threads) -> Self {
+    pub(crate) fn with_threads(self, threads: Threads) -> Self {
         Self { threads, ..self }
     }
 
@@ -62,7 +62,7 @@ impl<'a> Product<'a> {
     ///
     /// # Panics
     /// If the rows cannot be shared equally.
-    pub(crate) fn added_to(self, biases: &'a [f32]) -> Self {
+    pub(crate) fn with_biases(self, biases: &'a [f32]) -> Self {
         let (rows, cols) = (self.a.rows, self.b.cols);
         let groups = biases.len() / cols;
         assert!(
@@ -75,7 +75,7 @@ impl<'a> Product<'a> {
     }
 
     /// Calls `after` on the finished rows of each task.
-    pub(crate) fn then(self, after: RowsWork<'a>) -> Self {
+    pub(crate) fn then(self, after: RowsCallback<'a>) -> Self {
         let after = Some(after);
         Self { after, ..self }
     }
@@ -118,16 +118,16 @@ impl<'a> Product<'a> {
 
     pub(crate) fn to_vec(self) -> Vec<f32> {
         let len = self.a.rows * self.b.cols;
-        with_simd!(AnySimd::of(self.precision), simd => {
+        with_simd!(AnySimd::fastest(self.precision), simd => {
             // Clearing the output takes a core about as long as packing the operands, so both run at once.
-            let (mut out, operands) = self.both(|| vec![0.0; len], || Operands::new(simd, self));
+            let (mut out, operands) = self.run_both(|| vec![0.0; len], || Operands::new(simd, self));
             self.multiply(simd, operands, &mut out, self.b.cols, Mode::Replace);
             out
         })
     }
 
     /// Returns `sum` [m, n] plus the product, or the product alone if `sum` is `None`.
-    pub(crate) fn summed(self, sum: Option<Vec<f32>>) -> Vec<f32> {
+    pub(crate) fn added_to_sum(self, sum: Option<Vec<f32>>) -> Vec<f32> {
         match sum {
             None => self.to_vec(),
             Some(mut sum) => {
@@ -138,23 +138,23 @@ impl<'a> Product<'a> {
     }
 
     fn run(self, out: &mut [f32], stride: usize, mode: Mode) {
-        with_simd!(AnySimd::of(self.precision), simd => {
+        with_simd!(AnySimd::fastest(self.precision), simd => {
             self.multiply(simd, Operands::new(simd, self), out, stride, mode);
         });
     }
 
     /// Whether the product is split over the pool, because it is large enough and may use the pool.
-    fn splits(self) -> bool {
+    fn is_split(self) -> bool {
         self.threads == Threads::Pool && self.a.rows * self.a.cols * self.b.cols >= SPLIT_MIN
     }
 
     /// Runs both closures, in parallel if the product is split.
-    fn both<A: Send, B: Send>(
+    fn run_both<A: Send, B: Send>(
         self,
         a: impl FnOnce() -> A + Send,
         b: impl FnOnce() -> B + Send,
     ) -> (A, B) {
-        match self.splits() {
+        match self.is_split() {
             true => rayon::join(a, b),
             false => (a(), b()),
         }
@@ -185,7 +185,7 @@ impl<'a> Product<'a> {
             match &operands {
                 Some(Operands { panels, rows }) => {
                     let count = out.len().div_ceil(stride);
-                    panels.multiply_rows(simd, count, rows.left(first), mode, out, stride);
+                    panels.multiply_rows(simd, count, rows.operand_from(first), mode, out, stride);
                 }
                 None if mode == Mode::Replace => out.fill(0.0),
                 None => {}
@@ -194,7 +194,7 @@ impl<'a> Product<'a> {
                 after(first, out);
             }
         };
-        if self.splits() {
+        if self.is_split() {
             out.par_chunks_mut(TASK_ROWS * stride)
                 .with_max_len(1)
                 .enumerate()
@@ -208,7 +208,7 @@ impl<'a> Product<'a> {
 /// A product's operands, packed for an instruction set.
 struct Operands<'a, E: Element> {
     panels: Panels<E>,
-    rows: Rows<'a, E>,
+    rows: PackedRows<'a, E>,
 }
 
 impl<'a, E: Element> Operands<'a, E> {
@@ -218,13 +218,13 @@ impl<'a, E: Element> Operands<'a, E> {
         if a.rows * a.cols * b.cols == 0 {
             return None;
         }
-        let threads = match product.splits() {
+        let threads = match product.is_split() {
             true => Threads::Pool,
             false => Threads::Caller,
         };
-        let (panels, rows) = product.both(
+        let (panels, rows) = product.run_both(
             || Panels::pack(simd, b, threads),
-            || Rows::pack(simd, a, threads),
+            || PackedRows::pack(simd, a, threads),
         );
         Some(Self { panels, rows })
     }
@@ -259,12 +259,12 @@ mod tests {
 
     /// Compares a product, both written and added to an output, with `wanted` on every instruction set.
     fn check(product: Product<'_>, wanted: &[f64]) {
-        for simd in AnySimd::every(product.precision) {
+        for simd in AnySimd::all_available(product.precision) {
             for (mode, start, threads) in [
                 (Mode::Replace, 0.0, Threads::Pool),
                 (Mode::Add, 2.0, Threads::Caller),
             ] {
-                let (product, mut out) = (product.on(threads), vec![2.0; wanted.len()]);
+                let (product, mut out) = (product.with_threads(threads), vec![2.0; wanted.len()]);
                 with_simd!(simd, simd => {
                     let operands = Operands::new(simd, product);
                     product.multiply(simd, operands, &mut out, product.b.cols, mode);
@@ -365,17 +365,15 @@ mod tests {
                 |_: usize, rows: &mut [f32]| rows.iter_mut().for_each(|value| *value *= 2.0);
             let product =
                 Product::new(Precision::F32, Matrix::new(&a, m, k), Matrix::new(&b, k, n));
-            let (plain, edged) = (
-                product.to_vec(),
-                product.added_to(&values).then(&after).to_vec(),
-            );
+            let plain = product.to_vec();
+            let edged = product.with_biases(&values).then(&after).to_vec();
             for (at, (edged, plain)) in edged.iter().zip(&plain).enumerate() {
                 let wanted = 2.0 * (plain + (at / n) as f32);
                 assert!((edged - wanted).abs() < 1e-3, "{edged}, wanted {wanted}");
             }
-            assert_eq!(product.summed(None), plain);
+            assert_eq!(product.added_to_sum(None), plain);
             let twice: Vec<f32> = plain.iter().map(|value| 2.0 * value).collect();
-            assert_eq!(product.summed(Some(plain)), twice);
+            assert_eq!(product.added_to_sum(Some(plain)), twice);
         }
     }
 

@@ -11,13 +11,13 @@ use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::Stack;
 use crate::kernels::stages::Stages;
-use crate::kernels::tasks::{cut, parameters_len, unpacked};
+use crate::kernels::tasks::{parameters_len, split_parameters, unpack_weights};
 
 /// Images of a task.
 const COUNT: usize = 3;
 
 /// The 2-norm of the difference, relative to the 2-norm of `wanted`.
-pub(crate) fn apart<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
+pub(crate) fn relative_error<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
     assert_eq!(found.len(), wanted.len());
     let (mut error, mut size) = (0f64, 0f64);
     for (&found, &wanted) in found.iter().zip(wanted) {
@@ -53,25 +53,23 @@ impl Case<'_> {
     }
 
     /// Returns the maps, and the gradients of the parameters and, for plain convolutions, of the images.
-    fn on<S: Simd>(&self, simd: S) -> Vec<Vec<f32>> {
+    fn run_on<S: Simd>(&self, simd: S) -> Vec<Vec<f32>> {
         let (shapes, parameters, grad_maps) = (self.shapes, self.parameters(), self.grad_maps());
         let mut maps = vec![f32::NAN; grad_maps.len()];
         if let (true, Pixels::Bytes(images)) = (self.is_residual, self.images) {
             let stages = Stages::new(simd, shapes, &parameters, true);
-            let mut saved = stages.saved(COUNT);
-            stages.forward(images, &mut saved, &mut maps);
-            let sums = stages.backward(images, &saved, &maps, &grad_maps);
-            return vec![maps, unpacked(shapes, &sums)];
+            let mut tape = stages.allocate_tape(COUNT);
+            stages.forward(images, &mut tape, &mut maps);
+            let sums = stages.backward(images, &tape, &maps, &grad_maps);
+            return vec![maps, unpack_weights(shapes, &sums)];
         }
-        let (stack, images) = (
-            Stack::new(simd, shapes, &parameters, true, true),
-            self.images,
-        );
+        let stack = Stack::new(simd, shapes, &parameters, true, true);
+        let images = self.images;
         let saved = stack.forward(images, &mut maps);
         let mut grad_images = vec![0.0; images.len()];
         let to = Some(&mut grad_images[..]);
         let sums = stack.backward(images, &saved, &maps, &grad_maps, to);
-        vec![maps, unpacked(shapes, &sums), grad_images]
+        vec![maps, unpack_weights(shapes, &sums), grad_images]
     }
 
     /// Computes the same with candle, always with the gradients of the images.
@@ -85,7 +83,8 @@ impl Case<'_> {
         let size = (COUNT, height, width, first.channels_in);
         let images = Var::from_vec(images, size, &Device::Cpu)?;
         let (mut vars, parameters) = (Vec::new(), self.parameters());
-        for (shape, [weight, bias]) in self.shapes.iter().zip(cut(self.shapes, &parameters)) {
+        let parts = split_parameters(self.shapes, &parameters);
+        for (shape, [weight, bias]) in self.shapes.iter().zip(parts) {
             let (out, inputs, side) = (shape.channels_out, shape.channels_in, shape.kernel);
             for (part, size) in [(weight, &[out, inputs, side, side][..]), (bias, &[out])] {
                 let part: Vec<f64> = part.iter().map(|&it| it.into()).collect();
@@ -104,12 +103,12 @@ impl Case<'_> {
         let loss = (&maps * slope.to_dtype(DType::F64)?)?.sum_all()?;
         let gradients = loss.backward()?;
         let values = |of: &Tensor| of.flatten_all()?.to_vec1::<f64>();
-        let mut of_parameters = Vec::new();
+        let mut parameter_gradients = Vec::new();
         for var in &vars {
-            of_parameters.extend(values(gradients.get(var).unwrap())?);
+            parameter_gradients.extend(values(gradients.get(var).unwrap())?);
         }
-        let of_images = values(gradients.get(&images).unwrap())?;
-        Ok(vec![values(&maps)?, of_parameters, of_images])
+        let image_gradients = values(gradients.get(&images).unwrap())?;
+        Ok(vec![values(&maps)?, parameter_gradients, image_gradients])
     }
 }
 
@@ -142,17 +141,19 @@ fn every_instruction_set_gives_what_candle_does_in_f64() -> Result<()> {
         let wanted = case.reference()?;
         for precision in Precision::ALL {
             // Largest distance from the reference, and from the first instruction set's result.
-            let (tolerance, of_sets) = match precision {
+            let (tolerance, between_sets) = match precision {
                 Precision::F32 => (3e-6, 3e-6),
                 // ReLUs and pools may choose differently. A sum rounded to the neighbouring bf16 changes what follows by 1/256.
                 Precision::Bf16 => (0.3, 1e-2),
             };
-            let on = |simd| with_simd!(simd, simd => case.on(simd));
-            let results: Vec<_> = AnySimd::every(precision).into_iter().map(on).collect();
+            let on = |simd| with_simd!(simd, simd => case.run_on(simd));
+            let sets = AnySimd::all_available(precision).into_iter();
+            let results: Vec<_> = sets.map(on).collect();
             for found in &results {
                 for ((found, first), wanted) in found.iter().zip(&results[0]).zip(&wanted) {
-                    let [error, from_first] = [apart(found, wanted), apart(found, first)];
-                    let is_close = error <= tolerance && from_first <= of_sets;
+                    let error = relative_error(found, wanted);
+                    let from_first = relative_error(found, first);
+                    let is_close = error <= tolerance && from_first <= between_sets;
                     assert!(is_close, "{precision}: {error}, {from_first}");
                 }
             }

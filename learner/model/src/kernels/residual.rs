@@ -6,11 +6,11 @@
 
 use candle_core::{Result, Tensor, bail};
 
-use crate::gradients::sum_in_place;
+use crate::gradients::accumulate_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::Mode;
-use crate::kernels::linear::{add_rows, add_to, group_sums, relu_gradient, relu_in_place};
-use crate::kernels::operation::{Operation, apply_to_two};
+use crate::kernels::linear::{add_rows, add_to_sum, group_sums, relu_gradient, relu_in_place};
+use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
@@ -46,13 +46,13 @@ pub(crate) fn residual_block(
     let rows = x.elem_count() / features.max(1);
     let (hidden, inputs) = parameters.hidden_weight.dims2()?;
     let outputs = parameters.out_weight.dims2()?.0;
-    let (groups, joins) = match joined {
+    let (groups, joined_width) = match joined {
         Some(joined) => joined.dims2()?,
         None => (1, 0),
     };
     let is_bias = |bias: &Tensor| bias.dims() == [outputs];
     let fits = features > 0
-        && features + joins == inputs
+        && features + joined_width == inputs
         && groups > 0
         && rows.is_multiple_of(groups)
         && parameters.hidden_bias.dims() == [hidden]
@@ -71,12 +71,12 @@ pub(crate) fn residual_block(
             parameters.out_biases
         );
     }
-    let block = Block {
+    let block = ResidualBlock {
         parameters: parameters.clone(),
         rows,
         groups,
         features,
-        joins,
+        joined_width,
         hidden,
         outputs,
         precision,
@@ -84,30 +84,30 @@ pub(crate) fn residual_block(
     let shape = [&x.dims()[..x.rank() - 1], &[outputs]].concat();
     // A parameter as an input ties the result to the backward pass, even if x has no gradient.
     let second = joined.unwrap_or(&parameters.hidden_bias);
-    apply_to_two(block, [x, second], shape)
+    apply_op2(block, [x, second], shape)
 }
 
-struct Block {
+struct ResidualBlock {
     parameters: BlockParameters,
     rows: usize,
     /// Rows of the joined input; 1 if nothing is joined.
     groups: usize,
     features: usize,
     /// Columns of the joined input; 0 if nothing is joined.
-    joins: usize,
+    joined_width: usize,
     hidden: usize,
     outputs: usize,
     precision: Precision,
 }
 
-impl Block {
+impl ResidualBlock {
     const fn is_joined(&self) -> bool {
-        self.joins > 0
+        self.joined_width > 0
     }
 
     /// Splits `weight` [outputs, features + joined] into the columns that multiply x and those that multiply the joined input.
-    fn parts<'a>(&self, weight: &'a [f32]) -> (Matrix<'a>, Option<Matrix<'a>>) {
-        let inputs = self.features + self.joins;
+    fn split_weight<'a>(&self, weight: &'a [f32]) -> (Matrix<'a>, Option<Matrix<'a>>) {
+        let inputs = self.features + self.joined_width;
         let weight = Matrix::new(weight, weight.len() / inputs, inputs);
         let joined = self
             .is_joined()
@@ -125,13 +125,13 @@ impl Block {
             None => bias.to_vec(),
             Some((joined, weight)) => {
                 let product = self.product(joined, weight.transposed());
-                product.added_to(bias).to_vec()
+                product.with_biases(bias).to_vec()
             }
         }
     }
 
     /// Returns `sum` plus the gradient of a weight, whose first columns belong to x and the others to the joined input.
-    fn of_weight(
+    fn weight_gradient(
         &self,
         sum: Option<Vec<f32>>,
         grad: Matrix<'_>,
@@ -140,9 +140,9 @@ impl Block {
     ) -> Vec<f32> {
         let product = self.product(grad.transposed(), x);
         let Some((sums, joined)) = joined else {
-            return product.summed(sum);
+            return product.added_to_sum(sum);
         };
-        let inputs = self.features + self.joins;
+        let inputs = self.features + self.joined_width;
         let mut sum = sum.unwrap_or_else(|| vec![0.0; grad.cols * inputs]);
         product.add_to_columns(&mut sum, inputs, 0);
         self.product(sums.transposed(), joined)
@@ -152,38 +152,38 @@ impl Block {
 }
 
 /// The inputs are x, and the joined input or, without one, the hidden layer's bias.
-impl Operation<2> for Block {
+impl Operation<2> for ResidualBlock {
     const NAME: &'static str = "residual-block";
 
     /// relu(hidden([x, joined])) [rows, hidden].
-    type Kept = Buffer<f32>;
+    type Saved = Buffer<f32>;
 
-    fn forward(&self, [x, joined]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
+    fn forward(&self, [x, joined]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Saved)> {
         let parameters = &self.parameters;
         let x = Matrix::new(x.floats()?, self.rows, self.features);
         let joined = joined.floats()?;
         let joined = self
             .is_joined()
-            .then(|| Matrix::new(joined, self.groups, self.joins));
+            .then(|| Matrix::new(joined, self.groups, self.joined_width));
 
         let weight = values_of(&parameters.hidden_weight)?;
-        let (weight, of_joined) = self.parts(&weight);
-        let biases = self.biases(&values_of(&parameters.hidden_bias)?, joined.zip(of_joined));
+        let (weight, w_joined) = self.split_weight(&weight);
+        let biases = self.biases(&values_of(&parameters.hidden_bias)?, joined.zip(w_joined));
         let mut hidden = Buffer::new(self.rows * self.hidden);
         self.product(x, weight.transposed())
-            .added_to(&biases)
+            .with_biases(&biases)
             .then(&|_, rows| relu_in_place(rows))
             .write(&mut hidden, Mode::Replace);
 
         let weight = values_of(&parameters.skip_weight)?;
-        let (weight, of_joined) = self.parts(&weight);
+        let (weight, w_joined) = self.split_weight(&weight);
         let mut bias = vec![0.0; self.outputs];
         for part in &parameters.out_biases {
             add_rows(&mut bias, &values_of(part)?);
         }
-        let biases = self.biases(&bias, joined.zip(of_joined));
+        let biases = self.biases(&bias, joined.zip(w_joined));
         let product = self.product(x, weight.transposed());
-        let mut y = product.added_to(&biases).to_vec();
+        let mut y = product.with_biases(&biases).to_vec();
         let weight = values_of(&parameters.out_weight)?;
         let weight = Matrix::new(&weight, self.outputs, self.hidden);
         let active = Matrix::new(&hidden, self.rows, self.hidden);
@@ -196,7 +196,7 @@ impl Operation<2> for Block {
     fn backward(
         &self,
         [x, joined]: [&Tensor; 2],
-        hidden: &Self::Kept,
+        hidden: &Self::Saved,
         _y: &Tensor,
         grad_y: &[f32],
     ) -> Result<[Option<Vec<f32>>; 2]> {
@@ -206,8 +206,8 @@ impl Operation<2> for Block {
         let x = Matrix::new(&x, self.rows, self.features);
         let parameters = &self.parameters;
         let active = Matrix::new(hidden, self.rows, self.hidden);
-        let to_out = self.product(grad.transposed(), active);
-        sum_in_place(&parameters.out_weight, |sum| to_out.summed(sum))?;
+        let out_gradient = self.product(grad.transposed(), active);
+        accumulate_in_place(&parameters.out_weight, |sum| out_gradient.added_to_sum(sum))?;
 
         let out = values_of(&parameters.out_weight)?;
         let out = Matrix::new(&out, self.outputs, self.hidden);
@@ -223,18 +223,18 @@ impl Operation<2> for Block {
             .write(&mut grad_hidden, Mode::Replace);
 
         // For each group, the summed gradients of its rows with respect to the hidden layer's biases and the outputs' biases.
-        let of_groups = |grads: &[f32], width: usize| -> Option<Vec<f32>> {
+        let sum_groups = |grads: &[f32], width: usize| -> Option<Vec<f32>> {
             (self.groups < self.rows).then(|| group_sums(grads, self.groups, width))
         };
-        let hidden_sums = of_groups(&grad_hidden, self.hidden);
+        let hidden_sums = sum_groups(&grad_hidden, self.hidden);
         let hidden_sums = hidden_sums.as_deref().unwrap_or(&grad_hidden);
-        let out_sums = of_groups(grad_y, self.outputs);
+        let out_sums = sum_groups(grad_y, self.outputs);
         let out_sums = out_sums.as_deref().unwrap_or(grad_y);
 
         let joined = values_of(joined)?;
         let joined = self
             .is_joined()
-            .then(|| Matrix::new(&joined, self.groups, self.joins));
+            .then(|| Matrix::new(&joined, self.groups, self.joined_width));
         let hidden_weight = values_of(&parameters.hidden_weight)?;
         let skip_weight = values_of(&parameters.skip_weight)?;
         let mut gradients = [None, None];
@@ -249,23 +249,23 @@ impl Operation<2> for Block {
         ];
         for (weight, values, grad, sums) in layers {
             let sums = Matrix::new(sums, self.groups, grad.cols);
-            sum_in_place(weight, |sum| {
-                self.of_weight(sum, grad, x, joined.map(|it| (sums, it)))
+            accumulate_in_place(weight, |sum| {
+                self.weight_gradient(sum, grad, x, joined.map(|it| (sums, it)))
             })?;
-            let (of_x, of_joined) = self.parts(values);
-            let parts = [Some((grad, of_x)), of_joined.map(|weight| (sums, weight))];
+            let (w_x, w_joined) = self.split_weight(values);
+            let parts = [Some((grad, w_x)), w_joined.map(|weight| (sums, weight))];
             for ((gradient, part), wanted) in gradients.iter_mut().zip(parts).zip(wanted) {
                 if let Some((grad, weight)) = part.filter(|_| wanted) {
-                    *gradient = Some(self.product(grad, weight).summed(gradient.take()));
+                    *gradient = Some(self.product(grad, weight).added_to_sum(gradient.take()));
                 }
             }
         }
-        let of_bias = |sums: &[f32], width| group_sums(sums, 1, width);
-        let hidden_bias = of_bias(hidden_sums, self.hidden);
-        sum_in_place(&parameters.hidden_bias, |sum| add_to(sum, hidden_bias))?;
-        let out_bias = of_bias(out_sums, self.outputs);
+        let sum_rows = |sums: &[f32], width| group_sums(sums, 1, width);
+        let hidden_bias = sum_rows(hidden_sums, self.hidden);
+        accumulate_in_place(&parameters.hidden_bias, |sum| add_to_sum(sum, hidden_bias))?;
+        let out_bias = sum_rows(out_sums, self.outputs);
         for bias in &parameters.out_biases {
-            sum_in_place(bias, |sum| add_to(sum, out_bias.clone()))?;
+            accumulate_in_place(bias, |sum| add_to_sum(sum, out_bias.clone()))?;
         }
         Ok(gradients)
     }

@@ -10,14 +10,14 @@ vectorized! {
 }
 
 vectorized! {
-    /// Stores pixels as operands of a sum over windows: [`Element::steps_of_bytes`].
-    pub(crate) fn store_steps_of_bytes<S>(
+    /// Stores pixels as operands of a sum over windows: [`Element::store_byte_steps`].
+    pub(crate) fn store_byte_steps<S>(
         simd,
         bytes: &'a [u8],
         shift: usize,
         steps: &'a mut [S::Element],
     ) {
-        S::Element::steps_of_bytes(simd, bytes, shift, steps);
+        S::Element::store_byte_steps(simd, bytes, shift, steps);
     }
 }
 
@@ -47,14 +47,14 @@ vectorized! {
 }
 
 vectorized! {
-    /// Stores elements as operands of a sum over windows: [`Element::steps_of`].
-    pub(crate) fn store_steps_of<S>(
+    /// Stores elements as operands of a sum over windows: [`Element::store_steps`].
+    pub(crate) fn store_steps<S>(
         simd,
         values: &'a [S::Element],
         shift: usize,
         steps: &'a mut [S::Element],
     ) {
-        S::Element::steps_of(simd, values, shift, steps);
+        S::Element::store_steps(simd, values, shift, steps);
     }
 }
 
@@ -65,7 +65,7 @@ vectorized! {
         values: &'a [f32],
         rows: usize,
         cols: usize,
-        turned: &'a mut [f32],
+        transposed: &'a mut [f32],
     ) {
         for row in (0..rows).step_by(LANES) {
             for col in (0..cols).step_by(LANES) {
@@ -79,8 +79,8 @@ vectorized! {
                 }
                 simd.transpose(&mut block);
                 for (line, block) in block.iter().enumerate().take(width) {
-                    let turned = &mut turned[(col + line) * rows + row..][..height];
-                    for (value, &bits) in turned.iter_mut().zip(block) {
+                    let transposed = &mut transposed[(col + line) * rows + row..][..height];
+                    for (value, &bits) in transposed.iter_mut().zip(block) {
                         *value = f32::from_bits(bits);
                     }
                 }
@@ -99,10 +99,10 @@ mod tests {
     fn every_instruction_set_turns_images_of_any_size() {
         for [rows, cols] in [[1, 1], [16, 64], [17, 15], [3, 70], [33, 32], [5, 0]] {
             let values: Vec<f32> = (0..rows * cols).map(|at| at as f32).collect();
-            for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
-                let mut turned = vec![f32::NAN; values.len()];
-                with_simd!(simd, simd => transpose(simd, &values, rows, cols, &mut turned));
-                for (at, &value) in turned.iter().enumerate() {
+            for simd in Precision::ALL.into_iter().flat_map(AnySimd::all_available) {
+                let mut transposed = vec![f32::NAN; values.len()];
+                with_simd!(simd, simd => transpose(simd, &values, rows, cols, &mut transposed));
+                for (at, &value) in transposed.iter().enumerate() {
                     assert_eq!(value, values[at % rows * cols + at / rows]);
                 }
             }

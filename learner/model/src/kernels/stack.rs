@@ -6,7 +6,7 @@ use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{Convolution, backward, forward};
 use crate::kernels::images::{Images, Pixels};
 use crate::kernels::isa::{Element, Simd};
-use crate::kernels::tasks::{cut_mut, parameters_len, prepared};
+use crate::kernels::tasks::{parameters_len, prepare_layers, split_parameters_mut};
 
 /// The maps of all layers but the last, which the forward pass keeps for the backward pass.
 pub(crate) type SavedActivations<E> = Vec<Buffer<E>>;
@@ -19,16 +19,16 @@ pub(crate) struct Stack<S: Simd> {
 
 impl<S: Simd> Stack<S> {
     /// Prepares at least one layer. `parameters` holds each layer's weight [out, in, k, k], then its bias [out]. `backward` says whether
-    /// a backward pass follows. It computes the inputs' gradients of all layers but the first, and of the first if `images` is set.
+    /// a backward pass follows. It computes the inputs' gradients of all layers but the first, and of the first if `image_grad`.
     pub(crate) fn new(
         simd: S,
         shapes: &[ConvShape],
         parameters: &[f32],
         backward: bool,
-        images: bool,
+        image_grad: bool,
     ) -> Self {
-        let layers = prepared(shapes, parameters, |index, shape, [weight, bias]| {
-            let backward = backward && (index > 0 || images);
+        let layers = prepare_layers(shapes, parameters, |index, shape, [weight, bias]| {
+            let backward = backward && (index > 0 || image_grad);
             Convolution::new(simd, shape, weight, bias, backward)
         });
         Self { simd, layers }
@@ -76,7 +76,8 @@ impl<S: Simd> Stack<S> {
         let mut sums = Buffer::new(parameters_len(&shapes));
         // The gradient of the current layer's output. `None` for the last layer, whose gradient is `grad_maps`.
         let mut grad_output: Option<Buffer<f32>> = None;
-        let layers = self.layers.iter().zip(cut_mut(&shapes, &mut sums));
+        let parts = split_parameters_mut(&shapes, &mut sums);
+        let layers = self.layers.iter().zip(parts);
         for (index, (layer, sums)) in layers.enumerate().rev() {
             let before = index.checked_sub(1).map(|before| &saved[before]);
             let input = input_of(images, before);

@@ -2,13 +2,13 @@
 //! blocks x + conv(relu(conv(relu(x)))) each. It knows no tensors: `impala` splits the batch, `bordered` computes each convolution.
 
 use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, pooled};
-use crate::kernels::bordered::{BorderedConvolution, Inside, store_active};
+use crate::kernels::bordered::{BorderedConvolution, Interior, store_relu};
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{finish_row, pass_active};
+use crate::kernels::convolution::{relu_backward, store_relu_row};
 use crate::kernels::isa::{Element, Simd, vectorized};
 use crate::kernels::linear::relu_gradient;
 use crate::kernels::pool::{pool, unpool};
-use crate::kernels::tasks::{cut_mut, parameters_len, prepared};
+use crate::kernels::tasks::{parameters_len, prepare_layers, split_parameters_mut};
 
 /// All stages, their parameters packed for the kernels.
 pub(crate) struct Stages<S: Simd> {
@@ -17,7 +17,7 @@ pub(crate) struct Stages<S: Simd> {
 }
 
 /// State that the forward pass of some images keeps for the backward pass.
-pub(crate) struct Saved<E: Element> {
+pub(crate) struct Tape<E: Element> {
     /// For each image, the inputs of all convolutions but the first, with their borders. Each is the operand
     /// of a product. If a ReLU comes before it, it is above 0 exactly where a gradient passes that ReLU.
     inputs: Buffer<E>,
@@ -29,7 +29,7 @@ impl<S: Simd> Stages<S> {
     /// Prepares stages of convolutions with these shapes. `parameters` holds each one's weight
     /// [out, in, 3, 3], then its bias [out]. `backward` says whether a backward pass follows.
     pub(crate) fn new(simd: S, shapes: &[ConvShape], parameters: &[f32], backward: bool) -> Self {
-        let convolutions = prepared(shapes, parameters, |index, shape, [weight, bias]| {
+        let convolutions = prepare_layers(shapes, parameters, |index, shape, [weight, bias]| {
             BorderedConvolution::new(simd, shape, weight, bias, backward && index > 0)
         });
         Self { simd, convolutions }
@@ -48,16 +48,16 @@ impl<S: Simd> Stages<S> {
     }
 
     /// Allocates memory for what the forward pass of this many images keeps.
-    pub(crate) fn saved(&self, images: usize) -> Saved<S::Element> {
-        let (inputs, taken) = self.saved_lens();
-        Saved {
+    pub(crate) fn allocate_tape(&self, images: usize) -> Tape<S::Element> {
+        let (inputs, taken) = self.tape_lens();
+        Tape {
             inputs: Buffer::new(images * inputs),
             taken: Buffer::new(images * taken),
         }
     }
 
-    /// The numbers of scalars per image in the two fields of [`Saved`].
-    fn saved_lens(&self) -> (usize, usize) {
+    /// The numbers of scalars per image in the two fields of [`Tape`].
+    fn tape_lens(&self) -> (usize, usize) {
         let inputs = self.convolutions[1..].iter();
         let inputs = inputs.map(|it| it.shape().bordered_len::<S::Element>());
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
@@ -68,12 +68,12 @@ impl<S: Simd> Stages<S> {
     }
 
     /// Computes f3 of some images, one after the other.
-    pub(crate) fn forward(&self, images: &[u8], saved: &mut Saved<S::Element>, f3: &mut [f32]) {
-        let (inputs, taken) = self.saved_lens();
+    pub(crate) fn forward(&self, images: &[u8], tape: &mut Tape<S::Element>, f3: &mut [f32]) {
+        let (inputs, taken) = self.tape_lens();
         images
             .chunks_exact(self.image_len())
-            .zip(saved.inputs.chunks_exact_mut(inputs))
-            .zip(saved.taken.chunks_exact_mut(taken))
+            .zip(tape.inputs.chunks_exact_mut(inputs))
+            .zip(tape.taken.chunks_exact_mut(taken))
             .zip(f3.chunks_exact_mut(self.output_len()))
             .for_each(|(((image, inputs), taken), f3)| self.forward_one(image, inputs, taken, f3));
     }
@@ -91,12 +91,12 @@ impl<S: Simd> Stages<S> {
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate() {
             let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
-            let (input, inside, scale) = if stage == 0 {
-                (&mut first[..], Inside::Bytes(image), S::Element::BYTE_SCALE)
+            let (input, content, scale) = if stage == 0 {
+                (&mut *first, Interior::Bytes(image), S::Element::BYTE_SCALE)
             } else {
-                (cut_input(conv, &mut inputs), Inside::Maps(&x), 1.0)
+                (take_input(conv, &mut inputs), Interior::Maps(&x), 1.0)
             };
-            conv.shape().put_inside(simd, inside, input);
+            conv.shape().write_interior(simd, content, input);
             let mut maps = Buffer::new(conv.shape().map_len());
             conv.forward(simd, input, |y, row| {
                 let to = &mut maps[y * row.len()..][..row.len()];
@@ -108,13 +108,13 @@ impl<S: Simd> Stages<S> {
             pool(simd, &maps, conv.shape().output(), &mut x, own);
             for block in blocks {
                 let (one, two) = (&block[0], &block[1]);
-                let outer = cut_input(one, &mut inputs);
-                one.shape().put_inside(simd, Inside::Active(&x), outer);
-                let inner = cut_input(two, &mut inputs);
+                let outer = take_input(one, &mut inputs);
+                one.shape().write_interior(simd, Interior::Relu(&x), outer);
+                let inner = take_input(two, &mut inputs);
                 two.shape().clear_border(inner);
                 one.forward(simd, outer, |y, row| {
-                    let to = &mut inner[two.shape().inside(y)];
-                    finish_row(simd, row, one.bias(), 1.0, to);
+                    let to = &mut inner[two.shape().interior_row(y)];
+                    store_relu_row(simd, row, one.bias(), 1.0, to);
                 });
                 two.forward(simd, inner, |y, row| {
                     let to = &mut x[y * row.len()..][..row.len()];
@@ -122,30 +122,31 @@ impl<S: Simd> Stages<S> {
                 });
             }
         }
-        store_active(simd, &x, f3);
+        store_relu(simd, &x, f3);
     }
 
-    /// Computes the gradients of all parameters for `grad_f3`. `saved` and `f3` are from the forward pass of
+    /// Computes the gradients of all parameters for `grad_f3`. `tape` and `f3` are from the forward pass of
     /// `images`. Returns for each convolution the weight's gradient [3, 3, in, out], then the bias's.
     pub(crate) fn backward(
         &self,
         images: &[u8],
-        saved: &Saved<S::Element>,
+        tape: &Tape<S::Element>,
         f3: &[f32],
         grad_f3: &[f32],
     ) -> Buffer<f32> {
         let shapes: Vec<_> = self.convolutions.iter().map(|it| *it.shape()).collect();
         let mut sums = Buffer::zeros(parameters_len(&shapes));
-        let ((inputs, taken), len) = (self.saved_lens(), self.output_len());
+        let ((inputs, taken), len) = (self.tape_lens(), self.output_len());
         images
             .chunks_exact(self.image_len())
-            .zip(saved.inputs.chunks_exact(inputs))
-            .zip(saved.taken.chunks_exact(taken))
+            .zip(tape.inputs.chunks_exact(inputs))
+            .zip(tape.taken.chunks_exact(taken))
             .zip(f3.chunks_exact(len).zip(grad_f3.chunks_exact(len)))
             .for_each(|(((image, inputs), taken), (f3, grad_f3))| {
                 let mut grad = Buffer::new(len);
-                pass_active(self.simd, f3, grad_f3, &mut grad);
-                self.backward_one(image, inputs, taken, grad, cut_mut(&shapes, &mut sums));
+                relu_backward(self.simd, f3, grad_f3, &mut grad);
+                let own_sums = split_parameters_mut(&shapes, &mut sums);
+                self.backward_one(image, inputs, taken, grad, own_sums);
             });
         // Products with bytes are scaled only now.
         for sum in &mut sums[..shapes[0].weight_len()] {
@@ -165,41 +166,41 @@ impl<S: Simd> Stages<S> {
     ) {
         let simd = self.simd;
         let mut own_sums =
-            |convolution: &BorderedConvolution<S::Element>, input: &[S::Element], grad: &[f32]| {
+            |conv: &BorderedConvolution<S::Element>, input: &[S::Element], grad: &[f32]| {
                 let own = sums.pop().expect("each convolution has sums");
-                convolution.parameter_gradients(simd, input, grad, own);
+                conv.parameter_gradients(simd, input, grad, own);
             };
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate().rev() {
             let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
             for block in blocks.rev() {
                 let (one, two) = (&block[0], &block[1]);
-                let inner = last_input(two, &mut inputs);
-                let outer = last_input(one, &mut inputs);
+                let inner = take_last_input(two, &mut inputs);
+                let outer = take_last_input(one, &mut inputs);
                 own_sums(two, inner, &grad);
                 let mut between = Buffer::<f32>::new(one.shape().map_len());
                 two.image_gradient(simd, &grad, |y, row| {
                     let to = &mut between[y * row.len()..][..row.len()];
-                    pass_active(simd, &inner[two.shape().inside(y)], row, to);
+                    relu_backward(simd, &inner[two.shape().interior_row(y)], row, to);
                 });
                 own_sums(one, outer, &between);
                 one.image_gradient(simd, &between, |y, row| {
                     let to = &mut grad[y * row.len()..][..row.len()];
-                    add_active(simd, &outer[one.shape().inside(y)], row, to);
+                    add_relu_backward(simd, &outer[one.shape().interior_row(y)], row, to);
                 });
             }
             let before;
-            (taken, before) = cut_last(taken, grad.len());
+            (taken, before) = split_tail(taken, grad.len());
             let mut grad_maps = Buffer::zeros(conv.shape().map_len());
             unpool(simd, &grad, conv.shape().output(), before, &mut grad_maps);
             if stage == 0 {
-                let mut room = Buffer::new(conv.shape().bordered_len::<S::Element>());
+                let mut input = Buffer::new(conv.shape().bordered_len::<S::Element>());
                 conv.shape()
-                    .put_inside(simd, Inside::Bytes(image), &mut room);
-                own_sums(conv, &room, &grad_maps);
+                    .write_interior(simd, Interior::Bytes(image), &mut input);
+                own_sums(conv, &input, &grad_maps);
                 return;
             }
-            own_sums(conv, last_input(conv, &mut inputs), &grad_maps);
+            own_sums(conv, take_last_input(conv, &mut inputs), &grad_maps);
             grad = Buffer::new(conv.shape().locations() * conv.shape().channels_in);
             conv.image_gradient(simd, &grad_maps, |y, row| {
                 grad[y * row.len()..][..row.len()].copy_from_slice(row);
@@ -214,22 +215,25 @@ fn pooled_len<E: Element>(conv: &BorderedConvolution<E>) -> usize {
     height * width * channels
 }
 
-/// Takes the memory for the input of `of` off the start of `inputs`.
-fn cut_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a mut [E]) -> &'a mut [E] {
-    let (own, rest) = std::mem::take(inputs).split_at_mut(of.shape().bordered_len::<E>());
+/// Takes the memory for the input of `conv` off the start of `inputs`.
+fn take_input<'a, E: Element>(
+    conv: &BorderedConvolution<E>,
+    inputs: &mut &'a mut [E],
+) -> &'a mut [E] {
+    let (own, rest) = std::mem::take(inputs).split_at_mut(conv.shape().bordered_len::<E>());
     *inputs = rest;
     own
 }
 
 /// Takes the input of `of` off the end of `inputs`.
-fn last_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a [E]) -> &'a [E] {
+fn take_last_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a [E]) -> &'a [E] {
     let own;
-    (*inputs, own) = cut_last(inputs, of.shape().bordered_len::<E>());
+    (*inputs, own) = split_tail(inputs, of.shape().bordered_len::<E>());
     own
 }
 
 /// Splits `values` into all but the last `len`, and the last `len`.
-fn cut_last<T>(values: &[T], len: usize) -> (&[T], &[T]) {
+fn split_tail<T>(values: &[T], len: usize) -> (&[T], &[T]) {
     values.split_at(values.len() - len)
 }
 
@@ -251,7 +255,7 @@ vectorized! {
 
 vectorized! {
     /// Adds to `to` the gradients before a ReLU whose output was `active`.
-    fn add_active<S>(simd, active: &'a [S::Element], grads: &'a [f32], to: &'a mut [f32]) {
+    fn add_relu_backward<S>(simd, active: &'a [S::Element], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
             *to += relu_gradient(active.value(), grad);
         }

@@ -64,7 +64,7 @@ impl Tasks {
             .with_max_len(1)
             .map(|(index, (saved, grad_images))| backward(self.task(index), saved, grad_images))
             .collect();
-        unpacked(shapes, &add_in_order(&sums, parameters_len(shapes)))
+        unpack_weights(shapes, &add_in_order(&sums, parameters_len(shapes)))
     }
 }
 
@@ -74,7 +74,10 @@ pub(crate) fn parameters_len(shapes: &[ConvShape]) -> usize {
 }
 
 /// Cuts `parameters` into the weight and the bias of each convolution.
-pub(crate) fn cut<'a>(shapes: &[ConvShape], mut parameters: &'a [f32]) -> Vec<[&'a [f32]; 2]> {
+pub(crate) fn split_parameters<'a>(
+    shapes: &[ConvShape],
+    mut parameters: &'a [f32],
+) -> Vec<[&'a [f32]; 2]> {
     let mut parts = Vec::with_capacity(shapes.len());
     for shape in shapes {
         let (own, rest) = parameters.split_at(shape.parameters_len());
@@ -84,8 +87,8 @@ pub(crate) fn cut<'a>(shapes: &[ConvShape], mut parameters: &'a [f32]) -> Vec<[&
     parts
 }
 
-/// As [`cut`], but mutable.
-pub(crate) fn cut_mut<'a>(
+/// As [`split_parameters`], but mutable.
+pub(crate) fn split_parameters_mut<'a>(
     shapes: &[ConvShape],
     mut parameters: &'a mut [f32],
 ) -> Vec<[&'a mut [f32]; 2]> {
@@ -99,12 +102,13 @@ pub(crate) fn cut_mut<'a>(
 }
 
 /// Calls `prepare` with each convolution's index, shape, weight and bias. Runs on the pool, because every task waits for the result.
-pub(crate) fn prepared<C: Send>(
+pub(crate) fn prepare_layers<C: Send>(
     shapes: &[ConvShape],
     parameters: &[f32],
     prepare: impl Fn(usize, ConvShape, [&[f32]; 2]) -> C + Sync,
 ) -> Vec<C> {
-    let layers = shapes.par_iter().zip(cut(shapes, parameters)).enumerate();
+    let parts = split_parameters(shapes, parameters);
+    let layers = shapes.par_iter().zip(parts).enumerate();
     layers
         .with_max_len(1)
         .map(|(index, (&shape, parameters))| prepare(index, shape, parameters))
@@ -112,9 +116,10 @@ pub(crate) fn prepared<C: Send>(
 }
 
 /// Returns `sums` with the weights reordered to [out, in, k, k].
-pub(crate) fn unpacked(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
+pub(crate) fn unpack_weights(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
     let mut result = vec![0.0; sums.len()];
-    let (from, to) = (cut(shapes, sums), cut_mut(shapes, &mut result));
+    let from = split_parameters(shapes, sums);
+    let to = split_parameters_mut(shapes, &mut result);
     for (shape, (from, to)) in shapes.iter().zip(from.into_iter().zip(to)) {
         let ([packed, bias], [weight, bias_to]) = (from, to);
         shape.unpack_weight(packed, weight);

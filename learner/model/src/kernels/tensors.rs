@@ -8,7 +8,7 @@ use crate::kernels::images::Pixels;
 
 /// Returns the scalars of a contiguous f32 storage.
 pub fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
-    Ok(&storage.as_slice::<f32>()?[range(layout)?])
+    Ok(&storage.as_slice::<f32>()?[contiguous_range(layout)?])
 }
 
 /// An input of an operation.
@@ -30,21 +30,21 @@ impl<'a> Input<'a> {
     /// Returns contiguous images of u8 or f32.
     pub(crate) fn pixels(self) -> Result<Pixels<'a>> {
         match self.storage {
-            CpuStorage::U8(bytes) => Ok(Pixels::Bytes(&bytes[range(self.layout)?])),
+            CpuStorage::U8(bytes) => Ok(Pixels::Bytes(&bytes[contiguous_range(self.layout)?])),
             _ => self.floats().map(Pixels::Floats),
         }
     }
 }
 
 /// Returns the storage, or an error if it is not on the CPU.
-pub(crate) fn cpu(storage: &Storage) -> Result<&CpuStorage> {
+pub(crate) fn cpu_storage(storage: &Storage) -> Result<&CpuStorage> {
     match storage {
         Storage::Cpu(storage) => Ok(storage),
         _ => bail!("this operation runs on the CPU only"),
     }
 }
 
-fn range(layout: &Layout) -> Result<Range<usize>> {
+fn contiguous_range(layout: &Layout) -> Result<Range<usize>> {
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(start..end),
         None => bail!("a tensor of shape {:?} must be contiguous", layout.shape()),
@@ -60,8 +60,8 @@ pub struct Values<'a> {
 /// Returns the scalars of a contiguous f32 tensor on the CPU.
 pub fn values_of(tensor: &Tensor) -> Result<Values<'_>> {
     let (storage, layout) = tensor.storage_and_layout();
-    cpu(&storage)?.as_slice::<f32>()?;
-    let range = range(layout)?;
+    cpu_storage(&storage)?.as_slice::<f32>()?;
+    let range = contiguous_range(layout)?;
     Ok(Values { storage, range })
 }
 

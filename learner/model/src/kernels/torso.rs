@@ -6,18 +6,18 @@
 
 use candle_core::{Result, Tensor, bail};
 
-use crate::gradients::sum_in_place;
+use crate::gradients::accumulate_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
-use crate::kernels::conv::{ConvStack, stack_of};
+use crate::kernels::conv::{ConvStack, flatten_layers};
 use crate::kernels::isa::{AnySimd, Element, Mode, Simd, with_simd};
-use crate::kernels::linear::{add_to, group_sums, transpose_each};
-use crate::kernels::operation::{Operation, apply_to_two};
+use crate::kernels::linear::{add_to_sum, group_sums, transpose_images};
+use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
 use crate::kernels::stack::SavedActivations;
-use crate::kernels::tensors::{Input, cpu, values_of};
+use crate::kernels::tensors::{Input, cpu_storage, values_of};
 
 /// Computes [B, outputs] of `images` [B, H, W, C] u8: bit for bit
 /// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack).
@@ -31,7 +31,7 @@ pub(crate) fn torso(
     bias: &Tensor,
     precision: Precision,
 ) -> Result<Tensor> {
-    let (shapes, parameters) = stack_of(images, layers)?;
+    let (shapes, parameters) = flatten_layers(images, layers)?;
     let (count, outputs) = (images.dim(0)?, weight.dims2()?.0);
     let inputs = shapes[shapes.len() - 1].map_len();
     if weight.dims() != [outputs, inputs] || bias.dims() != [outputs] {
@@ -41,7 +41,7 @@ pub(crate) fn torso(
             bias.shape()
         );
     }
-    with_simd!(AnySimd::of(precision), simd => {
+    with_simd!(AnySimd::fastest(precision), simd => {
         let torso = Torso {
             stack: ConvStack { simd, shapes, count },
             weight: weight.clone(),
@@ -50,7 +50,7 @@ pub(crate) fn torso(
             outputs,
             precision,
         };
-        apply_to_two(torso, [images, &parameters], (count, outputs))
+        apply_op2(torso, [images, &parameters], (count, outputs))
     })
 }
 
@@ -65,7 +65,7 @@ struct Torso<S: Simd> {
 }
 
 /// State that the forward pass keeps for the backward pass.
-struct Kept<E: Element> {
+struct SavedState<E: Element> {
     /// For each task, the maps of all layers but the last, and those of the last.
     tasks: Vec<(SavedActivations<E>, Buffer<f32>)>,
     /// The last layer's maps, flattened.
@@ -75,17 +75,17 @@ struct Kept<E: Element> {
 impl<S: Simd> Operation<2> for Torso<S> {
     const NAME: &'static str = "torso";
 
-    type Kept = Kept<S::Element>;
+    type Saved = SavedState<S::Element>;
 
-    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
+    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Saved)> {
         let (stack, images) = (&self.stack, images.pixels()?);
-        let layers = stack.layers(parameters.floats()?, false, false);
-        let last = stack.last();
+        let layers = stack.prepare(parameters.floats()?, false, false);
+        let last = stack.last_shape();
         let mut flat = Buffer::<f32>::new(stack.count * self.inputs);
         let tasks = stack.tasks().forward(&mut flat, |task, flat| {
             let mut maps = Buffer::<f32>::new(flat.len());
             let saved = layers.forward(images.slice(task), &mut maps);
-            transpose_each(&maps, last.locations(), last.channels_out, flat);
+            transpose_images(&maps, last.locations(), last.channels_out, flat);
             (saved, maps)
         });
 
@@ -93,37 +93,37 @@ impl<S: Simd> Operation<2> for Torso<S> {
         let weight = Matrix::new(&weight, self.outputs, self.inputs);
         let x = Matrix::new(&flat, stack.count, self.inputs);
         let product = Product::new(self.precision, x, weight.transposed());
-        let y = product.added_to(&bias).to_vec();
-        Ok((y, Kept { tasks, flat }))
+        let y = product.with_biases(&bias).to_vec();
+        Ok((y, SavedState { tasks, flat }))
     }
 
     fn backward(
         &self,
         [images, parameters]: [&Tensor; 2],
-        kept: &Self::Kept,
+        saved: &Self::Saved,
         _y: &Tensor,
         grad_y: &[f32],
     ) -> Result<[Option<Vec<f32>>; 2]> {
         let stack = &self.stack;
         let grad = Matrix::new(grad_y, stack.count, self.outputs);
-        let x = Matrix::new(&kept.flat, stack.count, self.inputs);
-        let to_weight = Product::new(self.precision, grad.transposed(), x);
-        sum_in_place(&self.weight, |sum| to_weight.summed(sum))?;
-        let to_bias = group_sums(grad_y, 1, self.outputs);
-        sum_in_place(&self.bias, |sum| add_to(sum, to_bias))?;
+        let x = Matrix::new(&saved.flat, stack.count, self.inputs);
+        let weight_gradient = Product::new(self.precision, grad.transposed(), x);
+        accumulate_in_place(&self.weight, |sum| weight_gradient.added_to_sum(sum))?;
+        let bias_gradient = group_sums(grad_y, 1, self.outputs);
+        accumulate_in_place(&self.bias, |sum| add_to_sum(sum, bias_gradient))?;
 
         let weight = values_of(&self.weight)?;
         let weight = Matrix::new(&weight, self.outputs, self.inputs);
         let mut grad_flat = Buffer::<f32>::new(stack.count * self.inputs);
         Product::new(self.precision, grad, weight).write(&mut grad_flat, Mode::Replace);
         let (storage, layout) = images.storage_and_layout();
-        let images = Input::new(cpu(&storage)?, layout).pixels()?;
-        let layers = stack.layers(&values_of(parameters)?, true, false);
-        let (tasks, last) = (stack.tasks(), stack.last());
-        let gradient = tasks.backward(&stack.shapes, &kept.tasks, &mut [], |task, kept, _| {
-            let ((saved, maps), flat) = (kept, &grad_flat[task.maps]);
+        let images = Input::new(cpu_storage(&storage)?, layout).pixels()?;
+        let layers = stack.prepare(&values_of(parameters)?, true, false);
+        let (tasks, last) = (stack.tasks(), stack.last_shape());
+        let gradient = tasks.backward(&stack.shapes, &saved.tasks, &mut [], |task, saved, _| {
+            let ((saved, maps), flat) = (saved, &grad_flat[task.maps]);
             let mut grad_maps = Buffer::<f32>::new(flat.len());
-            transpose_each(flat, last.channels_out, last.locations(), &mut grad_maps);
+            transpose_images(flat, last.channels_out, last.locations(), &mut grad_maps);
             let images = images.slice(task.images);
             layers.backward(images, saved, maps, &grad_maps, None)
         });

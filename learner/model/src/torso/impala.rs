@@ -93,10 +93,10 @@ impl Torso for Impala {
     ) -> Box<dyn ActingTorso> {
         let (layers, fc) = (parameters.in_line(), parameters.fc);
         let (shapes, (_, _, channels)) = stages(self.input, &self.widths);
-        with_simd!(AnySimd::of(precision), simd => Box::new(ActingStages {
+        with_simd!(AnySimd::fastest(precision), simd => Box::new(ActingStages {
             simd,
             stages: Stages::new(simd, &shapes, &layers, false),
-            fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
+            fc: Dense::for_maps(simd, &fc.weight, fc.bias, channels),
             takes_mean: self.takes_mean,
         }))
     }
@@ -116,10 +116,10 @@ impl<S: Simd> ActingTorso for ActingStages<S> {
         let count = images.len();
         let stride = self.fc.row_len();
         let mut rows = Buffer::new(count * stride);
-        let (mut saved, mut f3) = (stages.saved(1), Buffer::new(stages.output_len()));
+        let (mut tape, mut f3) = (stages.allocate_tape(1), Buffer::new(stages.output_len()));
         let each = rows.chunks_exact_mut(stride);
         for (image, row) in images.zip(each) {
-            stages.forward(image, &mut saved, &mut f3);
+            stages.forward(image, &mut tape, &mut f3);
             if self.takes_mean {
                 write_rows(simd, &mean_of_locations(&f3, inputs), inputs, stride, row);
             } else {

@@ -8,7 +8,7 @@ use crate::compute::Kernels;
 use crate::geometry::{ConvLayer, ConvShape};
 use crate::init::InitialLaw;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::dense::{Dense, whole_steps};
+use crate::kernels::dense::{Dense, pad_rows};
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
@@ -92,9 +92,9 @@ impl Torso for Nature {
     ) -> Box<dyn ActingTorso> {
         let channels = self.shapes.last().map_or(1, |last| last.channels_out);
         let (layers, fc) = (parameters.in_line(), parameters.fc);
-        with_simd!(AnySimd::of(precision), simd => Box::new(ActingNature {
+        with_simd!(AnySimd::fastest(precision), simd => Box::new(ActingNature {
             stack: Stack::new(simd, &self.shapes, &layers, false, false),
-            fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
+            fc: Dense::for_maps(simd, &fc.weight, fc.bias, channels),
         }))
     }
 }
@@ -109,6 +109,6 @@ impl<S: Simd> ActingTorso for ActingNature<S> {
         let (count, inputs) = (frames.len() / self.stack.image_len(), self.fc.inputs());
         let mut maps = Buffer::<S::Element>::new(count * inputs);
         self.stack.forward(Pixels::Bytes(frames), &mut maps);
-        self.fc.forward(&whole_steps(maps, inputs), count)
+        self.fc.forward(&pad_rows(maps, inputs), count)
     }
 }

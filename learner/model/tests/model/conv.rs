@@ -25,10 +25,8 @@ const SHAPES: [Shape; 8] = [
 /// Pixels that no window covers are cut off first, because candle's backward pass fails on them.
 fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
     let used = |size: usize, kernel: usize| (size - kernel) / stride * stride + kernel;
-    let (height, width) = (
-        used(images.dim(1)?, weight.dim(2)?),
-        used(images.dim(2)?, weight.dim(3)?),
-    );
+    let height = used(images.dim(1)?, weight.dim(2)?);
+    let width = used(images.dim(2)?, weight.dim(3)?);
     let images = images.narrow(1, 0, height)?.narrow(2, 0, width)?;
     let maps = images
         .permute((0, 3, 1, 2))?
@@ -158,11 +156,9 @@ fn a_nan_stays_in_its_image() -> Result<()> {
 #[test]
 fn shapes_that_do_not_match_are_errors() {
     let rng = &mut rng(4);
-    let (images, weight, bias) = (
-        floats(&[2, 6, 6, 3], rng),
-        floats(&[4, 3, 3, 3], rng),
-        floats(&[4], rng),
-    );
+    let images = floats(&[2, 6, 6, 3], rng);
+    let weight = floats(&[4, 3, 3, 3], rng);
+    let bias = floats(&[4], rng);
     let fails = |images: &Tensor, weight: &Tensor, bias: &Tensor, stride| {
         assert!(conv2d_relu(images, weight, bias, stride, Precision::F32).is_err());
     };

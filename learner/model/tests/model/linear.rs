@@ -51,11 +51,9 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
 #[test]
 fn leading_dimensions_and_a_plain_bias_are_kept() -> Result<()> {
     let rng = &mut rng(2);
-    let (x, w, b) = (
-        variable(&[2, 3, 4, 5], rng),
-        variable(&[7, 5], rng),
-        variable(&[7], rng),
-    );
+    let x = variable(&[2, 3, 4, 5], rng);
+    let w = variable(&[7, 5], rng);
+    let b = variable(&[7], rng);
     let y = linear(&x, &w, &b, Precision::F32)?;
     assert_eq!(y.dims(), [2, 3, 4, 7]);
     let flat = linear(&x.reshape((24, 5))?, &w, &b, Precision::F32)?;
@@ -80,11 +78,9 @@ fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
 #[test]
 fn shapes_that_do_not_match_are_errors() {
     let rng = &mut rng(3);
-    let (x, w, b) = (
-        floats(&[6, 5], rng),
-        floats(&[7, 5], rng),
-        floats(&[7], rng),
-    );
+    let x = floats(&[6, 5], rng);
+    let w = floats(&[7, 5], rng);
+    let b = floats(&[7], rng);
     assert!(linear(&x, &w, &b, Precision::F32).is_ok());
     assert!(linear(&x, &w, &floats(&[6], rng), Precision::F32).is_err());
     assert!(linear(&x, &floats(&[7, 4], rng), &b, Precision::F32).is_err());

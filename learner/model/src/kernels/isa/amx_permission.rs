@@ -5,7 +5,7 @@
 
 use std::arch::asm;
 
-/// Reads CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. `granted` checks that the operating system supports tiles.
+/// Reads CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. `request_permission` checks that the operating system supports tiles.
 #[allow(
     unused_unsafe,
     reason = "the instruction is unsafe in Rust 1.90 and safe in later ones"
@@ -19,7 +19,7 @@ pub(super) fn has_amx_bf16() -> bool {
 
 /// Asks Linux for the 8 KiB of tile state (`arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)`), for all threads.
 #[cfg(target_os = "linux")]
-pub(super) fn granted() -> bool {
+pub(super) fn request_permission() -> bool {
     const ARCH_PRCTL: i64 = 158;
     const ARCH_REQ_XCOMP_PERM: i64 = 0x1023;
     const XTILEDATA: i64 = 18;
@@ -40,6 +40,6 @@ pub(super) fn granted() -> bool {
 }
 
 #[cfg(not(target_os = "linux"))]
-pub(super) fn granted() -> bool {
+pub(super) fn request_permission() -> bool {
     false
 }

@@ -11,17 +11,17 @@ use half::bf16;
 use super::simd::LANES;
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
-pub(super) const STEPS: usize = 16;
-pub(super) const ROWS: usize = 16;
+pub(super) const TILE_STEPS: usize = 16;
+pub(super) const TILE_ROWS: usize = 16;
 /// The number of tile registers that serve as accumulators.
-pub(super) const SUMS: usize = 4;
+pub(super) const ACCUMULATORS: usize = 4;
 
-/// Eight tile registers: four accumulators, and a left and a right operand, each twice: for `STEPS` steps and for the remaining steps.
+/// Eight tile registers: four accumulators, and a left and a right operand, each twice: for whole rows of steps and for the remaining steps.
 ///
 /// # Safety
 /// For all methods: `configure` was called before, pointers may be read or written for the sizes given to it,
 /// and the processor has the instructions that the implementation uses.
-pub(super) trait Tiles {
+pub(super) trait TileRegisters {
     /// Sets the sizes: left operands [rows, steps], right ones [steps, 16], accumulators [rows, 16]. The
     /// second pair of operands has `tail` steps, 0 if there are none. The accumulators are 0 afterwards.
     unsafe fn configure(&mut self, rows: usize, tail: usize);
@@ -35,11 +35,11 @@ pub(super) trait Tiles {
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize);
 }
 
-pub(super) struct Hardware;
+pub(super) struct HardwareTiles;
 
 thread_local! {
     /// The rows and tail that this thread's registers are configured for. Configuring takes as long as ten products.
-    static SIZES: Cell<(usize, usize)> = const { Cell::new((0, 0)) };
+    static CONFIGURED: Cell<(usize, usize)> = const { Cell::new((0, 0)) };
 }
 
 /// The operand of `ldtilecfg`.
@@ -87,9 +87,9 @@ macro_rules! store {
 
 // SAFETY for all methods: the caller guarantees the pointers and the processor. Between the calls nothing else uses
 // tile registers: compilers use them only when told to, and every user of this module configures them again.
-impl Tiles for Hardware {
+impl TileRegisters for HardwareTiles {
     unsafe fn configure(&mut self, rows: usize, tail: usize) {
-        if SIZES.replace((rows, tail)) == (rows, tail) {
+        if CONFIGURED.replace((rows, tail)) == (rows, tail) {
             unsafe {
                 asm!("tilezero tmm0", "tilezero tmm1", "tilezero tmm2", "tilezero tmm3", options(nostack, nomem),
                     out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _);
@@ -107,11 +107,11 @@ impl Tiles for Hardware {
             // At most 16 rows and 64 bytes.
             (config.rows[tile], config.row_bytes[tile]) = (rows as u8, (columns * 4) as u16);
         };
-        for sums in 0..SUMS {
+        for sums in 0..ACCUMULATORS {
             set(sums, rows, LANES);
         }
-        set(4, rows, STEPS);
-        set(5, STEPS, LANES);
+        set(4, rows, TILE_STEPS);
+        set(5, TILE_STEPS, LANES);
         if tail > 0 {
             set(6, rows, tail);
             set(7, tail, LANES);

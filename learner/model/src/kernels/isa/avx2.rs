@@ -28,8 +28,8 @@ macro_rules! simd {
         impl $simd {
             /// Returns the instruction set if the processor and the operating system have AVX2 and fused multiply-add.
             pub(super) fn new() -> Option<Self> {
-                let there = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-                there.then_some(Self(()))
+                let is_available = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+                is_available.then_some(Self(()))
             }
 
             #[target_feature(enable = "avx2,fma")]
@@ -111,12 +111,12 @@ impl Vector for F32 {
     type Operand = [__m256; 2];
 
     #[inline(always)]
-    unsafe fn row(at: *const f32) -> [__m256; 2] {
+    unsafe fn load_row(at: *const f32) -> [__m256; 2] {
         unsafe { [_mm256_set1_ps(*at); 2] }
     }
 
     #[inline(always)]
-    unsafe fn columns(at: *const f32) -> [__m256; 2] {
+    unsafe fn load_columns(at: *const f32) -> [__m256; 2] {
         unsafe { [_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))] }
     }
 
@@ -163,12 +163,12 @@ impl Vector for Bf16 {
     type Operand = [__m256i; 2];
 
     #[inline(always)]
-    unsafe fn row(at: *const bf16) -> [__m256i; 2] {
+    unsafe fn load_row(at: *const bf16) -> [__m256i; 2] {
         unsafe { [_mm256_set1_epi32(at.cast::<i32>().read_unaligned()); 2] }
     }
 
     #[inline(always)]
-    unsafe fn columns(at: *const bf16) -> [__m256i; 2] {
+    unsafe fn load_columns(at: *const bf16) -> [__m256i; 2] {
         unsafe {
             [
                 _mm256_loadu_si256(at.cast()),

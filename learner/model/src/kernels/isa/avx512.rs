@@ -20,7 +20,7 @@ use super::{
 };
 
 /// Whether the processor and the operating system have the AVX-512 extensions of server processors.
-fn is_there() -> bool {
+fn has_avx512() -> bool {
     is_x86_feature_detected!("avx512f")
         && is_x86_feature_detected!("avx512bw")
         && is_x86_feature_detected!("avx512dq")
@@ -37,14 +37,14 @@ pub(crate) struct Bf16(());
 
 impl F32 {
     pub(super) fn new() -> Option<Self> {
-        is_there().then_some(Self(()))
+        has_avx512().then_some(Self(()))
     }
 }
 
 impl Bf16 {
     /// Returns the instruction set if the processor has AVX512_BF16 in addition to AVX-512.
     pub(super) fn new() -> Option<Self> {
-        (is_there() && is_x86_feature_detected!("avx512bf16")).then_some(Self(()))
+        (has_avx512() && is_x86_feature_detected!("avx512bf16")).then_some(Self(()))
     }
 }
 
@@ -75,7 +75,7 @@ macro_rules! simd {
             #[inline(always)]
             fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
                 // SAFETY: `new` found the instructions.
-                unsafe { transposed(block) }
+                unsafe { transpose_block(block) }
             }
 
             #[inline(always)]
@@ -119,31 +119,31 @@ macro_rules! bf16_rounding {
             #[inline(always)]
             fn round(self, values: &[f32], to: &mut [bf16]) {
                 // SAFETY: `new` found the instructions.
-                unsafe { avx512_rounding::rounded(values, to) }
+                unsafe { avx512_rounding::round(values, to) }
             }
 
             #[inline(always)]
             fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
                 // SAFETY: `new` found the instructions.
-                unsafe { avx512_rounding::rounded_pairs(first, second, pairs) }
+                unsafe { avx512_rounding::round_pairs(first, second, pairs) }
             }
 
             #[inline(always)]
             fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
                 // SAFETY: `new` found the instructions.
-                unsafe { avx512_rounding::paired(first, second, pairs) }
+                unsafe { avx512_rounding::pair(first, second, pairs) }
             }
 
             #[inline(always)]
-            fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
+            fn convert_bytes(self, bytes: &[u8], to: &mut [bf16]) {
                 // SAFETY: `new` found the instructions.
-                unsafe { avx512_rounding::of_bytes(bytes, to) }
+                unsafe { avx512_rounding::convert_bytes(bytes, to) }
             }
 
             #[inline(always)]
             fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
                 // SAFETY: `new` found the instructions.
-                unsafe { avx512_rounding::paired_bytes(first, second, pairs) }
+                unsafe { avx512_rounding::pair_bytes(first, second, pairs) }
             }
         }
     };
@@ -155,7 +155,7 @@ bf16_rounding!(Bf16);
 /// Transposes 16 registers of 16 words: exchanges 32-bit words, pairs of them, then quarters of registers twice.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,fma")]
-unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
+unsafe fn transpose_block(block: &mut [[u32; LANES]; LANES]) {
     // SAFETY: every row of the block is the 64 bytes of a register, read and written where it is.
     let rows: [__m512i; LANES] =
         std::array::from_fn(|row| unsafe { _mm512_loadu_si512(block[row].as_ptr().cast()) });
@@ -232,12 +232,12 @@ impl Vector for F32 {
     type Operand = __m512;
 
     #[inline(always)]
-    unsafe fn row(at: *const f32) -> __m512 {
+    unsafe fn load_row(at: *const f32) -> __m512 {
         unsafe { _mm512_set1_ps(*at) }
     }
 
     #[inline(always)]
-    unsafe fn columns(at: *const f32) -> __m512 {
+    unsafe fn load_columns(at: *const f32) -> __m512 {
         unsafe { _mm512_loadu_ps(at) }
     }
 
@@ -253,12 +253,12 @@ impl Vector for Bf16 {
     type Operand = __m512i;
 
     #[inline(always)]
-    unsafe fn row(at: *const bf16) -> __m512i {
+    unsafe fn load_row(at: *const bf16) -> __m512i {
         unsafe { _mm512_set1_epi32(at.cast::<i32>().read_unaligned()) }
     }
 
     #[inline(always)]
-    unsafe fn columns(at: *const bf16) -> __m512i {
+    unsafe fn load_columns(at: *const bf16) -> __m512i {
         unsafe { _mm512_loadu_si512(at.cast()) }
     }
 

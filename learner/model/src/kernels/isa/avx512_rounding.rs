@@ -19,17 +19,15 @@ use super::{element::Element, simd::LANES};
 /// `Rounding::round`, 32 values at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-pub(super) unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
+pub(super) unsafe fn round(values: &[f32], to: &mut [bf16]) {
     let to = &mut to[..values.len()];
     let (blocks, tail) = values.as_chunks::<{ 2 * LANES }>();
     let (to_blocks, to_tail) = to.as_chunks_mut::<{ 2 * LANES }>();
     for (block, to) in blocks.iter().zip(to_blocks) {
         // SAFETY: a block is two registers of f32, and what it is rounded to one of bf16.
         unsafe {
-            let (low, high) = (
-                _mm512_loadu_ps(block.as_ptr()),
-                _mm512_loadu_ps(block[LANES..].as_ptr()),
-            );
+            let low = _mm512_loadu_ps(block.as_ptr());
+            let high = _mm512_loadu_ps(block[LANES..].as_ptr());
             let words = transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(high, low));
             _mm512_storeu_si512(to.as_mut_ptr().cast(), words);
         }
@@ -48,7 +46,7 @@ pub(super) unsafe fn rounded(values: &[f32], to: &mut [bf16]) {
 /// `Rounding::round_pairs`, 16 pairs at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-pub(super) unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+pub(super) unsafe fn round_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {
     // Word i of a register of pairs is word i / 2 of the first row (words 0 to 15) if i is even, else of the second (16 to 31).
     const ORDER: [u16; 2 * LANES] = {
         let mut order = [0; 2 * LANES];
@@ -99,7 +97,7 @@ pub(super) unsafe fn rounded_pairs(first: &[f32], second: &[f32], pairs: &mut [b
 /// `Rounding::pair`, 32 pairs at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-pub(super) unsafe fn paired(first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
+pub(super) unsafe fn pair(first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
     // Word i of the first (second) register of pairs is word i / 2 (16 + i / 2) of the first row if i is even, else of the second.
     const ORDERS: [[u16; 2 * LANES]; 2] = {
         let mut orders = [[0; 2 * LANES]; 2];
@@ -121,10 +119,8 @@ pub(super) unsafe fn paired(first: &[bf16], second: &[bf16], pairs: &mut [bf16])
     for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
         // SAFETY: a block of either row is a register of bf16, and its pairs two.
         unsafe {
-            let (first, second) = (
-                _mm512_loadu_si512(first.as_ptr().cast()),
-                _mm512_loadu_si512(second.as_ptr().cast()),
-            );
+            let first = _mm512_loadu_si512(first.as_ptr().cast());
+            let second = _mm512_loadu_si512(second.as_ptr().cast());
             for (half, order) in pairs.chunks_exact_mut(2 * LANES).zip(orders) {
                 let words = _mm512_permutex2var_epi16(first, order, second);
                 _mm512_storeu_si512(half.as_mut_ptr().cast(), words);
@@ -140,16 +136,16 @@ pub(super) unsafe fn paired(first: &[bf16], second: &[bf16], pairs: &mut [bf16])
 /// Converts 16 bytes to f32, whose lower 16 bits are 0.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-unsafe fn floats_of(bytes: &[u8; LANES]) -> __m512 {
+unsafe fn bytes_to_floats(bytes: &[u8; LANES]) -> __m512 {
     // SAFETY: 16 bytes are a register of them.
     let bytes = unsafe { _mm_loadu_si128(bytes.as_ptr().cast()) };
     _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(bytes))
 }
 
-/// `Rounding::of_bytes`, 32 pixels at a time.
+/// `Rounding::convert_bytes`, 32 pixels at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-pub(super) unsafe fn of_bytes(bytes: &[u8], to: &mut [bf16]) {
+pub(super) unsafe fn convert_bytes(bytes: &[u8], to: &mut [bf16]) {
     let to = &mut to[..bytes.len()];
     let (blocks, tail) = bytes.as_chunks::<{ 2 * LANES }>();
     let (to_blocks, to_tail) = to.as_chunks_mut::<{ 2 * LANES }>();
@@ -159,20 +155,20 @@ pub(super) unsafe fn of_bytes(bytes: &[u8], to: &mut [bf16]) {
         };
         // SAFETY: 32 bytes become one register of bf16.
         unsafe {
-            let words = _mm512_cvtne2ps_pbh(floats_of(high), floats_of(low));
+            let words = _mm512_cvtne2ps_pbh(bytes_to_floats(high), bytes_to_floats(low));
             let words = transmute::<__m512bh, __m512i>(words);
             _mm512_storeu_si512(to.as_mut_ptr().cast(), words);
         }
     }
     for (to, &byte) in to_tail.iter_mut().zip(tail) {
-        *to = bf16::of_byte(byte);
+        *to = bf16::from_byte(byte);
     }
 }
 
 /// `Rounding::pair_bytes`, 16 pairs at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-pub(super) unsafe fn paired_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16]) {
+pub(super) unsafe fn pair_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16]) {
     let columns = first.len().min(second.len());
     let pairs = &mut pairs[..2 * columns];
     let (first_blocks, first_tail) = first[..columns].as_chunks::<LANES>();
@@ -181,15 +177,15 @@ pub(super) unsafe fn paired_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16
     for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
         // SAFETY: 16 bytes of each row become one register of pairs.
         unsafe {
-            let first = _mm512_srli_epi32::<16>(_mm512_castps_si512(floats_of(first)));
-            let second = _mm512_castps_si512(floats_of(second));
+            let first = _mm512_srli_epi32::<16>(_mm512_castps_si512(bytes_to_floats(first)));
+            let second = _mm512_castps_si512(bytes_to_floats(second));
             let words = _mm512_or_si512(first, second);
             _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words);
         }
     }
     let pairs = pair_tail.as_chunks_mut::<2>().0.iter_mut();
     for ((pair, &first), &second) in pairs.zip(first_tail).zip(second_tail) {
-        *pair = [first, second].map(bf16::of_byte);
+        *pair = [first, second].map(bf16::from_byte);
     }
 }
 

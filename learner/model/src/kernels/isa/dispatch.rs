@@ -51,14 +51,14 @@ pub(crate) use with_simd;
 type Candidate = fn() -> Option<AnySimd>;
 
 /// The instruction sets for each precision, fastest first. The last one runs anywhere.
-const F32: &[Candidate] = &[
+const F32_CANDIDATES: &[Candidate] = &[
     #[cfg(target_arch = "x86_64")]
     || avx512::F32::new().map(AnySimd::Avx512F32),
     #[cfg(target_arch = "x86_64")]
     || avx2::F32::new().map(AnySimd::Avx2F32),
     || Some(AnySimd::PortableF32(portable::F32)),
 ];
-const BF16: &[Candidate] = &[
+const BF16_CANDIDATES: &[Candidate] = &[
     #[cfg(target_arch = "x86_64")]
     || amx::Amx::new().map(AnySimd::Amx),
     #[cfg(target_arch = "x86_64")]
@@ -70,24 +70,24 @@ const BF16: &[Candidate] = &[
 
 impl AnySimd {
     /// Returns the fastest instruction set that this processor has for `precision`.
-    pub(crate) fn of(precision: Precision) -> Self {
-        let mut all = Self::there(precision);
-        all.next().expect("portable code runs anywhere")
+    pub(crate) fn fastest(precision: Precision) -> Self {
+        let mut available = Self::available(precision);
+        available.next().expect("portable code runs anywhere")
     }
 
-    fn there(precision: Precision) -> impl Iterator<Item = Self> {
+    fn available(precision: Precision) -> impl Iterator<Item = Self> {
         let candidates = match precision {
-            Precision::F32 => F32,
-            Precision::Bf16 => BF16,
+            Precision::F32 => F32_CANDIDATES,
+            Precision::Bf16 => BF16_CANDIDATES,
         };
         candidates.iter().filter_map(|candidate| candidate())
     }
 
     /// Returns every instruction set that runs here, including the emulated one.
     #[cfg(test)]
-    pub(crate) fn every(precision: Precision) -> Vec<Self> {
+    pub(crate) fn all_available(precision: Precision) -> Vec<Self> {
         #[allow(unused_mut, reason = "only x86-64 has an emulated one")]
-        let mut all: Vec<_> = Self::there(precision).collect();
+        let mut all: Vec<_> = Self::available(precision).collect();
         #[cfg(target_arch = "x86_64")]
         if precision == Precision::Bf16 {
             all.push(Self::EmulatedAmx(super::emulated::EmulatedAmx));
@@ -119,7 +119,7 @@ impl AnySimd {
 
 /// Whether this processor multiplies faster in bf16 than in f32: it has AVX512_BF16 or AMX.
 pub fn is_bf16_fast() -> bool {
-    match AnySimd::of(Precision::Bf16) {
+    match AnySimd::fastest(Precision::Bf16) {
         #[cfg(target_arch = "x86_64")]
         AnySimd::Avx512Bf16(_) | AnySimd::Amx(_) => true,
         _ => false,
@@ -128,7 +128,7 @@ pub fn is_bf16_fast() -> bool {
 
 /// Describes the instruction set for products of this precision, for `driml doctor` and the heads of tables.
 pub fn describe_kernels(precision: Precision) -> &'static str {
-    AnySimd::of(precision).describe()
+    AnySimd::fastest(precision).describe()
 }
 
 #[cfg(test)]
@@ -137,17 +137,17 @@ mod tests {
 
     use super::*;
     use crate::kernels::isa::element::Rounding;
-    use crate::kernels::isa::{Columns, Element, LANES, Left, Mode, Simd, multiply_tile};
+    use crate::kernels::isa::{Element, LANES, LeftOperand, Mode, OutputTile, Simd, multiply_tile};
 
     /// Compares a tile, written or added to ones, with a plain sum. Returns whether the instruction set has this
-    /// size of tile. With `rows_inside` the rows are adjacent and a row's steps are apart, else the reverse.
+    /// size of tile. With `rows_adjacent` the rows are adjacent and a row's steps are apart, else the reverse.
     fn check_tile<S: Simd>(
         simd: S,
         [rows, vecs]: [usize; 2],
         cols: usize,
         mode: Mode,
         steps: usize,
-        rows_inside: bool,
+        rows_adjacent: bool,
     ) -> bool {
         if vecs > S::VECS_MAX || rows > S::rows_max(vecs) {
             return false;
@@ -155,36 +155,36 @@ mod tests {
         let depth = S::Element::DEPTH;
         let (k, width) = (steps * depth, vecs * LANES);
         // Two runs of `k` terms a row.
-        let (row_stride, step, run_stride) = if rows_inside {
+        let (row_stride, step_stride, run_stride) = if rows_adjacent {
             (depth, depth * rows, rows * k)
         } else {
             (2 * k, depth, k)
         };
         let left: Vec<_> = (0..rows * 2 * k)
-            .map(|at| S::Element::of((at % 97 * 37 % 41) as f32 / 8.0 - 2.5))
+            .map(|at| S::Element::rounded((at % 97 * 37 % 41) as f32 / 8.0 - 2.5))
             .collect();
         let panel: Vec<_> = (0..2 * k * width)
-            .map(|at| S::Element::of((at % 89 * 29 % 31) as f32 / 8.0 - 1.9))
+            .map(|at| S::Element::rounded((at % 89 * 29 % 31) as f32 / 8.0 - 1.9))
             .collect();
         let stride = cols + 3;
         let mut out = vec![1.0; rows * stride];
-        let operand = Left {
+        let operand = LeftOperand {
             values: &left,
             start: 0,
             row_stride,
-            step,
+            step_stride,
             steps,
             run_stride,
             runs: 2,
         };
-        let columns = Columns {
+        let output = OutputTile {
             out: &mut out,
-            stride,
+            row_stride: stride,
             cols,
             vecs,
             mode,
         };
-        multiply_tile(simd, rows, operand, &panel, columns);
+        multiply_tile(simd, rows, operand, &panel, output);
         for (at, &got) in out.iter().enumerate() {
             let (row, col) = (at / stride, at % stride);
             let start = if col < cols && mode == Mode::Replace {
@@ -195,7 +195,7 @@ mod tests {
             let terms = (0..2 * k).filter(|_| col < cols).map(|term| {
                 let (at_step, part) = (term / depth, term % depth);
                 let right = panel[(at_step * width + col) * depth + part];
-                let run = at_step / steps * run_stride + at_step % steps * step;
+                let run = at_step / steps * run_stride + at_step % steps * step_stride;
                 let left = left[row * row_stride + run + part];
                 f64::from(left.value()) * f64::from(right.value())
             });
@@ -220,12 +220,12 @@ mod tests {
                 ((vecs - 1) * LANES + 1, Mode::Add, 16),
                 (vecs * LANES, Mode::Replace, 35),
             ] {
-                for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
-                    for rows_inside in [false, true] {
-                        let is_there = with_simd!(simd, simd => {
-                            check_tile(simd, [rows, vecs], cols, mode, steps, rows_inside)
+                for simd in Precision::ALL.into_iter().flat_map(AnySimd::all_available) {
+                    for rows_adjacent in [false, true] {
+                        let is_supported = with_simd!(simd, simd => {
+                            check_tile(simd, [rows, vecs], cols, mode, steps, rows_adjacent)
                         });
-                        tried += usize::from(is_there);
+                        tried += usize::from(is_supported);
                     }
                 }
             }
@@ -258,7 +258,7 @@ mod tests {
         });
         for value in special.clone().chain(walk.by_ref().take(1_000_000)) {
             // Subnormals are exact too.
-            let (got, wanted) = (bf16::of(value).to_f32(), nearest(value));
+            let (got, wanted) = (bf16::rounded(value).to_f32(), nearest(value));
             let is_nearest = got.to_bits() == wanted.to_bits();
             assert!(
                 is_nearest || got.is_nan() && value.is_nan(),
@@ -266,7 +266,7 @@ mod tests {
             );
         }
         for byte in 0..=255 {
-            assert_eq!(f32::of_byte(byte), f32::from(byte) * (1.0 / 255.0));
+            assert_eq!(f32::from_byte(byte), f32::from(byte) * (1.0 / 255.0));
         }
         for len in (0..140).chain([100_000]) {
             let first: Vec<_> = special.clone().chain(walk.by_ref()).take(len).collect();
@@ -274,7 +274,7 @@ mod tests {
             let second: Vec<_> = special.chain(walk.by_ref()).take(len).collect();
             let bytes = |by: usize| (0..len).map(move |at| (at * by % 256) as u8);
             let [first_bytes, second_bytes] = [31, 7].map(|by| bytes(by).collect::<Vec<_>>());
-            for simd in AnySimd::every(Precision::Bf16) {
+            for simd in AnySimd::all_available(Precision::Bf16) {
                 // Elements beyond the results must not change.
                 let [mut rounded, mut of_first, mut of_second] =
                     [(); 3].map(|()| vec![bf16::NEG_ONE; len + 3]);
@@ -283,8 +283,8 @@ mod tests {
                 with_simd!(simd, simd => {
                     simd.round(&first, &mut rounded);
                     simd.round_pairs(&first, &second, &mut pairs);
-                    simd.of_bytes(&first_bytes, &mut of_first);
-                    simd.of_bytes(&second_bytes, &mut of_second);
+                    simd.convert_bytes(&first_bytes, &mut of_first);
+                    simd.convert_bytes(&second_bytes, &mut of_second);
                     simd.pair(&of_first[..len], &of_second[..len], &mut joined);
                     simd.pair_bytes(&first_bytes, &second_bytes, &mut of_bytes);
                 });

@@ -15,7 +15,7 @@ pub(crate) trait Rounding: Copy {
     #[inline(always)]
     fn round(self, values: &[f32], to: &mut [bf16]) {
         for (to, &value) in to.iter_mut().zip(values) {
-            *to = bf16::of(value);
+            *to = bf16::rounded(value);
         }
     }
 
@@ -23,7 +23,7 @@ pub(crate) trait Rounding: Copy {
     #[inline(always)]
     fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
         for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
-            (pair[0], pair[1]) = (bf16::of(first), bf16::of(second));
+            (pair[0], pair[1]) = (bf16::rounded(first), bf16::rounded(second));
         }
     }
 
@@ -35,11 +35,11 @@ pub(crate) trait Rounding: Copy {
         }
     }
 
-    /// Converts pixels as [`Element::of_byte`], into the first elements of `to`.
+    /// Converts pixels as [`Element::from_byte`], into the first elements of `to`.
     #[inline(always)]
-    fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
+    fn convert_bytes(self, bytes: &[u8], to: &mut [bf16]) {
         for (to, &byte) in to.iter_mut().zip(bytes) {
-            *to = bf16::of_byte(byte);
+            *to = bf16::from_byte(byte);
         }
     }
 
@@ -47,7 +47,7 @@ pub(crate) trait Rounding: Copy {
     #[inline(always)]
     fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
         for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
-            (pair[0], pair[1]) = (bf16::of_byte(first), bf16::of_byte(second));
+            (pair[0], pair[1]) = (bf16::from_byte(first), bf16::from_byte(second));
         }
     }
 }
@@ -56,36 +56,36 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// Neighbouring scalars along the reduction axis that are stored together and multiplied in one step.
     const DEPTH: usize;
 
-    /// The factor that turns products of bytes stored by [`Element::of_byte`] into products of byte / 255.
+    /// The factor that turns products of bytes stored by [`Element::from_byte`] into products of byte / 255.
     const BYTE_SCALE: f32;
 
     /// Rounds to the nearest element, ties to even.
-    fn of(value: f32) -> Self;
+    fn rounded(value: f32) -> Self;
 
-    /// Rounds `values` as [`Element::of`] into `to`, which has the same length, with the instructions of `rounding`.
+    /// Rounds `values` as [`Element::rounded`] into `to`, which has the same length, with the instructions of `rounding`.
     fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]);
 
     /// Converts a pixel. The result times [`Element::BYTE_SCALE`] is byte / 255.
-    fn of_byte(byte: u8) -> Self;
+    fn from_byte(byte: u8) -> Self;
 
     fn value(self) -> f32;
 
     /// Interleaves `DEPTH` rows that follow each other along the reduction axis: `step` [columns, DEPTH],
     /// with 0 where the rows end. `second` is used only if `DEPTH` is 2.
-    fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]);
+    fn interleave<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]);
 
     /// Rounds `values` [`LANES`, DEPTH] to `LANES` steps of 32 bits each.
-    fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]);
+    fn round_steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]);
 
-    /// Converts pixels as [`Element::of_byte`], into the first elements of `to`.
+    /// Converts pixels as [`Element::from_byte`], into the first elements of `to`.
     fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]);
 
-    /// Converts pixels as [`Element::of_byte`]. If `DEPTH` is 2, each is paired with the one `shift` further,
+    /// Converts pixels as [`Element::from_byte`]. If `DEPTH` is 2, each is paired with the one `shift` further,
     /// or with 0 beyond the end: `steps` [pixels, DEPTH].
-    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]);
+    fn store_byte_steps<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]);
 
-    /// As [`Element::steps_of_bytes`], for elements.
-    fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
+    /// As [`Element::store_byte_steps`], for elements.
+    fn store_steps<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
 
     /// Packs the scalars of a step [DEPTH] into 32 bits.
     fn pack(step: &[Self]) -> u32;
@@ -102,12 +102,12 @@ impl Element for f32 {
     const BYTE_SCALE: f32 = 1.0;
 
     #[inline(always)]
-    fn of(value: f32) -> Self {
+    fn rounded(value: f32) -> Self {
         value
     }
 
     #[inline(always)]
-    fn of_byte(byte: u8) -> Self {
+    fn from_byte(byte: u8) -> Self {
         Self::from(byte) * (1.0 / 255.0)
     }
 
@@ -122,14 +122,14 @@ impl Element for f32 {
     }
 
     #[inline(always)]
-    fn join<R: Rounding>(_: R, first: &[f32], _: &[f32], step: &mut [Self]) {
+    fn interleave<R: Rounding>(_: R, first: &[f32], _: &[f32], step: &mut [Self]) {
         let (begin, end) = step.split_at_mut(first.len());
         begin.copy_from_slice(first);
         end.fill(0.0);
     }
 
     #[inline(always)]
-    fn steps<R: Rounding>(_: R, values: &[f32], steps: &mut [u32; LANES]) {
+    fn round_steps<R: Rounding>(_: R, values: &[f32], steps: &mut [u32; LANES]) {
         for (step, value) in steps.iter_mut().zip(values) {
             *step = value.to_bits();
         }
@@ -138,17 +138,17 @@ impl Element for f32 {
     #[inline(always)]
     fn store_bytes<R: Rounding>(_: R, bytes: &[u8], to: &mut [Self]) {
         for (to, &byte) in to.iter_mut().zip(bytes) {
-            *to = Self::of_byte(byte);
+            *to = Self::from_byte(byte);
         }
     }
 
     #[inline(always)]
-    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], _: usize, steps: &mut [Self]) {
+    fn store_byte_steps<R: Rounding>(rounding: R, bytes: &[u8], _: usize, steps: &mut [Self]) {
         Self::store_bytes(rounding, bytes, steps);
     }
 
     #[inline(always)]
-    fn steps_of<R: Rounding>(_: R, values: &[Self], _: usize, steps: &mut [Self]) {
+    fn store_steps<R: Rounding>(_: R, values: &[Self], _: usize, steps: &mut [Self]) {
         steps.copy_from_slice(values);
     }
 
@@ -174,7 +174,7 @@ impl Element for bf16 {
 
     /// As `bf16::from_f32`, but without a branch, so that loops over it are vectorised.
     #[inline(always)]
-    fn of(value: f32) -> Self {
+    fn rounded(value: f32) -> Self {
         let bits = value.to_bits();
         let nearest = (bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16) as u16;
         // A NaN's lower bits could carry into its sign, or be all that tells it from an infinity.
@@ -183,7 +183,7 @@ impl Element for bf16 {
     }
 
     #[inline(always)]
-    fn of_byte(byte: u8) -> Self {
+    fn from_byte(byte: u8) -> Self {
         Self::from_bits((f32::from(byte).to_bits() >> 16) as u16)
     }
 
@@ -198,11 +198,11 @@ impl Element for bf16 {
     }
 
     #[inline(always)]
-    fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]) {
+    fn interleave<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]) {
         let (begin, end) = step.split_at_mut(first.len() * 2);
         if second.is_empty() {
             for (pair, &first) in begin.chunks_exact_mut(2).zip(first) {
-                (pair[0], pair[1]) = (Self::of(first), Self::default());
+                (pair[0], pair[1]) = (Self::rounded(first), Self::default());
             }
         } else {
             rounding.round_pairs(first, second, begin);
@@ -211,7 +211,7 @@ impl Element for bf16 {
     }
 
     #[inline(always)]
-    fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]) {
+    fn round_steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]) {
         let mut rounded = [Self::default(); 2 * LANES];
         rounding.round(values, &mut rounded);
         for (step, pair) in steps.iter_mut().zip(rounded.chunks_exact(2)) {
@@ -221,26 +221,26 @@ impl Element for bf16 {
 
     #[inline(always)]
     fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]) {
-        rounding.of_bytes(bytes, to);
+        rounding.convert_bytes(bytes, to);
     }
 
     #[inline(always)]
-    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]) {
-        let later = bytes.get(shift..).unwrap_or_default();
-        let (begin, end) = bytes.split_at(later.len());
-        let (both, one) = steps.split_at_mut(later.len() * 2);
-        rounding.pair_bytes(begin, later, both);
+    fn store_byte_steps<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]) {
+        let shifted = bytes.get(shift..).unwrap_or_default();
+        let (begin, end) = bytes.split_at(shifted.len());
+        let (both, one) = steps.split_at_mut(shifted.len() * 2);
+        rounding.pair_bytes(begin, shifted, both);
         for (pair, &byte) in one.chunks_exact_mut(2).zip(end) {
-            (pair[0], pair[1]) = (Self::of_byte(byte), Self::default());
+            (pair[0], pair[1]) = (Self::from_byte(byte), Self::default());
         }
     }
 
     #[inline(always)]
-    fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]) {
-        let later = values.get(shift..).unwrap_or_default();
-        let (begin, end) = values.split_at(later.len());
-        let (both, one) = steps.split_at_mut(later.len() * 2);
-        rounding.pair(begin, later, both);
+    fn store_steps<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]) {
+        let shifted = values.get(shift..).unwrap_or_default();
+        let (begin, end) = values.split_at(shifted.len());
+        let (both, one) = steps.split_at_mut(shifted.len() * 2);
+        rounding.pair(begin, shifted, both);
         for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
             (pair[0], pair[1]) = (value, Self::default());
         }

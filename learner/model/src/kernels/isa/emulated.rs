@@ -6,18 +6,18 @@ use half::bf16;
 
 use super::{
     amx::{ROWS_MAX, compute},
-    amx_tiles::{ROWS, STEPS, SUMS, Tiles},
+    amx_tiles::{ACCUMULATORS, TILE_ROWS, TILE_STEPS, TileRegisters},
     element::Rounding,
     simd::{LANES, Loop, RawTile, Simd},
 };
 
 #[derive(Clone, Copy, Default)]
-struct Registers {
+struct EmulatedTiles {
     rows: usize,
     tail: usize,
-    left: [[[u32; STEPS]; ROWS]; 2],
-    right: [[[u32; LANES]; STEPS]; 2],
-    sums: [[[f32; LANES]; ROWS]; SUMS],
+    left: [[[u32; TILE_STEPS]; TILE_ROWS]; 2],
+    right: [[[u32; LANES]; TILE_STEPS]; 2],
+    sums: [[[f32; LANES]; TILE_ROWS]; ACCUMULATORS],
 }
 
 fn pair(pair: u32) -> [f32; 2] {
@@ -27,9 +27,9 @@ fn pair(pair: u32) -> [f32; 2] {
     ]
 }
 
-impl Registers {
+impl EmulatedTiles {
     const fn steps(&self, tail: bool) -> usize {
-        if tail { self.tail } else { STEPS }
+        if tail { self.tail } else { TILE_STEPS }
     }
 }
 
@@ -43,9 +43,9 @@ unsafe fn load<const N: usize>(at: *const bf16, stride: usize, to: &mut [[u32; N
     }
 }
 
-impl Tiles for Registers {
+impl TileRegisters for EmulatedTiles {
     unsafe fn configure(&mut self, rows: usize, tail: usize) {
-        assert!(rows <= ROWS && tail < STEPS);
+        assert!(rows <= TILE_ROWS && tail < TILE_STEPS);
         *self = Self {
             rows,
             tail,
@@ -104,15 +104,15 @@ impl Rounding for EmulatedAmx {}
 
 impl Simd for EmulatedAmx {
     type Element = bf16;
-    const VECS_MAX: usize = SUMS;
-    const LEFT_STEPS_ADJOIN: bool = true;
+    const VECS_MAX: usize = ACCUMULATORS;
+    const LEFT_STEPS_ADJACENT: bool = true;
 
     fn rows_max(_: usize) -> usize {
         ROWS_MAX
     }
 
     unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        unsafe { compute(self, &mut Registers::default(), tile, rows, vecs) }
+        unsafe { compute(self, &mut EmulatedTiles::default(), tile, rows, vecs) }
     }
 
     fn vectorize<W: Loop>(self, work: W) {

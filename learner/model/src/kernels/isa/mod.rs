@@ -21,4 +21,4 @@ pub use dispatch::{describe_kernels, is_bf16_fast};
 pub(crate) use element::Element;
 pub use peak::multiply_in_first_cache;
 pub(crate) use simd::{LANES, Mode, Simd, vectorized};
-pub(crate) use tile::{Columns, Left, multiply_tile, row_tiles, tile_vecs};
+pub(crate) use tile::{LeftOperand, OutputTile, multiply_tile, row_tiles, tile_vecs};

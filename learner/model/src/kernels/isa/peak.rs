@@ -7,7 +7,7 @@ use super::{
     dispatch::{AnySimd, with_simd},
     element::Element,
     simd::{LANES, Mode, Simd},
-    tile::{Columns, Left, multiply_tile},
+    tile::{LeftOperand, OutputTile, multiply_tile},
 };
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
@@ -17,7 +17,7 @@ const DEPTH: usize = 256;
 
 /// Multiplies the tallest tile that is one register wide `times` times on every thread of the pool. Returns the FLOPs of all of them.
 pub fn multiply_in_first_cache(precision: Precision, times: usize) -> f64 {
-    with_simd!(AnySimd::of(precision), simd => multiply(simd, times))
+    with_simd!(AnySimd::fastest(precision), simd => multiply(simd, times))
 }
 
 fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
@@ -26,21 +26,21 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
     (0..threads).into_par_iter().with_max_len(1).for_each(|_| {
         let ones = |len| {
             let mut ones = Buffer::new(len);
-            ones.fill(S::Element::of(1.0));
+            ones.fill(S::Element::rounded(1.0));
             ones
         };
         let (left, panel) = (ones(rows * DEPTH), ones(DEPTH * LANES));
         let mut out = Buffer::zeros(rows * LANES);
         for _ in 0..times {
-            let left = Left::rows(&left, DEPTH);
-            let columns = Columns {
+            let left = LeftOperand::rows(&left, DEPTH);
+            let output = OutputTile {
                 out: &mut out,
-                stride: LANES,
+                row_stride: LANES,
                 cols: LANES,
                 vecs: 1,
                 mode: Mode::Replace,
             };
-            multiply_tile(simd, rows, left, &panel, columns);
+            multiply_tile(simd, rows, left, &panel, output);
         }
         assert!(
             out.iter().all(|&sum| sum == DEPTH as f32),
@@ -61,7 +61,7 @@ mod tests {
 
     #[test]
     fn every_instruction_set_sums_the_tile_that_is_counted() {
-        for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
+        for simd in Precision::ALL.into_iter().flat_map(AnySimd::all_available) {
             let (thrice, rows) = with_simd!(simd, simd => (multiply(simd, 3), rows_of(simd)));
             let products = 3 * rayon::current_num_threads() * rows * LANES * DEPTH;
             assert_eq!(thrice, 2.0 * products as f64);

@@ -47,12 +47,12 @@ macro_rules! simd {
             type Operand = [[$element; <$element>::DEPTH]; LANES];
 
             #[inline(always)]
-            unsafe fn row(at: *const $element) -> Self::Operand {
+            unsafe fn load_row(at: *const $element) -> Self::Operand {
                 unsafe { [at.cast::<[$element; <$element>::DEPTH]>().read_unaligned(); LANES] }
             }
 
             #[inline(always)]
-            unsafe fn columns(at: *const $element) -> Self::Operand {
+            unsafe fn load_columns(at: *const $element) -> Self::Operand {
                 unsafe { at.cast::<Self::Operand>().read_unaligned() }
             }
 

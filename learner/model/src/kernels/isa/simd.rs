@@ -16,12 +16,12 @@ pub(crate) enum Mode {
 
 /// A tile in the form that instruction sets take.
 ///
-/// `left` may be read at row * row_stride + run * run_stride + i * step, i < steps, for every row and run, `DEPTH` scalars each.
+/// `left` may be read at row * row_stride + run * run_stride + i * step_stride, i < steps, for every row and run, `DEPTH` scalars each.
 /// `panel` holds runs * steps * vecs * LANES * DEPTH scalars. `out` may be read and written at row * out_stride, `cols` scalars each.
 pub(crate) struct RawTile<E> {
     pub(super) left: *const E,
     pub(super) row_stride: usize,
-    pub(super) step: usize,
+    pub(super) step_stride: usize,
     pub(super) steps: usize,
     pub(super) run_stride: usize,
     pub(super) runs: usize,
@@ -46,7 +46,7 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
 
     /// Whether a left operand's steps should be adjacent, and its rows begin on cache lines, even if packing
     /// has to transpose the operand.
-    const LEFT_STEPS_ADJOIN: bool = false;
+    const LEFT_STEPS_ADJACENT: bool = false;
 
     /// Largest number of rows of a tile that is `vecs` registers wide.
     fn rows_max(vecs: usize) -> usize;
@@ -61,9 +61,9 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
     /// Transposes a block of steps, [column, step] to [step, column].
     #[inline(always)]
     fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
-        let turned: [[u32; LANES]; LANES] =
+        let transposed: [[u32; LANES]; LANES] =
             std::array::from_fn(|step| std::array::from_fn(|column| block[column][step]));
-        *block = turned;
+        *block = transposed;
     }
 
     /// Runs `work`, compiled for these instructions, so that its loops use the vector registers.

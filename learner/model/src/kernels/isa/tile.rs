@@ -11,28 +11,28 @@ use super::{
 /// A step is [`Element::DEPTH`] neighbouring scalars. A matrix row is one run. An image window has one run
 /// for each row of the kernel, so that windows need not be copied.
 #[derive(Clone, Copy)]
-pub(crate) struct Left<'a, E> {
+pub(crate) struct LeftOperand<'a, E> {
     pub(crate) values: &'a [E],
     /// Index of the first row's first scalar.
     pub(crate) start: usize,
     /// Scalars from one row to the next.
     pub(crate) row_stride: usize,
     /// Scalars from one step to the next.
-    pub(crate) step: usize,
+    pub(crate) step_stride: usize,
     pub(crate) steps: usize,
     /// Scalars from one run to the next.
     pub(crate) run_stride: usize,
     pub(crate) runs: usize,
 }
 
-impl<'a, E: Element> Left<'a, E> {
+impl<'a, E: Element> LeftOperand<'a, E> {
     /// Rows of a matrix, `row_stride` scalars apart, which must be whole steps.
     pub(crate) const fn rows(values: &'a [E], row_stride: usize) -> Self {
         Self {
             values,
             start: 0,
             row_stride,
-            step: E::DEPTH,
+            step_stride: E::DEPTH,
             steps: row_stride / E::DEPTH,
             run_stride: 0,
             runs: 1,
@@ -40,20 +40,20 @@ impl<'a, E: Element> Left<'a, E> {
     }
 
     /// Whether `rows` rows lie inside the values.
-    fn holds(&self, rows: usize) -> bool {
+    fn contains_rows(&self, rows: usize) -> bool {
         let last = self.start
             + (rows - 1) * self.row_stride
             + (self.runs - 1) * self.run_stride
-            + (self.steps - 1) * self.step;
+            + (self.steps - 1) * self.step_stride;
         last + E::DEPTH <= self.values.len()
     }
 }
 
-pub(crate) struct Columns<'a> {
+pub(crate) struct OutputTile<'a> {
     /// The output, from the first row's first column on.
     pub(crate) out: &'a mut [f32],
     /// Scalars from one row to the next.
-    pub(crate) stride: usize,
+    pub(crate) row_stride: usize,
     /// Columns that are written, at most `vecs` registers.
     pub(crate) cols: usize,
     /// Registers of columns that are computed.
@@ -70,17 +70,17 @@ pub(crate) struct Columns<'a> {
 pub(crate) fn multiply_tile<S: Simd>(
     simd: S,
     rows: usize,
-    left: Left<'_, S::Element>,
+    left: LeftOperand<'_, S::Element>,
     panel: &[S::Element],
-    columns: Columns<'_>,
+    output: OutputTile<'_>,
 ) {
-    let Columns {
+    let OutputTile {
         out,
-        stride,
+        row_stride,
         cols,
         vecs,
         mode,
-    } = columns;
+    } = output;
     assert!(
         (1..=S::VECS_MAX).contains(&vecs) && (1..=S::rows_max(vecs)).contains(&rows),
         "a tile of {rows} rows by {vecs} registers"
@@ -93,19 +93,21 @@ pub(crate) fn multiply_tile<S: Simd>(
     );
     let panel_len = left.runs * left.steps * vecs * LANES * S::Element::DEPTH;
     assert!(
-        left.holds(rows) && panel.len() >= panel_len && (rows - 1) * stride + cols <= out.len(),
+        left.contains_rows(rows)
+            && panel.len() >= panel_len
+            && (rows - 1) * row_stride + cols <= out.len(),
         "a tile beyond its operands"
     );
     let tile = RawTile {
         left: left.values[left.start..].as_ptr(),
         row_stride: left.row_stride,
-        step: left.step,
+        step_stride: left.step_stride,
         steps: left.steps,
         run_stride: left.run_stride,
         runs: left.runs,
         panel: panel.as_ptr(),
         out: out.as_mut_ptr(),
-        out_stride: stride,
+        out_stride: row_stride,
         cols,
         mode,
     };

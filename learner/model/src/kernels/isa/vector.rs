@@ -23,9 +23,9 @@ pub(super) trait Vector: Copy {
     type Operand: Copy;
 
     /// Loads the step at `at` of one row and broadcasts it to all columns.
-    unsafe fn row(at: *const Self::Element) -> Self::Operand;
+    unsafe fn load_row(at: *const Self::Element) -> Self::Operand;
     /// Loads the steps of `LANES` neighbouring columns.
-    unsafe fn columns(at: *const Self::Element) -> Self::Operand;
+    unsafe fn load_columns(at: *const Self::Element) -> Self::Operand;
     unsafe fn mul_add(sums: Self::Sums, row: Self::Operand, columns: Self::Operand) -> Self::Sums;
 }
 
@@ -46,19 +46,19 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
             let mut at = run;
             for _ in 0..tile.steps {
                 // No closure here: it could be compiled without these instructions, and each would then be a call.
-                let mut columns = [V::columns(panel); VECS];
+                let mut columns = [V::load_columns(panel); VECS];
                 for (v, columns) in columns.iter_mut().enumerate().skip(1) {
-                    *columns = V::columns(panel.add(v * LANES * V::Element::DEPTH));
+                    *columns = V::load_columns(panel.add(v * LANES * V::Element::DEPTH));
                 }
                 for (r, sums) in sums.iter_mut().enumerate() {
-                    let row = V::row(at.add(r * tile.row_stride));
+                    let row = V::load_row(at.add(r * tile.row_stride));
                     for (sums, columns) in sums.iter_mut().zip(columns) {
                         *sums = V::mul_add(*sums, row, columns);
                     }
                 }
                 panel = panel.add(VECS * LANES * V::Element::DEPTH);
                 // The last step of the last run may end at the end of the allocation.
-                at = at.wrapping_add(tile.step);
+                at = at.wrapping_add(tile.step_stride);
             }
             run = run.wrapping_add(tile.run_stride);
         }
