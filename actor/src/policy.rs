@@ -1,7 +1,7 @@
 //! The policies that choose actions: the network with epsilon-greedy exploration, and uniformly random actions.
 //! They do not know the schedule of epsilon, nor where weights come from.
 
-use driml_model::{Enlarge, ModelConfig, PolicyNetwork, Precision};
+use driml_model::{ModelConfig, PolicyNetwork, Precision, Resizer};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -50,7 +50,7 @@ impl Policy for RandomPolicy {
 /// Draws first which actions are random. States with a random action do not pass through the network.
 pub struct NetworkPolicy {
     network: PolicyNetwork,
-    enlarge: Option<Enlarge>,
+    enlarge: Option<Resizer>,
     num_actions: u8,
     noise: bool,
     /// Reused buffers: the environments in which the network chooses the action; their states, if these are not all;
@@ -66,7 +66,7 @@ impl NetworkPolicy {
     /// if the sizes are equal. The network computes its products in `precision`.
     pub fn new(
         model: &ModelConfig,
-        enlarge: Option<Enlarge>,
+        enlarge: Option<Resizer>,
         safetensors: &[u8],
         precision: Precision,
     ) -> Result<Self, ActError> {

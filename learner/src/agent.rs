@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use candle_core::Tensor;
 use driml_model::{
-    Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, StoredAs, is_dim,
+    Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, WeightDtype, is_dim,
 };
 use driml_protocol::fail_point;
 use rand_chacha::ChaCha8Rng;
@@ -61,7 +61,7 @@ impl Agent {
     ) -> Result<Self, UpdateError> {
         let online = Parameters::init(&model, rng, &compute.device)?;
         let key = settings.make_auxiliary_loss()?.key_tau();
-        let key = key.map(|_| online.copy_part(Encoder::has));
+        let key = key.map(|_| online.copy_part(Encoder::has_parameter));
         let parameters = NetworkParameters {
             target: online.without_dim()?,
             key_encoder: key.transpose()?,
@@ -203,14 +203,14 @@ impl Agent {
     /// # Errors
     /// A weight that is not finite; a failing serialisation.
     pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
-        self.weights_as(StoredAs::F32)
+        self.weights_as(WeightDtype::F32)
     }
 
     /// [`Agent::weights`] with scalars of another type.
     ///
     /// # Errors
     /// As [`Agent::weights`], and a weight that is too large for the type.
-    pub fn weights_as(&self, stored: StoredAs) -> Result<Vec<u8>, UpdateError> {
+    pub fn weights_as(&self, stored: WeightDtype) -> Result<Vec<u8>, UpdateError> {
         Ok(self
             .online()
             .to_safetensors_as(stored, |name| !is_dim(name))?)

@@ -1,7 +1,7 @@
 //! The learner's settings, and the other tables of the run's settings that a learner reads.
 //! No number has a default here: presets give all of them, with their sources.
 
-use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
+use driml_model::{InputSize, ModelConfig, Precision, WeightDtype};
 use driml_protocol::{
     RunSpec, Sampling,
     config::{ConfigError, Settings, TransportConfig, check},
@@ -33,7 +33,7 @@ pub struct Config {
     /// Batches requested ahead of the one being learned from.
     pub batches_in_flight: u32,
     /// Number format of published weights.
-    pub publish_dtype: StoredAs,
+    pub publish_dtype: WeightDtype,
     /// Updates from one version of the weights to the next.
     pub publish_period_updates: u64,
     /// Updates from one checkpoint to the next.
@@ -256,7 +256,7 @@ impl LearnerConfig {
         let sizes_follow = this.model.input_channels == states
             && this.model.num_actions == this.spec.num_actions as usize
             && this.model.local_shape() == whole.local_shape()
-            && this.input.enlarge(frame_size, &this.model).is_ok();
+            && this.input.resizer(frame_size, &this.model).is_ok();
         if !sizes_follow {
             return Err(LearnerConfigError::Sizes);
         }

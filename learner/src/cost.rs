@@ -61,11 +61,11 @@ impl UpdateCost {
     pub fn compute(model: &ModelConfig, shape: &UpdateShape) -> Self {
         let layers = model.layer_costs();
         let sum = |parts: &[&str], cost: fn(&LayerCost) -> u64| -> u64 {
-            let of_parts = |layer: &&LayerCost| parts.iter().any(|part| layer.is_of(part));
+            let of_parts = |layer: &&LayerCost| parts.iter().any(|part| layer.is_in(part));
             layers.iter().filter(of_parts).map(cost).sum()
         };
         let forward = |parts: &[&str]| sum(parts, |layer| layer.forward);
-        let learning = |parts: &[&str]| sum(parts, LayerCost::learning);
+        let learning = |parts: &[&str]| sum(parts, LayerCost::forward_backward);
         let UpdateShape {
             rows,
             every_action,
@@ -82,7 +82,7 @@ impl UpdateCost {
         // The forward product and the gradients of both operands; keys have no gradient.
         let products = if passes.keys > 0 { 2 } else { 3 };
         let value = forward(&["torso", "head"]);
-        let loss_layers = model.loss_layers.iter().map(|it| learning(&[&it.layer()]));
+        let loss_layers = model.loss_layers.iter().map(|it| learning(&[&it.prefix()]));
         Self {
             online: rows * learning(&["torso"]),
             head: rows * learning(&["head"]) / actions,

@@ -2,7 +2,7 @@
 //! It takes no optimiser step: `agent` does.
 
 use candle_core::Tensor;
-use driml_model::{Compute, Encoder, HeadNoise, ModelConfig, Network, Parameters, greedy};
+use driml_model::{Compute, Encoder, HeadNoise, ModelConfig, Network, Parameters, argmax};
 use driml_protocol::NO_ACTION;
 
 use crate::{
@@ -223,7 +223,7 @@ impl Networks {
             let what = format!("the {network} network's value of an s_{{t+n}}");
             return Err(UpdateError::NonFinite(what));
         }
-        let greedy_by_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
+        let greedy_by_state: Vec<u8> = values.chunks_exact(num_actions).map(argmax).collect();
         let logits = to_vec_f32(&target_logits)?;
         let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
         for row in 0..frames.len() {

@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_model::{Enlarge, ModelError};
+use driml_model::{ModelError, Resizer};
 use driml_protocol::Batch as WireBatch;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -48,7 +48,7 @@ impl<'a> Columns<'a> {
 pub(crate) struct Preparation {
     positives: Positives,
     state_bytes: usize,
-    enlarge: Option<Enlarge>,
+    enlarge: Option<Resizer>,
     /// States at the network's input size, if they have to be enlarged.
     enlarged: [Vec<u8>; 3],
     augment: Option<Augmenter>,
@@ -66,7 +66,7 @@ impl Preparation {
         Ok(Self {
             positives: config.learner.update.auxiliary_loss.positives(),
             state_bytes: model.frame_len(),
-            enlarge: config.input.enlarge(frame_size, model)?,
+            enlarge: config.input.resizer(frame_size, model)?,
             enlarged: Default::default(),
             augment: augment.map(|settings| Augmenter::new(settings, size, channels)),
             augmented: Default::default(),
@@ -126,7 +126,7 @@ impl Preparation {
 }
 
 /// Enlarges all `states` into `larger`, in parallel.
-fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
+fn enlarge_all(enlarge: &Resizer, states: &[u8], larger: &mut Vec<u8>) {
     let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
     larger.resize(states.len() / from * to, 0);
     larger

@@ -12,7 +12,7 @@ use driml_learner::{
     insight::{Insight, NetworkOutputs},
 };
 use driml_machine::error::{Usage, usage};
-use driml_model::{Enlarge, Parameters, Precision, StoredAs, is_dim};
+use driml_model::{Parameters, Precision, Resizer, WeightDtype, is_dim};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -101,7 +101,7 @@ impl Player {
     /// The same player with f32 weights and arithmetic, whatever the actors of the run use.
     #[must_use]
     pub fn exact(mut self) -> Self {
-        self.config.learner.publish_dtype = StoredAs::F32;
+        self.config.learner.publish_dtype = WeightDtype::F32;
         self.config.actor.precision = Precision::F32;
         self
     }
@@ -173,9 +173,9 @@ impl Player {
         })
     }
 
-    fn enlarge(&self) -> anyhow::Result<Option<Enlarge>> {
+    fn enlarge(&self) -> anyhow::Result<Option<Resizer>> {
         let config = &self.config;
-        Ok(config.input.enlarge(sent(config), &config.model)?)
+        Ok(config.input.resizer(sent(config), &config.model)?)
     }
 }
 
@@ -234,7 +234,7 @@ const fn sent(config: &RunConfig) -> (usize, usize) {
 pub struct Viewer {
     /// The network.
     pub insight: Insight,
-    enlarge: Option<Enlarge>,
+    enlarge: Option<Resizer>,
     enlarged: Vec<u8>,
 }
 

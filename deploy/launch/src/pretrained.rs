@@ -9,7 +9,7 @@ use driml_learner::{
     checkpoint::{METADATA_KEY, describe, read_description},
 };
 use driml_machine::error::{nearest, usage};
-use driml_model::{Parameters, Precision, StoredAs, is_bf16_fast};
+use driml_model::{Parameters, Precision, WeightDtype, is_bf16_fast};
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -89,7 +89,7 @@ fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
         })?;
     let settings = format!("the settings in {name}");
     let mut config = RunConfig::parse(&settings, &exported.settings)?;
-    config.learner.publish_dtype = StoredAs::F16;
+    config.learner.publish_dtype = WeightDtype::F16;
     // The run's precision was chosen for the machine that trained.
     if !is_bf16_fast() {
         config.actor.precision = Precision::F32;
@@ -109,17 +109,17 @@ fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
 /// Exports the network, without DIM's heads, as the bytes of a file that [`find`] reads.
 pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
     let config = &player.config;
-    let exported = Exported {
-        settings: config.to_toml(),
-        updates: player.updates,
-        is_averaged: player.is_averaged,
-    };
     let model = config.model.without_dim();
     let mut description: Value =
         serde_json::from_str(&describe(&config.run, &model, &config.input))?;
-    description[EXPORTED] = serde_json::to_value(exported)?;
+    description[EXPORTED] = serde_json::to_value(Exported {
+        settings: config.to_toml(),
+        updates: player.updates,
+        is_averaged: player.is_averaged,
+    })?;
     let network = player.network.without_dim()?;
-    Ok(network.to_described_safetensors(StoredAs::F16, METADATA_KEY, &description.to_string())?)
+    let description = description.to_string();
+    Ok(network.to_described_safetensors(WeightDtype::F16, METADATA_KEY, &description)?)
 }
 
 #[cfg(test)]
@@ -150,8 +150,8 @@ mod tests {
             let both = [var, player.network.get(name).unwrap()];
             let both = both.map(|it| it.flatten_all().unwrap().to_vec1::<f32>().unwrap());
             for (rounded, exact) in both[0].iter().zip(&both[1]) {
-                let size = exact.abs().max(StoredAs::F16.least_normal());
-                let error = StoredAs::F16.error() as f32 * size;
+                let size = exact.abs().max(WeightDtype::F16.min_normal());
+                let error = WeightDtype::F16.rounding_error() as f32 * size;
                 let is_near = (rounded - exact).abs() <= error;
                 assert!(is_near, "{name}: {rounded}, {exact}");
             }
@@ -204,7 +204,7 @@ mod tests {
             });
             let network = &mixed.network;
             let bytes = network
-                .to_described_safetensors(StoredAs::F16, METADATA_KEY, &description.to_string())
+                .to_described_safetensors(WeightDtype::F16, METADATA_KEY, &description.to_string())
                 .unwrap();
             let text = said(&[("chain", &bytes[..])], "chain");
             let is_told = text.contains(why) && text.contains("pretrained:chain");

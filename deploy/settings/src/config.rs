@@ -204,7 +204,7 @@ impl RunConfig {
                 ));
             }
         }
-        let device = local.learner_device.check(learner.precision);
+        let device = local.learner_device.check_precision(learner.precision);
         device.map_err(said)?;
         self.check_auxiliary_loss()?;
         let rng = &mut ChaCha8Rng::seed_from_u64(0);

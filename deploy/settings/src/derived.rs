@@ -4,7 +4,7 @@
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::UpdateSettings;
 use driml_machine::error::{Usage, usage};
-use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, ModelConfig, TorsoName};
+use driml_model::{ConvLayer, FrameSize, InputSize, ModelConfig, ReadArea, TorsoName};
 use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
@@ -106,7 +106,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         whole_size(table, "input.height")?,
         whole_size(table, "input.width")?,
     );
-    let mut read = InputRead { input, frame };
+    let mut read = ReadArea { input, frame };
     if find(table, FRAME).is_some() {
         let (height, width) = (shape.height as u32, shape.width as u32);
         put(table, FRAME, as_toml(FrameSize { height, width })?);
@@ -114,7 +114,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         if find(table, "learner.augment").is_none() {
             let input: InputSize = table_at(table, "input")?;
             let conv: Option<Vec<ConvLayer>> = optional(table, "model.conv")?;
-            read = input.read(torso(table)?, &conv.unwrap_or_default(), frame);
+            read = input.read_area(torso(table)?, &conv.unwrap_or_default(), frame);
         }
     }
     let set = optional(table, "actor.actions")?.unwrap_or(ActionSet::All);

@@ -164,7 +164,7 @@ impl DeviceName {
     ///
     /// # Errors
     /// `precision` is bf16 and the device is a GPU.
-    pub fn check(self, precision: Precision) -> Result<(), DeviceError> {
+    pub fn check_precision(self, precision: Precision) -> Result<(), DeviceError> {
         match (self, precision) {
             (Self::Cuda(_), Precision::Bf16) => Err(DeviceError::Precision {
                 device: self,
@@ -179,7 +179,7 @@ impl DeviceName {
     /// # Errors
     /// The GPU is absent, the program was built without the feature `cuda`, or `precision` is bf16 on a GPU.
     pub fn open(self, precision: Precision) -> Result<Compute, DeviceError> {
-        self.check(precision)?;
+        self.check_precision(precision)?;
         match self {
             Self::Cpu => Ok(Compute::cpu(precision)),
             Self::Cuda(ordinal) => {
@@ -251,10 +251,8 @@ mod tests {
     #[test]
     fn a_gpu_has_no_bf16_of_ours() {
         let error = DeviceName::Cuda(1).open(Precision::Bf16).unwrap_err();
-        assert!(
-            error.to_string().contains("set learner.precision"),
-            "{error}"
-        );
+        let error = error.to_string();
+        assert!(error.contains("set learner.precision"), "{error}");
         assert!(DeviceName::Cpu.open(Precision::Bf16).is_ok());
     }
 

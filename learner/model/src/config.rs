@@ -7,7 +7,7 @@ use crate::error::{ModelError, Result};
 use crate::geometry::{ConvLayer, ConvShape};
 pub(crate) use crate::heads::config::HeadConfig;
 use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
-use crate::init::InitialLaw;
+use crate::init::Initializer;
 use crate::layers::LayerShape;
 use crate::torso::{TorsoName, TorsoSettings, interface::Torso};
 
@@ -81,7 +81,7 @@ pub struct LossLayer {
 
 impl LossLayer {
     /// Returns the common prefix of the names of this layer's parameters, without the final dot.
-    pub fn layer(&self) -> String {
+    pub fn prefix(&self) -> String {
         format!("dim.{}", self.name)
     }
 }
@@ -104,17 +104,17 @@ pub struct DimHeads {
 
 impl DimHeads {
     /// No DIM head, as in the plain C51 agent, in target networks and in actors.
-    pub const NONE: Self = Self::all(false);
+    pub const NONE: Self = Self::uniform(false);
     /// Every head, and Psi sees the action.
-    pub const EVERY: Self = Self::all(true);
+    pub const ALL: Self = Self::uniform(true);
 
-    const fn all(is_there: bool) -> Self {
+    const fn uniform(exists: bool) -> Self {
         Self {
-            psi3: is_there,
-            phi3: is_there,
-            psi4: is_there,
-            phi4: is_there,
-            action: is_there,
+            psi3: exists,
+            phi3: exists,
+            psi4: exists,
+            phi4: exists,
+            action: exists,
         }
     }
 
@@ -168,7 +168,7 @@ impl ModelConfig {
             ));
         }
         self.head.validate()?;
-        self.torso.check(&self.torso_settings())?;
+        self.torso.check_settings(&self.torso_settings())?;
         for (index, &width) in self.channels.iter().enumerate() {
             check(&format!("channels[{index}]"), width)?;
         }
@@ -277,7 +277,7 @@ impl ModelConfig {
 
     /// All layers in the order of [`ModelConfig::parameter_shapes`].
     pub(crate) fn layers(&self) -> Vec<LayerShape> {
-        use InitialLaw::{Orthogonal, Uniform};
+        use Initializer::{Orthogonal, Uniform};
         let torso = self.torso();
         let mut layers = torso.convolutions();
         let fc = [self.hidden, torso.fc_inputs()];
@@ -291,20 +291,20 @@ impl ModelConfig {
                 ..LayerShape::new(name, &[outputs, self.hidden], Uniform)
             });
         }
-        let mut embed = 0;
+        let mut embed_width = 0;
         if self.dim.embeds_action() {
-            embed = self.action_embed;
-            let shape = [self.num_actions, 0, embed];
+            embed_width = self.action_embed;
+            let shape = [self.num_actions, 0, embed_width];
             let mut block = LayerShape::block("dim.action", 1, shape, Orthogonal);
-            block[2].bias = true;
+            block[2].has_bias = true;
             layers.extend(block);
         }
         let (height, width, channels) = torso.local_shape();
         let (local, global) = ((height.saturating_mul(width), channels), (1, self.hidden));
         for (exists, name, (locations, features), joined, initial) in [
-            (self.dim.psi3, "dim.psi3", local, embed, Orthogonal),
+            (self.dim.psi3, "dim.psi3", local, embed_width, Orthogonal),
             (self.dim.phi3, "dim.phi3", local, 0, Orthogonal),
-            (self.dim.psi4, "dim.psi4", global, embed, Uniform),
+            (self.dim.psi4, "dim.psi4", global, embed_width, Uniform),
             (self.dim.phi4, "dim.phi4", global, 0, Uniform),
         ] {
             if exists {
@@ -312,9 +312,9 @@ impl ModelConfig {
                 layers.extend(LayerShape::block(name, locations, shape, initial));
             }
         }
-        for own in &self.loss_layers {
-            let shape = [own.outputs, own.inputs];
-            layers.push(LayerShape::new(own.layer(), &shape, Uniform));
+        for layer in &self.loss_layers {
+            let shape = [layer.outputs, layer.inputs];
+            layers.push(LayerShape::new(layer.prefix(), &shape, Uniform));
         }
         layers
     }
@@ -340,7 +340,7 @@ impl ModelConfig {
             hidden: 7,
             embedding_dim: 8,
             action_embed: 2,
-            dim: DimHeads::EVERY,
+            dim: DimHeads::ALL,
             loss_layers: vec![],
             head: HeadConfig::PLAIN,
         }

@@ -5,7 +5,7 @@ use safetensors::tensor::TensorView;
 
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::stored::StoredAs;
+use crate::stored::WeightDtype;
 
 /// The cost of one layer. FLOPs are multiplications and additions, each counted as one.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -22,12 +22,12 @@ pub struct LayerCost {
 
 impl LayerCost {
     /// FLOPs of one state forward and backward.
-    pub const fn learning(&self) -> u64 {
+    pub const fn forward_backward(&self) -> u64 {
         self.forward + self.backward
     }
 
     /// Whether the layer belongs to the part of the network with this name, such as `torso` or `dim.psi4`.
-    pub fn is_of(&self, part: &str) -> bool {
+    pub fn is_in(&self, part: &str) -> bool {
         let rest = self.name.strip_prefix(part);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     }
@@ -40,13 +40,13 @@ impl ModelConfig {
         let costs = layers.map(|(index, layer)| {
             let len = |shape: &[usize]| shape.iter().product::<usize>();
             // Products with the joined input run once a state, all others once a location.
-            let joined = layer.joined * layer.weight[0];
-            let products = joined + layer.locations * (len(&layer.weight) - joined);
+            let joined = layer.joined_width * layer.weight_shape[0];
+            let products = joined + layer.locations * (len(&layer.weight_shape) - joined);
             let parameters = layer.parameters();
             let scalars = parameters.iter().map(|(_, shape)| len(shape));
-            let is_of = |part: &str| layer.name.starts_with(part);
+            let is_in = |part: &str| layer.name.starts_with(part);
             // Bytes and one-hot actions need no gradient.
-            let is_first = index == 0 || is_of("dim.action.hidden") || is_of("dim.action.skip");
+            let is_first = index == 0 || is_in("dim.action.hidden") || is_in("dim.action.skip");
             let forward = 2 * products as u64;
             LayerCost {
                 forward,
@@ -59,7 +59,7 @@ impl ModelConfig {
     }
 
     /// Returns the size in bytes of a safetensors file of all parameters, names and shapes included.
-    pub fn weights_bytes(&self, stored: StoredAs) -> Result<usize> {
+    pub fn weights_bytes(&self, stored: WeightDtype) -> Result<usize> {
         let shapes = self.parameter_shapes();
         let scalars = |shape: &[usize]| shape.iter().product::<usize>() * stored.bytes();
         let largest = shapes.iter().map(|(_, shape)| scalars(shape)).max();
@@ -118,8 +118,8 @@ mod tests {
             let backward = layer.forward * (1 + u64::from(inputs_gradient));
             assert_eq!(layer.backward, backward, "{name}");
         }
-        assert!(counted[4].is_of("dim.action") && counted[4].is_of("dim"));
-        assert!(counted[3].is_of("head") && !counted[4].is_of("dim.act"));
+        assert!(counted[4].is_in("dim.action") && counted[4].is_in("dim"));
+        assert!(counted[3].is_in("head") && !counted[4].is_in("dim.act"));
     }
 
     /// The value stream has parameters but no products: its weight is added to the advantage stream's weight.
@@ -130,7 +130,7 @@ mod tests {
         dueling.head.dueling = true;
         let of_head = |config: &ModelConfig| {
             let layers = config.layer_costs().into_iter();
-            let layers: Vec<_> = layers.filter(|layer| layer.is_of("head")).collect();
+            let layers: Vec<_> = layers.filter(|layer| layer.is_in("head")).collect();
             let sum = |cost: fn(&LayerCost) -> u64| layers.iter().map(cost).sum::<u64>();
             let names: Vec<_> = layers.iter().map(|layer| layer.name.clone()).collect();
             (
@@ -170,7 +170,7 @@ mod tests {
             (TorsoName::Impoola, 32 * 512),
         ] {
             let costs = of(torso).layer_costs();
-            let torso = costs.iter().filter(|layer| layer.is_of("torso"));
+            let torso = costs.iter().filter(|layer| layer.is_in("torso"));
             let forward: u64 = torso.map(|layer| layer.forward).sum();
             assert_eq!(forward, 2 * (convolutions + fc) as u64);
             assert_eq!(costs[1].name, "torso.stage1.block1.conv1");
@@ -199,7 +199,7 @@ mod tests {
             let all: usize = built.iter().map(|(_, var)| var.elem_count()).sum();
             let counted: u64 = config.layer_costs().iter().map(|it| it.parameters).sum();
             assert_eq!(all as u64, counted);
-            for stored in [StoredAs::F32, StoredAs::F16, StoredAs::Bf16] {
+            for stored in [WeightDtype::F32, WeightDtype::F16, WeightDtype::Bf16] {
                 let file = built.to_safetensors_as(stored, |_| true).unwrap();
                 assert_eq!(config.weights_bytes(stored).unwrap(), file.len());
             }

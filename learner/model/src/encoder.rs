@@ -7,7 +7,7 @@ use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
 use crate::features::FeatureLayers;
-use crate::heads::dim::Head;
+use crate::heads::dim::DimHead;
 use crate::parameters::Parameters;
 
 /// The part of a network that encodes a state as psi_4(f4).
@@ -16,12 +16,12 @@ use crate::parameters::Parameters;
 #[derive(Debug)]
 pub struct Encoder {
     torso: FeatureLayers,
-    psi4: Head,
+    psi4: DimHead,
 }
 
 impl Encoder {
     /// Whether the parameter of this name belongs to the encoder.
-    pub fn has(name: &str) -> bool {
+    pub fn has_parameter(name: &str) -> bool {
         name.starts_with("torso.") || name.starts_with("dim.psi4.")
     }
 
@@ -30,7 +30,7 @@ impl Encoder {
         config.validate()?;
         Ok(Self {
             torso: FeatureLayers::new(config, parameters, kernels)?,
-            psi4: Head::new("dim.psi4", parameters, kernels)?,
+            psi4: DimHead::new("dim.psi4", parameters, kernels)?,
         })
     }
 

@@ -26,7 +26,7 @@ impl FeatureLayers {
     ) -> Result<Self> {
         let torso = config.torso();
         let parameters =
-            TorsoParameters::of(&*torso, |layer, part| parameters.tensor(layer, part))?;
+            TorsoParameters::collect(&*torso, |layer, part| parameters.tensor(layer, part))?;
         Ok(Self {
             kernels,
             input: [config.height, config.width, config.input_channels],

@@ -116,7 +116,7 @@ impl ConvShape {
 pub(crate) const STAGE_CONVOLUTIONS: usize = 5;
 
 /// Returns height, width and channels after a 3 x 3 max pool of stride 2 and padding 1, where the padding is never the largest.
-pub(crate) const fn pooled(
+pub(crate) const fn pooled_size(
     (height, width, channels): (usize, usize, usize),
 ) -> (usize, usize, usize) {
     (height.div_ceil(2), width.div_ceil(2), channels)
@@ -124,14 +124,14 @@ pub(crate) const fn pooled(
 
 /// Returns the shapes of all convolutions of stages with these widths on an input of
 /// (height, width, channels), in the order of application, and the shape of the output.
-pub(crate) fn stages(
+pub(crate) fn stage_shapes(
     input: (usize, usize, usize),
     widths: &[usize],
 ) -> (Vec<ConvShape>, (usize, usize, usize)) {
     let (mut shapes, mut maps) = (Vec::new(), input);
     for &width in widths {
         let first = ConvShape::bordered(maps, width);
-        maps = pooled(first.output());
+        maps = pooled_size(first.output());
         shapes.push(first);
         shapes.extend([ConvShape::bordered(maps, width); STAGE_CONVOLUTIONS - 1]);
     }
@@ -142,16 +142,16 @@ pub(crate) fn stages(
 /// of `conv` cover. Pixels beyond change no output. `None` if a kernel does not fit.
 ///
 /// The last layer's whole output is read. A layer with n output rows reads `stride * (n - 1) + kernel` input rows.
-pub(crate) fn reach(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+pub(crate) fn read_size(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
     let mut size = (image.0, image.1, 1);
     for layer in conv {
         size = ConvShape::new(size, *layer)?.output();
     }
-    let back = |outputs: usize| {
+    let input_side = |outputs: usize| {
         let layers = conv.iter().rev();
         layers.fold(outputs, |n, layer| layer.stride * (n - 1) + layer.kernel)
     };
-    Some((back(size.0), back(size.1)))
+    Some((input_side(size.0), input_side(size.1)))
 }
 
 #[cfg(test)]
@@ -180,7 +180,7 @@ mod tests {
             layers(&[(5, 3), (1, 2)]),
         ] {
             for side in 1..80 {
-                let Some((height, width)) = reach(&conv, (side, 79)) else {
+                let Some((height, width)) = read_size(&conv, (side, 79)) else {
                     assert_eq!(maps(&conv, (side, 79)), None);
                     continue;
                 };

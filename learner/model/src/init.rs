@@ -14,28 +14,28 @@ const LANES: usize = 8;
 
 /// How the initial weight and bias of a layer are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum InitialLaw {
+pub(crate) enum Initializer {
     /// Weight orthogonal with gain sqrt(2), where a convolution counts as [out, in * k * k]. Bias 0.
     Orthogonal,
     /// Weight and bias uniform on +-1/sqrt(fan_in), PyTorch's default for a linear layer.
     Uniform,
 }
 
-impl InitialLaw {
+impl Initializer {
     /// Draws a layer's initial weight, row-major, of shape [out, in] or [out, in, k, k].
-    pub(crate) fn weight(self, shape: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
+    pub(crate) fn draw_weight(self, shape: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
         let (rows, fan_in) = (shape[0], fan_in(shape));
         match self {
-            Self::Orthogonal => orthogonal(rows, fan_in, RELU_GAIN, rng),
-            Self::Uniform => uniform_within(fan_in, rows * fan_in, rng),
+            Self::Orthogonal => draw_orthogonal(rows, fan_in, RELU_GAIN, rng),
+            Self::Uniform => draw_uniform_within(fan_in, rows * fan_in, rng),
         }
     }
 
     /// Draws the initial bias [out] of a layer whose weight has this shape.
-    pub(crate) fn bias(self, weight: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
+    pub(crate) fn draw_bias(self, weight: &[usize], rng: &mut ChaCha8Rng) -> Vec<f32> {
         match self {
             Self::Orthogonal => vec![0.0; weight[0]],
-            Self::Uniform => uniform_within(fan_in(weight), weight[0], rng),
+            Self::Uniform => draw_uniform_within(fan_in(weight), weight[0], rng),
         }
     }
 }
@@ -46,10 +46,10 @@ fn fan_in(weight: &[usize]) -> usize {
 }
 
 /// Draws `len` numbers uniform on +-1/sqrt(fan_in).
-fn uniform_within(fan_in: usize, len: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+fn draw_uniform_within(fan_in: usize, len: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let bound = 1.0 / (fan_in as f64).sqrt();
     (0..len)
-        .map(|_| ((2.0 * uniform(rng) - 1.0) * bound) as f32)
+        .map(|_| ((2.0 * draw_uniform(rng) - 1.0) * bound) as f32)
         .collect()
 }
 
@@ -58,11 +58,11 @@ fn uniform_within(fan_in: usize, len: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
 /// W W^T = gain^2 I if rows <= cols, else W^T W = gain^2 I, uniformly distributed among such matrices.
 /// Gram-Schmidt makes normal vectors orthonormal in f64, twice, because one pass loses digits. Source: Saxe
 /// et al. 2014; PyTorch's `orthogonal_` gives the same distribution.
-fn orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
+fn draw_orthogonal(rows: usize, cols: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let (count, len) = (rows.min(cols), rows.max(cols));
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(count);
     for _ in 0..count {
-        let mut vector = normals(len, rng);
+        let mut vector = draw_normals(len, rng);
         for _ in 0..2 {
             for earlier in &basis {
                 let overlap = dot(earlier, &vector);
@@ -102,21 +102,21 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-pub(crate) fn normals(len: usize, rng: &mut ChaCha8Rng) -> Vec<f64> {
-    let pairs = (0..len.div_ceil(2)).flat_map(|_| normal_pair(rng));
+pub(crate) fn draw_normals(len: usize, rng: &mut ChaCha8Rng) -> Vec<f64> {
+    let pairs = (0..len.div_ceil(2)).flat_map(|_| draw_normal_pair(rng));
     pairs.take(len).collect()
 }
 
 /// Draws two independent standard normal numbers, by the Box-Muller method.
-fn normal_pair(rng: &mut ChaCha8Rng) -> [f64; 2] {
+fn draw_normal_pair(rng: &mut ChaCha8Rng) -> [f64; 2] {
     // In (0, 1], so that the logarithm is finite.
-    let radius = (-2.0 * (1.0 - uniform(rng)).ln()).sqrt();
-    let (sin, cos) = (std::f64::consts::TAU * uniform(rng)).sin_cos();
+    let radius = (-2.0 * (1.0 - draw_uniform(rng)).ln()).sqrt();
+    let (sin, cos) = (std::f64::consts::TAU * draw_uniform(rng)).sin_cos();
     [radius * cos, radius * sin]
 }
 
 /// Draws a number uniform on [0, 1) with 53 bits.
-fn uniform(rng: &mut ChaCha8Rng) -> f64 {
+fn draw_uniform(rng: &mut ChaCha8Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 / (1u64 << 53) as f64
 }
 
@@ -130,9 +130,9 @@ mod tests {
     fn uniform_weights_and_biases_have_the_bound_and_variance_of_fan_in() {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
         for shape in [&[300, 100][..], &[40, 25, 2, 2]] {
-            let weight = InitialLaw::Uniform.weight(shape, &mut rng);
+            let weight = Initializer::Uniform.draw_weight(shape, &mut rng);
             let bias: Vec<f32> = (0..40)
-                .flat_map(|_| InitialLaw::Uniform.bias(shape, &mut rng))
+                .flat_map(|_| Initializer::Uniform.draw_bias(shape, &mut rng))
                 .collect();
             assert_eq!(weight.len(), shape.iter().product::<usize>());
             assert_eq!(bias.len(), 40 * shape[0]);
@@ -159,17 +159,18 @@ mod tests {
     #[test]
     fn a_layer_that_starts_orthogonal_has_no_bias_and_draws_none() {
         let (mut one, mut other) = (ChaCha8Rng::seed_from_u64(7), ChaCha8Rng::seed_from_u64(7));
-        assert_eq!(InitialLaw::Orthogonal.bias(&[5, 3], &mut one), [0.0; 5]);
+        let bias = Initializer::Orthogonal.draw_bias(&[5, 3], &mut one);
+        assert_eq!(bias, [0.0; 5]);
         assert_eq!(one.next_u64(), other.next_u64());
         // A kernel is a matrix [out, in * k * k].
-        let kernel = InitialLaw::Orthogonal.weight(&[4, 3, 2, 2], &mut one);
-        let matrix = orthogonal(4, 12, RELU_GAIN, &mut other);
+        let kernel = Initializer::Orthogonal.draw_weight(&[4, 3, 2, 2], &mut one);
+        let matrix = draw_orthogonal(4, 12, RELU_GAIN, &mut other);
         assert_eq!(kernel, matrix);
     }
 
     #[test]
     fn entries_have_mean_zero_and_the_variance_of_a_rotation() {
-        let weight = orthogonal(64, 1024, 1.0, &mut ChaCha8Rng::seed_from_u64(5));
+        let weight = draw_orthogonal(64, 1024, 1.0, &mut ChaCha8Rng::seed_from_u64(5));
         let mean = weight.iter().sum::<f32>() / weight.len() as f32;
         // Standard error of the mean of 65,536 entries of variance 1/1024.
         assert!(mean.abs() < 4.0 / 1024f32.sqrt() / 256.0, "{mean}");

@@ -34,7 +34,7 @@ pub struct FrameSize {
 
 /// The part that a network reads, from the upper left corner, as (height, width).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct InputRead {
+pub struct ReadArea {
     /// The part of the enlarged frame.
     pub input: (usize, usize),
     /// The part of the frame as the environment gives it.
@@ -55,47 +55,47 @@ impl InputSize {
 
     /// Returns the part that `torso` (with the layers `conv` if it is `nature`) reads of a frame of
     /// (height, width) enlarged to this size. Returns the whole if the layers do not fit.
-    pub fn read(&self, torso: TorsoName, conv: &[ConvLayer], frame: (usize, usize)) -> InputRead {
+    pub fn read_area(
+        &self,
+        torso: TorsoName,
+        conv: &[ConvLayer],
+        frame: (usize, usize),
+    ) -> ReadArea {
         let whole = self.whole_input();
-        let reach = torso.reach(conv, whole);
-        let Some(input) = reach.filter(|&(rows, cols)| rows.min(cols) > 0) else {
-            return InputRead {
-                input: whole,
-                frame,
-            };
+        let read = torso.read_size(conv, whole);
+        let Some(input) = read.filter(|&(rows, cols)| rows.min(cols) > 0) else {
+            let input = whole;
+            return ReadArea { input, frame };
         };
-        let of_side = |read: usize, from: usize, to: usize| source(read - 1, from, to) + 1;
-        InputRead {
-            input,
-            frame: (
-                of_side(input.0, frame.0, whole.0),
-                of_side(input.1, frame.1, whole.1),
-            ),
-        }
+        let frame_side = |read: usize, from: usize, to: usize| source_at(read - 1, from, to) + 1;
+        let height = frame_side(input.0, frame.0, whole.0);
+        let width = frame_side(input.1, frame.1, whole.1);
+        let frame = (height, width);
+        ReadArea { input, frame }
     }
 
     /// Returns the resize from transferred frames of size `sent`, (height, width), to the input of `model`; `None` if none is needed.
     ///
     /// # Errors
     /// [`ModelError::Config`] if the network reads pixels that these frames lack.
-    pub fn enlarge(&self, sent: (usize, usize), model: &ModelConfig) -> Result<Option<Enlarge>> {
+    pub fn resizer(&self, sent: (usize, usize), model: &ModelConfig) -> Result<Option<Resizer>> {
         let (frame, whole) = (self.whole_frame(sent), self.whole_input());
-        let taken = (model.height, model.width);
+        let read = (model.height, model.width);
         if frame != whole {
-            let enlarge = Enlarge::new(frame, whole, model.input_channels)?;
-            return enlarge.part(sent, taken).map(Some);
+            let resizer = Resizer::new(frame, whole, model.input_channels)?;
+            return resizer.restrict(sent, read).map(Some);
         }
-        if sent == taken {
+        if sent == read {
             return Ok(None);
         }
         Err(ModelError::Config(format!(
-            "the network takes {taken:?} of {whole:?}, and frames of {sent:?} travel"
+            "the network takes {read:?} of {whole:?}, and frames of {sent:?} travel"
         )))
     }
 }
 
 /// Returns the source index of output index `at` along one side.
-const fn source(at: usize, from: usize, to: usize) -> usize {
+const fn source_at(at: usize, from: usize, to: usize) -> usize {
     (2 * at + 1) * from / (2 * to)
 }
 
@@ -104,14 +104,14 @@ const fn source(at: usize, from: usize, to: usize) -> usize {
 /// Output pixel d copies source pixel floor((d + 1/2) * from / to), independently in each direction: the
 /// pixel under its centre. Procgen's 64x64 becomes the paper's 104x80, Ms. PacMan's 21x19 its 84x84.
 #[derive(Clone, Debug)]
-pub struct Enlarge {
+pub struct Resizer {
     from: (usize, usize),
     channels: usize,
     source_rows: Vec<usize>,
     source_cols: Vec<usize>,
 }
 
-impl Enlarge {
+impl Resizer {
     /// Builds a resize between two sizes, each (height, width).
     ///
     /// # Errors
@@ -122,7 +122,7 @@ impl Enlarge {
                 "resizing {from:?} to {to:?} with {channels} channels"
             )));
         }
-        let sources = |from: usize, to: usize| (0..to).map(|at| source(at, from, to)).collect();
+        let sources = |from: usize, to: usize| (0..to).map(|at| source_at(at, from, to)).collect();
         Ok(Self {
             from,
             channels,
@@ -135,13 +135,13 @@ impl Enlarge {
     ///
     /// # Errors
     /// [`ModelError::Config`] if the part `to` needs pixels outside `from`, or if either part exceeds its image.
-    pub fn part(mut self, from: (usize, usize), to: (usize, usize)) -> Result<Self> {
+    pub fn restrict(mut self, from: (usize, usize), to: (usize, usize)) -> Result<Self> {
         let whole = (self.from, (self.source_rows.len(), self.source_cols.len()));
         self.source_rows.truncate(to.0);
         self.source_cols.truncate(to.1);
-        let fits = |sources: &[usize], whole: usize, wanted: usize, there: usize| {
+        let fits = |sources: &[usize], whole: usize, wanted: usize, part: usize| {
             let last = sources.last().copied();
-            sources.len() == wanted && there <= whole && last.is_some_and(|last| last < there)
+            sources.len() == wanted && part <= whole && last.is_some_and(|last| last < part)
         };
         if fits(&self.source_rows, whole.0.0, to.0, from.0)
             && fits(&self.source_cols, whole.0.1, to.1, from.1)
@@ -216,12 +216,12 @@ mod tests {
             ((21, 19), (84, 84), 12),
             ((3, 5), (2, 4), 1),
         ] {
-            let enlarge = Enlarge::new(from, to, channels).unwrap();
+            let resizer = Resizer::new(from, to, channels).unwrap();
             let images: Vec<u8> = (0..2 * from.0 * from.1 * channels)
                 .map(|index| (index * 7 % 251) as u8)
                 .collect();
             let mut enlarged = vec![0; 2 * to.0 * to.1 * channels];
-            enlarge.apply(&images, &mut enlarged);
+            resizer.apply(&images, &mut enlarged);
             for (index, &value) in enlarged.iter().enumerate() {
                 let (pixel, channel) = (index / channels, index % channels);
                 let (image, y, x) = (pixel / (to.0 * to.1), pixel / to.1 % to.0, pixel % to.1);
@@ -259,14 +259,14 @@ mod tests {
                     width: frame.1 as u32,
                 }),
             };
-            let found = size.read(TorsoName::Nature, &conv, frame);
+            let found = size.read_area(TorsoName::Nature, &conv, frame);
             assert_eq!((found.input, found.frame), read);
             let image: Vec<u8> = (0..frame.0 * frame.1)
                 .map(|at| (at * 7 % 251) as u8)
                 .collect();
             let mut whole = vec![0; input.0 * input.1];
-            let enlarge = Enlarge::new(frame, input, 1).unwrap();
-            enlarge.apply(&image, &mut whole);
+            let resizer = Resizer::new(frame, input, 1).unwrap();
+            resizer.apply(&image, &mut whole);
             let model = ModelConfig {
                 height: found.input.0,
                 width: found.input.1,
@@ -275,20 +275,20 @@ mod tests {
             };
             let sent = cut(&image, frame.1, found.frame);
             let mut part = vec![0; found.input.0 * found.input.1];
-            match size.enlarge(found.frame, &model).unwrap() {
-                Some(enlarge) => enlarge.apply(&sent, &mut part),
+            match size.resizer(found.frame, &model).unwrap() {
+                Some(resizer) => resizer.apply(&sent, &mut part),
                 None => part.copy_from_slice(&sent),
             }
             assert_eq!(part, cut(&whole, input.1, found.input), "{frame:?}");
             // One row less is too small.
             let less = (found.frame.0 - 1, found.frame.1);
-            assert!(size.enlarge(less, &model).is_err(), "{frame:?}");
+            assert!(size.resizer(less, &model).is_err(), "{frame:?}");
         }
     }
 
     #[test]
     fn sizes_of_zero_are_errors() {
-        assert!(Enlarge::new((0, 2), (4, 8), 1).is_err());
-        assert!(Enlarge::new((1, 2), (4, 8), 0).is_err());
+        assert!(Resizer::new((0, 2), (4, 8), 1).is_err());
+        assert!(Resizer::new((1, 2), (4, 8), 0).is_err());
     }
 }

@@ -10,7 +10,7 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::features::FeatureLayers;
 use crate::heads::c51::C51Head;
-use crate::heads::dim::{ActionEmbedding, Head};
+use crate::heads::dim::{ActionEmbedding, DimHead};
 use crate::heads::noise::HeadNoise;
 use crate::parameters::Parameters;
 
@@ -25,7 +25,7 @@ pub struct Features {
 
 impl Features {
     /// Returns f3, or [`ModelError::NoHead`] if no head reads it.
-    pub fn local(&self) -> Result<&Tensor> {
+    pub fn require_f3(&self) -> Result<&Tensor> {
         self.f3.as_ref().ok_or(ModelError::NoHead("psi3 or phi3"))
     }
 
@@ -59,10 +59,10 @@ pub struct Network {
     torso: FeatureLayers,
     head: C51Head,
     action: Option<ActionEmbedding>,
-    psi3: Option<Head>,
-    phi3: Option<Head>,
-    psi4: Option<Head>,
-    phi4: Option<Head>,
+    psi3: Option<DimHead>,
+    phi3: Option<DimHead>,
+    psi4: Option<DimHead>,
+    phi4: Option<DimHead>,
     /// Weight and bias of each loss layer, by name.
     loss_layers: BTreeMap<String, (Tensor, Tensor)>,
 }
@@ -73,18 +73,18 @@ impl Network {
     pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         let head = |exists: bool, name: &str| {
-            let head = exists.then(|| Head::new(name, parameters, kernels));
+            let head = exists.then(|| DimHead::new(name, parameters, kernels));
             head.transpose()
         };
-        let embeds = config.dim.embeds_action();
-        let action = embeds.then(|| ActionEmbedding::new(config, parameters, kernels));
-        let own = config.loss_layers.iter().map(|own| {
-            let tensor = |part| parameters.tensor(&own.layer(), part);
-            Ok((own.name.clone(), (tensor("weight")?, tensor("bias")?)))
+        let embeds_action = config.dim.embeds_action();
+        let action = embeds_action.then(|| ActionEmbedding::new(config, parameters, kernels));
+        let loss_layers = config.loss_layers.iter().map(|layer| {
+            let tensor = |part| parameters.tensor(&layer.prefix(), part);
+            Ok((layer.name.clone(), (tensor("weight")?, tensor("bias")?)))
         });
         Ok(Self {
             kernels,
-            loss_layers: own.collect::<Result<_>>()?,
+            loss_layers: loss_layers.collect::<Result<_>>()?,
             torso: FeatureLayers::new(config, parameters, kernels)?,
             head: C51Head::new(config, parameters, kernels)?,
             action: action.transpose()?,
@@ -131,25 +131,25 @@ impl Network {
 
     /// Computes Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers, ignored if Psi does not see the action).
     pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        let head = there(self.psi3.as_ref(), "psi3")?;
-        by_location(head.forward(f3, self.embedded(actions)?.as_ref())?)
+        let head = require_head(self.psi3.as_ref(), "psi3")?;
+        flatten_locations(head.forward(f3, self.embed_actions(actions)?.as_ref())?)
     }
 
     /// Computes Phi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c].
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
-        let head = there(self.phi3.as_ref(), "phi3")?;
-        by_location(head.forward(f3, None)?)
+        let head = require_head(self.phi3.as_ref(), "phi3")?;
+        flatten_locations(head.forward(f3, None)?)
     }
 
     /// Computes Psi_4 [B, embedding_dim] of `f4` [B, hidden] and `actions` [B] (integers, ignored if Psi does not see the action).
     pub fn psi4(&self, f4: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        let head = there(self.psi4.as_ref(), "psi4")?;
-        head.forward(f4, self.embedded(actions)?.as_ref())
+        let head = require_head(self.psi4.as_ref(), "psi4")?;
+        head.forward(f4, self.embed_actions(actions)?.as_ref())
     }
 
     /// Computes Phi_4 [B, embedding_dim] of `f4` [B, hidden].
     pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
-        there(self.phi4.as_ref(), "phi4")?.forward(f4, None)
+        require_head(self.phi4.as_ref(), "phi4")?.forward(f4, None)
     }
 
     /// Computes W x + b [.., outputs] of `x` [.., inputs] with the loss layer of this name.
@@ -161,17 +161,17 @@ impl Network {
         Ok(self.kernels.linear(x, weight, bias)?)
     }
 
-    fn embedded(&self, actions: &Tensor) -> Result<Option<Tensor>> {
+    fn embed_actions(&self, actions: &Tensor) -> Result<Option<Tensor>> {
         let action = self.action.as_ref();
         action.map(|it| it.forward(actions)).transpose()
     }
 }
 
-fn there<'a>(head: Option<&'a Head>, name: &'static str) -> Result<&'a Head> {
+fn require_head<'a>(head: Option<&'a DimHead>, name: &'static str) -> Result<&'a DimHead> {
     head.ok_or(ModelError::NoHead(name))
 }
 
 /// Reshapes [B, h, w, embedding_dim] to [B, h * w, embedding_dim].
-fn by_location(maps: Tensor) -> Result<Tensor> {
+fn flatten_locations(maps: Tensor) -> Result<Tensor> {
     Ok(maps.flatten(1, 2)?)
 }

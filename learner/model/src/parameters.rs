@@ -9,7 +9,7 @@ use safetensors::tensor::{SafeTensors, TensorView};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::stored::{self, StoredAs};
+use crate::stored::{self, WeightDtype};
 
 /// Parameters by name, as candle variables with PyTorch's names and shapes.
 ///
@@ -27,7 +27,7 @@ impl Parameters {
         config.validate()?;
         let mut vars = BTreeMap::new();
         for layer in config.layers() {
-            let values = layer.initial_values(rng);
+            let values = layer.draw_initial_values(rng);
             for ((name, shape), values) in layer.parameters().into_iter().zip(values) {
                 vars.insert(name, Var::from_vec(values, shape, device)?);
             }
@@ -91,7 +91,7 @@ impl Parameters {
     /// # Errors
     /// A parameter that is not finite, because every reader rejects it; a failure to read a variable or to serialise.
     pub fn to_safetensors(&self, filter: impl Fn(&str) -> bool) -> Result<Vec<u8>> {
-        self.to_safetensors_as(StoredAs::F32, filter)
+        self.to_safetensors_as(WeightDtype::F32, filter)
     }
 
     /// [`Parameters::to_safetensors`] with scalars of another type.
@@ -100,27 +100,27 @@ impl Parameters {
     /// As [`Parameters::to_safetensors`], or a parameter that is too large for the type.
     pub fn to_safetensors_as(
         &self,
-        stored: StoredAs,
+        stored: WeightDtype,
         filter: impl Fn(&str) -> bool,
     ) -> Result<Vec<u8>> {
-        self.serialized(stored, filter, None)
+        self.serialize_part(stored, filter, None)
     }
 
     /// Serialises all parameters as a safetensors file with the metadata entry `key`: `value`, for readers that
     /// know only the file. There is one entry, because several would be written in a random order each time.
     pub fn to_described_safetensors(
         &self,
-        stored: StoredAs,
+        stored: WeightDtype,
         key: &str,
         value: &str,
     ) -> Result<Vec<u8>> {
         let entry = HashMap::from([(key.to_owned(), value.to_owned())]);
-        self.serialized(stored, |_| true, Some(entry))
+        self.serialize_part(stored, |_| true, Some(entry))
     }
 
-    fn serialized(
+    fn serialize_part(
         &self,
-        stored: StoredAs,
+        stored: WeightDtype,
         filter: impl Fn(&str) -> bool,
         metadata: Option<HashMap<String, String>>,
     ) -> Result<Vec<u8>> {
@@ -166,10 +166,8 @@ impl Parameters {
     pub fn copy_part(&self, part: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
         for (name, var) in self.iter().filter(|(name, _)| part(name)) {
-            vars.insert(
-                name.to_owned(),
-                Var::from_tensor(&var.as_detached_tensor().copy()?)?,
-            );
+            let copy = Var::from_tensor(&var.as_detached_tensor().copy()?)?;
+            vars.insert(name.to_owned(), copy);
         }
         Ok(Self(vars))
     }
@@ -185,7 +183,7 @@ impl Parameters {
 }
 
 /// A tensor's shape and its values, row-major.
-type Shaped = (Vec<usize>, Vec<f32>);
+type ShapeAndValues = (Vec<usize>, Vec<f32>);
 
 /// Whether the parameter belongs to a DIM head or a loss layer.
 pub fn is_dim(name: &str) -> bool {
@@ -199,7 +197,7 @@ pub(crate) fn decode(
     part: impl Fn(&str) -> bool,
     bytes: &[u8],
     ignore: impl Fn(&str) -> bool,
-) -> Result<BTreeMap<String, Shaped>> {
+) -> Result<BTreeMap<String, ShapeAndValues>> {
     config.validate()?;
     let file = SafeTensors::deserialize(bytes)?;
     let mut found: BTreeMap<&str, TensorView<'_>> = file.iter().collect();
@@ -227,10 +225,8 @@ fn check_shape(name: &str, found: &[usize], wanted: &[usize]) -> Result<()> {
     if found == wanted {
         return Ok(());
     }
-    Err(ModelError::parameter(
-        name,
-        format!("has shape {found:?}, wanted {wanted:?}"),
-    ))
+    let why = format!("has shape {found:?}, wanted {wanted:?}");
+    Err(ModelError::parameter(name, why))
 }
 
 fn check_finite(name: &str, values: &[f32]) -> Result<()> {

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::heads::acting::merged;
+use crate::heads::acting::merge;
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::HeadLayer;
@@ -69,8 +69,8 @@ impl PolicyNetwork {
     /// Uses this noise in the head's noisy layers from now on. `None` means the layers' means.
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         let weights = &mut self.weights;
-        if let Some(noisy) = &weights.noisy {
-            weights.head = build_relu_layer(self.precision, merged(noisy, noise));
+        if let Some(noisy) = &weights.noisy_layers {
+            weights.head = build_relu_layer(self.precision, merge(noisy, noise));
         }
     }
 
@@ -100,9 +100,9 @@ impl PolicyNetwork {
         if tasks <= 1 {
             task(frames, values);
         } else {
-            let share = batch.div_ceil(tasks);
-            let values = values.par_chunks_mut(share * actions);
-            let frames = frames.par_chunks(share * frame_len);
+            let task_frames = batch.div_ceil(tasks);
+            let values = values.par_chunks_mut(task_frames * actions);
+            let frames = frames.par_chunks(task_frames * frame_len);
             values
                 .zip(frames)
                 .for_each(|(values, frames)| task(frames, values));
@@ -123,7 +123,7 @@ impl PolicyNetwork {
         let result = self.q_values(frames, &mut values);
         if result.is_ok() {
             for (action, values) in actions.iter_mut().zip(values.chunks_exact(count)) {
-                *action = greedy(values);
+                *action = argmax(values);
             }
         }
         self.values = values;
@@ -143,7 +143,7 @@ impl fmt::Debug for PolicyNetwork {
 ///
 /// # Panics
 /// If an action beyond 255 is best.
-pub fn greedy(values: &[f32]) -> u8 {
+pub fn argmax(values: &[f32]) -> u8 {
     let better = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
     let best = (1..values.len()).fold(0, better);
     u8::try_from(best).expect("a valid configuration has at most 255 actions")
@@ -154,7 +154,7 @@ struct Weights {
     torso: Box<dyn ActingTorso>,
     head: Box<dyn ReluLayer>,
     /// The layers that `head` is merged from, kept to merge them with new noise. `Some` if the head is noisy.
-    noisy: Option<Vec<HeadLayer<Vec<f32>>>>,
+    noisy_layers: Option<Vec<HeadLayer<Vec<f32>>>>,
 }
 
 impl Weights {
@@ -168,12 +168,12 @@ impl Weights {
             Ok::<_, Infallible>(values)
         };
         let torso = config.torso();
-        let Ok(of_torso) = TorsoParameters::of(&*torso, &mut take);
-        let Ok(of_head) = HeadLayer::all(config, take);
+        let Ok(torso_parameters) = TorsoParameters::collect(&*torso, &mut take);
+        let Ok(head_layers) = HeadLayer::collect(config, take);
         Ok(Self {
-            torso: torso.acting(precision, of_torso),
-            head: build_relu_layer(precision, merged(&of_head, None)),
-            noisy: config.head.noisy_sigma.map(|_| of_head),
+            torso: torso.for_actor(precision, torso_parameters),
+            head: build_relu_layer(precision, merge(&head_layers, None)),
+            noisy_layers: config.head.noisy_sigma.map(|_| head_layers),
         })
     }
 }

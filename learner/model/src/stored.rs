@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// The type of the scalars in a weights file. Rounding is to nearest, ties to even.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum StoredAs {
+pub enum WeightDtype {
     /// f32, unchanged, 4 bytes each.
     #[default]
     F32,
@@ -20,7 +20,7 @@ pub enum StoredAs {
     Bf16,
 }
 
-impl fmt::Display for StoredAs {
+impl fmt::Display for WeightDtype {
     /// Writes the name that settings use.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -31,9 +31,9 @@ impl fmt::Display for StoredAs {
     }
 }
 
-impl StoredAs {
-    /// Largest error of a stored scalar, relative to the scalar or to [`StoredAs::least_normal`], whichever is larger.
-    pub const fn error(self) -> f64 {
+impl WeightDtype {
+    /// Largest error of a stored scalar, relative to the scalar or to [`WeightDtype::min_normal`], whichever is larger.
+    pub const fn rounding_error(self) -> f64 {
         match self {
             Self::F32 => 0.0,
             // 2^-11 and 2^-8.
@@ -42,8 +42,8 @@ impl StoredAs {
         }
     }
 
-    /// The smallest normal number. Smaller numbers have a fixed spacing: 2 * [`StoredAs::error`] * `least_normal`.
-    pub const fn least_normal(self) -> f32 {
+    /// The smallest normal number. Smaller numbers have a fixed spacing: 2 * [`WeightDtype::rounding_error`] * `min_normal`.
+    pub const fn min_normal(self) -> f32 {
         match self {
             Self::F32 | Self::Bf16 => f32::MIN_POSITIVE,
             // 2^-14.
@@ -101,7 +101,7 @@ impl StoredAs {
     }
 }
 
-/// Decodes the scalars of a tensor; `None` if `dtype` is not one of [`StoredAs`].
+/// Decodes the scalars of a tensor; `None` if `dtype` is not one of [`WeightDtype`].
 pub(crate) fn decode(dtype: Dtype, bytes: &[u8]) -> Option<Vec<f32>> {
     let halves = |value: fn([u8; 2]) -> f32| {
         let (halves, _) = bytes.as_chunks::<2>();
@@ -126,16 +126,16 @@ mod tests {
     /// Decoded values are the nearest numbers; the property table of `driml experiment stability` covers that for all types.
     #[test]
     fn the_limits_are_the_types_own() {
-        assert_eq!(StoredAs::F16.largest(), f16::MAX.to_f32());
-        assert_eq!(StoredAs::Bf16.largest(), bf16::MAX.to_f32());
-        assert_eq!(StoredAs::F16.least_normal(), f16::MIN_POSITIVE.to_f32());
+        assert_eq!(WeightDtype::F16.largest(), f16::MAX.to_f32());
+        assert_eq!(WeightDtype::Bf16.largest(), bf16::MAX.to_f32());
+        assert_eq!(WeightDtype::F16.min_normal(), f16::MIN_POSITIVE.to_f32());
         assert_eq!(decode(Dtype::F64, &[0; 8]), None);
     }
 
     #[test]
     fn what_would_be_infinite_is_refused() {
-        assert_eq!(StoredAs::F16.encode(&[1.0, 65_519.0]), Err(1));
-        assert_eq!(StoredAs::Bf16.encode(&[f32::MAX]), Err(0));
-        assert!(StoredAs::F32.encode(&[f32::MAX]).is_ok());
+        assert_eq!(WeightDtype::F16.encode(&[1.0, 65_519.0]), Err(1));
+        assert_eq!(WeightDtype::Bf16.encode(&[f32::MAX]), Err(0));
+        assert!(WeightDtype::F32.encode(&[f32::MAX]).is_ok());
     }
 }

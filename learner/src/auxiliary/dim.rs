@@ -131,8 +131,8 @@ impl HeadVectors {
         let heads = Lambda::heads_for_pairs(active, true);
         let psi3 = heads
             .psi3
-            .then(|| network.psi3(features_t.local()?, action));
-        let phi3 = heads.phi3.then(|| network.phi3(features_k.local()?));
+            .then(|| network.psi3(features_t.require_f3()?, action));
+        let phi3 = heads.phi3.then(|| network.phi3(features_k.require_f3()?));
         let psi4 = heads.psi4.then(|| network.psi4(&features_t.f4, action));
         let phi4 = heads.phi4.then(|| network.phi4(&features_k.f4));
         Ok(Self {

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_model::{Parameters, StoredAs};
+use driml_model::{Parameters, WeightDtype};
 
 use super::{
     contents::{
@@ -108,7 +108,7 @@ fn tensor_files(
     extras: Extras<'_>,
 ) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
     let described = |parameters: &Parameters, description: &str| {
-        parameters.to_described_safetensors(StoredAs::F32, description::METADATA_KEY, description)
+        parameters.to_described_safetensors(WeightDtype::F32, description::METADATA_KEY, description)
     };
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;

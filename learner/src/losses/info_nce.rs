@@ -2,7 +2,7 @@
 //! It does not compute the dot products, and does not know which features they compare.
 
 use candle_core::{Result, Tensor, bail};
-use driml_model::{Kernels, exp_below, soft_clip};
+use driml_model::{Kernels, exp_minus_max, soft_clip};
 use rayon::prelude::*;
 
 use super::{
@@ -108,7 +108,7 @@ fn anchor_loss(
         .binary_search(&anchor)
         .map_or(f64::NAN, |at| values[at]);
     let max = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    exp_below(values, max);
+    exp_minus_max(values, max);
     let sum: f64 = values.iter().sum();
     let share = 1.0 / sum;
     for ((&exp, &slope), &j) in values.iter().zip(&*slopes).zip(candidates) {

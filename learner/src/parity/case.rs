@@ -159,7 +159,7 @@ impl Case {
     /// The noise of the noisy layers, made from the normal numbers in the case.
     pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise, ParityError> {
         let head_noise = |network: &str| {
-            HeadNoise::of_normals(model, |layer, side, len| {
+            HeadNoise::from_normals(model, |layer, side, len| {
                 let name = format!("noise.{network}.{layer}.{side}");
                 let normals = self.tensors.read::<f32>(&name, DType::F32, &[len])?;
                 Ok::<_, ParityError>(normals.into_iter().map(f64::from).collect())

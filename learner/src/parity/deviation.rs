@@ -2,7 +2,7 @@
 //! It applies no tolerances: the parity check does, which compares both ways of computing with float64.
 
 use candle_core::Device;
-use driml_model::{Compute, Kernels, greedy};
+use driml_model::{Compute, Kernels, argmax};
 use driml_protocol::NO_ACTION;
 
 use crate::{agent::Agent, batch::Batch, error::UpdateError, tensors::to_vec_f64};
@@ -94,7 +94,7 @@ impl QDeviation {
             max = max.max(error);
         }
         let rows = expected.len() / num_actions;
-        let [own, reference] = [got, expected].map(|it| it.chunks_exact(num_actions).map(greedy));
+        let [own, reference] = [got, expected].map(|it| it.chunks_exact(num_actions).map(argmax));
         let same = own.zip(reference).filter(|(a, b)| a == b).count();
         Self {
             rms: (square / expected.len() as f64).sqrt(),

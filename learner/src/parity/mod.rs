@@ -272,7 +272,7 @@ fn key_parameters(
         return Ok(None);
     }
     let named = case.parameters("key.", model);
-    let key = Parameters::part_from_tensors(model, Encoder::has, named, &compute.device)?;
+    let key = Parameters::part_from_tensors(model, Encoder::has_parameter, named, &compute.device)?;
     Ok(Some(key))
 }
 

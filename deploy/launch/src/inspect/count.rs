@@ -6,7 +6,7 @@ use driml_learner::{
     auxiliary::loss::Passes,
     cost::{UpdateCost, UpdateShape},
 };
-use driml_model::{DimHeads, HeadConfig, LayerCost, ModelConfig, StoredAs};
+use driml_model::{DimHeads, HeadConfig, LayerCost, ModelConfig, WeightDtype};
 use driml_protocol::{BatchHeader, Horizon, RunSpec, TRANSITION_BYTES};
 use driml_settings::{config::RunConfig, memory::replay_bytes_each};
 use serde::Serialize;
@@ -54,7 +54,7 @@ impl<'a> Counted<'a> {
             height: input.height as usize,
             width: input.width as usize,
             num_actions: config.world.num_actions(),
-            dim: DimHeads::EVERY,
+            dim: DimHeads::ALL,
             head: HeadConfig::RAINBOW,
             ..config.model.clone()
         };
@@ -80,7 +80,7 @@ impl<'a> Counted<'a> {
         };
         Ok(Self {
             config,
-            broadcast: model.weights_bytes(StoredAs::F32)?,
+            broadcast: model.weights_bytes(WeightDtype::F32)?,
             model,
             shape,
             run,
@@ -161,7 +161,7 @@ impl<'a> Counted<'a> {
 }
 
 fn sum(layers: &[LayerCost], part: &str, cost: fn(&LayerCost) -> u64) -> u64 {
-    let of_part = layers.iter().filter(|layer| layer.is_of(part));
+    let of_part = layers.iter().filter(|layer| layer.is_in(part));
     of_part.map(cost).sum()
 }
 

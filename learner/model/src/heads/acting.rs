@@ -6,11 +6,11 @@ use crate::heads::streams::HeadLayer;
 use crate::layers::Layer;
 
 /// Merges a head's `layers` into one layer of A * N outputs. Without `noise`, noisy layers are their means.
-pub(crate) fn merged(layers: &[HeadLayer<Vec<f32>>], noise: Option<&HeadNoise>) -> Layer<Vec<f32>> {
-    let with_noise = |(number, layer): (usize, &HeadLayer<Vec<f32>>)| {
+pub(crate) fn merge(layers: &[HeadLayer<Vec<f32>>], noise: Option<&HeadNoise>) -> Layer<Vec<f32>> {
+    let with_noise = |(index, layer): (usize, &HeadLayer<Vec<f32>>)| {
         let mut sum = layer.mean.clone();
         if let (Some(noise), Some(sigma)) = (noise, &layer.sigma) {
-            let noise = noise.of_layer(number);
+            let noise = noise.layer(index);
             let narrow = |noise: &[f64]| noise.iter().map(|&it| it as f32).collect::<Vec<_>>();
             let (inputs, outputs) = (narrow(&noise.inputs), narrow(&noise.outputs));
             let rows = sum.weight.chunks_exact_mut(inputs.len());
@@ -32,13 +32,13 @@ pub(crate) fn merged(layers: &[HeadLayer<Vec<f32>>], noise: Option<&HeadNoise>) 
     let Some(mut advantage) = layers.next() else {
         return first;
     };
-    duel(&first.weight, &mut advantage.weight);
-    duel(&first.bias, &mut advantage.bias);
+    add_streams(&first.weight, &mut advantage.weight);
+    add_streams(&first.bias, &mut advantage.bias);
     advantage
 }
 
 /// Computes V + A - mean_a A in `advantage` [A * N, in] or [A * N], from `value` [N, in] or [N].
-fn duel(value: &[f32], advantage: &mut [f32]) {
+fn add_streams(value: &[f32], advantage: &mut [f32]) {
     let mut shared = vec![0.0; value.len()];
     for action in advantage.chunks_exact(value.len()) {
         for (sum, a) in shared.iter_mut().zip(action) {

@@ -12,7 +12,7 @@ use crate::config::ModelConfig;
 use crate::error::Result;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::Streams;
-use crate::kernels::exponentials::exp_below;
+use crate::kernels::exponentials::exp_minus_max;
 use crate::kernels::tensors::values_of;
 use crate::layers::Layer;
 use crate::parameters::Parameters;
@@ -47,7 +47,7 @@ impl C51Head {
     /// Computes the logits [B, A, atoms] of f4 [B, hidden] before its ReLU. Without noise, noisy layers use their means.
     pub(crate) fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let layer = self.streams.layer(noise)?;
+        let layer = self.streams.merged_layer(noise)?;
         let logits = self.kernels.linear(&active, &layer.weight, &layer.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
@@ -60,17 +60,17 @@ impl C51Head {
         noise: Option<&HeadNoise>,
     ) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let Layer { weight, bias } = self.streams.layer(noise)?;
-        let (with, atoms) = (self.kernels, self.atoms);
-        Ok(with.grouped_linear(&active, &weight, &bias, actions, atoms)?)
+        let Layer { weight, bias } = self.streams.merged_layer(noise)?;
+        let (kernels, atoms) = (self.kernels, self.atoms);
+        Ok(kernels.grouped_linear(&active, &weight, &bias, actions, atoms)?)
     }
 
     /// Computes the expected returns [B, A] of logits [B, A, atoms], without a gradient.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         match self.kernels {
-            Kernels::Fused(_) => Ok(expectations(&logits.contiguous()?, &self.support)?),
+            Kernels::Fused(_) => Ok(fused_q_values(&logits.contiguous()?, &self.support)?),
             Kernels::Candle => {
-                let (v_min, spacing) = ends(&self.support);
+                let (v_min, spacing) = v_min_and_spacing(&self.support);
                 let positions = Tensor::arange(0f32, self.atoms as f32, logits.device())?;
                 let probs = softmax(&logits.detach(), D::Minus1)?;
                 let mean = probs.broadcast_mul(&positions)?.sum(D::Minus1)?;
@@ -81,7 +81,7 @@ impl C51Head {
 }
 
 /// Computes [`expected_returns`] [B, A] of logits [B, A, atoms] on the rayon pool.
-fn expectations(logits: &Tensor, support: &[f32]) -> candle_core::Result<Tensor> {
+fn fused_q_values(logits: &Tensor, support: &[f32]) -> candle_core::Result<Tensor> {
     let (batch, actions, atoms) = logits.dims3()?;
     if atoms != support.len() {
         bail!("logits {:?} over {} atoms", logits.shape(), support.len());
@@ -104,7 +104,7 @@ pub const EXPECTED_RETURN_ERROR: f64 = 8e-15;
 /// not returns. So the error beyond f32 rounding is at most [`EXPECTED_RETURN_ERROR`] times the support's width, wherever the support
 /// lies. Every value lies within the support, and no f32 support overflows. A NaN, or a maximum that is infinite, gives NaN.
 pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f32]) {
-    let (v_min, spacing) = ends(support);
+    let (v_min, spacing) = v_min_and_spacing(support);
     let v_max = f64::from(support[support.len() - 1]);
     let mut weights = vec![0.0; support.len()];
     for (value, logits) in values.iter_mut().zip(logits.chunks_exact(support.len())) {
@@ -112,7 +112,7 @@ pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f3
         for (weight, &logit) in weights.iter_mut().zip(logits) {
             *weight = logit.into();
         }
-        exp_below(&mut weights, max.into());
+        exp_minus_max(&mut weights, max.into());
         let (mut weighted, mut total) = (0.0, 0.0);
         for (i, weight) in (0..).zip(&weights) {
             weighted += weight * f64::from(i);
@@ -123,7 +123,7 @@ pub(crate) fn expected_returns(logits: &[f32], support: &[f32], values: &mut [f3
 }
 
 /// Returns the first of two or more atoms, and the spacing of the atoms.
-fn ends(support: &[f32]) -> (f64, f64) {
+fn v_min_and_spacing(support: &[f32]) -> (f64, f64) {
     let (v_min, v_max) = (f64::from(support[0]), f64::from(support[support.len() - 1]));
     (v_min, (v_max - v_min) / (support.len() - 1) as f64)
 }
@@ -152,11 +152,8 @@ mod tests {
         let mut value = [0.0];
         expected_returns(&[f32::NEG_INFINITY; 3], &[-1.0, 0.0, 1.0], &mut value);
         assert!(value[0].is_nan());
-        expected_returns(
-            &[0.0, f32::NEG_INFINITY, 0.0],
-            &[-1.0, 0.0, 2.0],
-            &mut value,
-        );
+        let logits = [0.0, f32::NEG_INFINITY, 0.0];
+        expected_returns(&logits, &[-1.0, 0.0, 2.0], &mut value);
         assert_eq!(value, [0.5]);
     }
 }

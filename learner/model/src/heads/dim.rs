@@ -13,12 +13,12 @@ use crate::parameters::Parameters;
 
 /// A residual block on features, optionally with an action embedding joined to them.
 #[derive(Debug)]
-pub(crate) struct Head {
+pub(crate) struct DimHead {
     kernels: Kernels,
     parameters: BlockParameters,
 }
 
-impl Head {
+impl DimHead {
     pub(crate) fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         let tensor = |layer: &str, part: &str| parameters.tensor(&format!("{name}.{layer}"), part);
         let parameters = BlockParameters {
@@ -40,21 +40,21 @@ impl Head {
     /// group of rows, and the tiled concatenation is never built.
     pub(crate) fn forward(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
         let Kernels::Fused(precision) = self.kernels else {
-            return self.of_layers(x, joined);
+            return self.forward_by_layers(x, joined);
         };
         Ok(residual_block(x, joined, &self.parameters, precision)?)
     }
 
     /// Computes the same with candle's operations, layer by layer: W [x; joined] = W_x x + W_joined joined.
-    fn of_layers(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
-        let with = self.kernels;
+    fn forward_by_layers(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
+        let kernels = self.kernels;
         let features = x.dim(D::Minus1)?;
         let bias = |weight: &Tensor, bias: &Tensor| -> Result<Tensor> {
             let Some(joined) = joined else {
                 return Ok(bias.clone());
             };
             let weight = weight.narrow(1, features, weight.dim(1)? - features)?;
-            Ok(with.linear(joined, &weight, bias)?)
+            Ok(kernels.linear(joined, &weight, bias)?)
         };
         let block = &self.parameters;
         let out_bias = Tensor::stack(&block.out_biases, 0)?.sum(0)?;
@@ -62,17 +62,17 @@ impl Head {
         let skip_bias = bias(&block.skip_weight, &out_bias)?;
         let hidden_weight = block.hidden_weight.narrow(1, 0, features)?;
         let skip_weight = block.skip_weight.narrow(1, 0, features)?;
-        let hidden = with.relu(&with.linear(x, &hidden_weight, &hidden_bias)?)?;
+        let hidden = kernels.relu(&kernels.linear(x, &hidden_weight, &hidden_bias)?)?;
         // The skip's result serves as the bias of `out`, which saves an addition.
-        let skip = with.linear(x, &skip_weight, &skip_bias)?;
-        Ok(with.linear(&hidden, &block.out_weight, &skip)?)
+        let skip = kernels.linear(x, &skip_weight, &skip_bias)?;
+        Ok(kernels.linear(&hidden, &block.out_weight, &skip)?)
     }
 }
 
 /// The action embedding: a one-hot vector through a residual block whose skip layer has a bias.
 #[derive(Debug)]
 pub(crate) struct ActionEmbedding {
-    block: Head,
+    block: DimHead,
     num_actions: usize,
 }
 
@@ -82,7 +82,7 @@ impl ActionEmbedding {
         parameters: &Parameters,
         kernels: Kernels,
     ) -> Result<Self> {
-        let mut block = Head::new("dim.action", parameters, kernels)?;
+        let mut block = DimHead::new("dim.action", parameters, kernels)?;
         let skip_bias = parameters.tensor("dim.action.skip", "bias")?;
         block.parameters.out_biases.push(skip_bias);
         Ok(Self {

@@ -6,7 +6,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::config::ModelConfig;
-use crate::init::normals;
+use crate::init::draw_normals;
 
 /// One draw of the noise of all noisy layers of a head.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,7 +25,7 @@ pub(crate) struct LayerNoise {
 impl HeadNoise {
     /// Draws noise for the head of `config`; `None` if the head has no noisy layer.
     pub fn draw(config: &ModelConfig, rng: &mut ChaCha8Rng) -> Option<Self> {
-        let drawn = Self::of_normals(config, |_, _, len| Ok::<_, ()>(normals(len, rng)));
+        let drawn = Self::from_normals(config, |_, _, len| Ok::<_, ()>(draw_normals(len, rng)));
         drawn.unwrap_or_default()
     }
 
@@ -37,7 +37,7 @@ impl HeadNoise {
     ///
     /// # Panics
     /// If `normals` returns another count.
-    pub fn of_normals<E>(
+    pub fn from_normals<E>(
         config: &ModelConfig,
         mut normals: impl FnMut(&str, &str, usize) -> Result<Vec<f64>, E>,
     ) -> Result<Option<Self>, E> {
@@ -61,13 +61,13 @@ impl HeadNoise {
     }
 
     /// Returns the noise of the head's layer with this index.
-    pub(crate) fn of_layer(&self, number: usize) -> &LayerNoise {
-        &self.layers[number]
+    pub(crate) fn layer(&self, index: usize) -> &LayerNoise {
+        &self.layers[index]
     }
 
     /// Returns the noise of the weight [out, in] and the bias [out] of the head's layer with this index.
-    pub fn of_parameters(&self, number: usize) -> (Vec<f64>, Vec<f64>) {
-        let LayerNoise { inputs, outputs } = self.of_layer(number);
+    pub fn weight_and_bias(&self, index: usize) -> (Vec<f64>, Vec<f64>) {
+        let LayerNoise { inputs, outputs } = self.layer(index);
         let mut weight = Vec::with_capacity(inputs.len() * outputs.len());
         for output in outputs {
             weight.extend(inputs.iter().map(|input| input * output));
@@ -97,8 +97,8 @@ mod tests {
         let mut count = 0.0;
         for _ in 0..2000 {
             let noise = HeadNoise::draw(&config, rng).unwrap();
-            let (value, value_bias) = noise.of_parameters(0);
-            let (advantage, bias) = noise.of_parameters(1);
+            let (value, value_bias) = noise.weight_and_bias(0);
+            let (advantage, bias) = noise.weight_and_bias(1);
             assert_eq!((value.len(), advantage.len()), (77, 231));
             assert_eq!((value_bias.len(), bias.len()), (7, 21));
             for (v, a) in [(value[0], advantage[0]), (value[76], advantage[230])] {

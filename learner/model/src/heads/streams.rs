@@ -23,14 +23,14 @@ pub(crate) struct HeadLayer<T> {
 impl<T> HeadLayer<T> {
     /// Collects the layers of the head of `config`: value and advantage if dueling, else one. `take` returns
     /// a parameter by the layer's name and the parameter's, such as `weight_mu`.
-    pub(crate) fn all<E>(
+    pub(crate) fn collect<E>(
         config: &ModelConfig,
         mut take: impl FnMut(&str, &str) -> std::result::Result<T, E>,
     ) -> std::result::Result<Vec<Self>, E> {
-        let mut layer = |name: &str, end: &str| -> std::result::Result<Layer<T>, E> {
+        let mut layer = |name: &str, suffix: &str| -> std::result::Result<Layer<T>, E> {
             Ok(Layer {
-                weight: take(name, &format!("weight{end}"))?,
-                bias: take(name, &format!("bias{end}"))?,
+                weight: take(name, &format!("weight{suffix}"))?,
+                bias: take(name, &format!("bias{suffix}"))?,
             })
         };
         let (mean, sigma) = match config.head.noisy_sigma {
@@ -40,7 +40,7 @@ impl<T> HeadLayer<T> {
         let layers = config.head_layers().into_iter().map(|(name, _)| {
             Ok(Self {
                 mean: layer(name, mean)?,
-                sigma: sigma.map(|end| layer(name, end)).transpose()?,
+                sigma: sigma.map(|suffix| layer(name, suffix)).transpose()?,
             })
         });
         layers.collect()
@@ -49,7 +49,7 @@ impl<T> HeadLayer<T> {
 
 impl HeadLayer<Tensor> {
     /// Returns mu + sigma * eps for the head's layer with this index, or mu without noise.
-    fn with_noise(&self, noise: Option<&HeadNoise>, number: usize) -> Result<Layer<Tensor>> {
+    fn with_noise(&self, noise: Option<&HeadNoise>, index: usize) -> Result<Layer<Tensor>> {
         let (Some(noise), Some(sigma)) = (noise, &self.sigma) else {
             if noise.is_some() {
                 let what = "noise for a head without noisy layers";
@@ -57,7 +57,7 @@ impl HeadLayer<Tensor> {
             }
             return Ok(self.mean.clone());
         };
-        let (weight, bias) = noise.of_parameters(number);
+        let (weight, bias) = noise.weight_and_bias(index);
         let add = |mean: &Tensor, sigma: &Tensor, noise: &[f64]| -> Result<Tensor> {
             let noise: Vec<f32> = noise.iter().map(|&it| it as f32).collect();
             let noise = Tensor::from_vec(noise, sigma.dims(), sigma.device())?;
@@ -79,14 +79,14 @@ pub(crate) struct Streams {
 impl Streams {
     pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
         Ok(Self {
-            layers: HeadLayer::all(config, |layer, part| parameters.tensor(layer, part))?,
+            layers: HeadLayer::collect(config, |layer, part| parameters.tensor(layer, part))?,
             atoms: config.atoms,
         })
     }
 
     /// Reduces the head to one layer of A * N outputs, with or without noise. For a plain head without noise,
     /// this is the head's layer itself, whose parameters are variables.
-    pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Result<Layer<Tensor>> {
+    pub(crate) fn merged_layer(&self, noise: Option<&HeadNoise>) -> Result<Layer<Tensor>> {
         let first = self.layers[0].with_noise(noise, 0)?;
         let Some(advantage) = self.layers.get(1) else {
             return Ok(first);
@@ -94,8 +94,8 @@ impl Streams {
         let (value, advantage) = (first, advantage.with_noise(noise, 1)?);
         let (v, a) = (value.bias.unsqueeze(1)?, advantage.bias.unsqueeze(1)?);
         Ok(Layer {
-            weight: dueling(&value.weight, &advantage.weight, self.atoms)?,
-            bias: dueling(&v, &a, self.atoms)?.squeeze(D::Minus1)?,
+            weight: add_streams(&value.weight, &advantage.weight, self.atoms)?,
+            bias: add_streams(&v, &a, self.atoms)?.squeeze(D::Minus1)?,
         })
     }
 }
@@ -103,7 +103,7 @@ impl Streams {
 /// Computes V + A - mean_a A of outputs: `value` [N, in], `advantage` [A * N, in], result [A * N, in].
 ///
 /// Source: Wang et al. 2016, equation 9, per atom.
-fn dueling(value: &Tensor, advantage: &Tensor, atoms: usize) -> candle_core::Result<Tensor> {
+fn add_streams(value: &Tensor, advantage: &Tensor, atoms: usize) -> candle_core::Result<Tensor> {
     let (outputs, inputs) = advantage.dims2()?;
     let by_action = advantage.reshape((outputs / atoms, atoms, inputs))?;
     let shared = (value - by_action.mean(0)?)?;

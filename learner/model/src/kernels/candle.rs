@@ -6,7 +6,7 @@
 
 use candle_core::{DType, Result, Tensor};
 
-use crate::geometry::{STAGE_CONVOLUTIONS, pooled};
+use crate::geometry::{STAGE_CONVOLUTIONS, pooled_size};
 
 /// Weight [out, in, k, k], bias [out] and stride of a convolution.
 pub(crate) type ConvLayerTensors<'a> = (&'a Tensor, &'a Tensor, usize);
@@ -56,7 +56,7 @@ fn padded_conv2d(images: &Tensor, (weight, bias): BorderedTensors<'_>) -> Result
 /// window then has the same place in its block. A window touches four neighbouring blocks.
 fn max_pool(maps: &Tensor) -> Result<Tensor> {
     let (batch, height, width, channels) = maps.dims4()?;
-    let (rows, cols, _) = pooled((height, width, channels));
+    let (rows, cols, _) = pooled_size((height, width, channels));
     let border = |maps: &Tensor, dim: usize, before: usize, after: usize| {
         let part = |len: usize| {
             let mut shape = maps.dims().to_vec();

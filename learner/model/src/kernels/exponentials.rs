@@ -23,7 +23,7 @@ pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slope
 
 /// Replaces each value by `exp(value - max)`; no value may exceed `max`. The relative error is at most 1e-15
 /// in addition to the rounding of the difference. A result below 1e-307 is 0; a NaN gives NaN.
-pub fn exp_below(values: &mut [f64], max: f64) {
+pub fn exp_minus_max(values: &mut [f64], max: f64) {
     with_simd!(AnySimd::fastest(Precision::F32), simd => exp_of_differences(simd, values, max));
 }
 
@@ -140,7 +140,7 @@ mod tests {
             }
             let max = scores.iter().copied().fold(f64::MIN, f64::max);
             let mut weights = scores.clone();
-            exp_below(&mut weights, max);
+            exp_minus_max(&mut weights, max);
             for (weight, score) in weights.iter().zip(&scores) {
                 prop_assert!(*weight < 1e-300 || close(*weight, (score - max).exp(), 5e-16));
             }
@@ -156,7 +156,7 @@ mod tests {
         assert_eq!(scores[1..], [20.0, -20.0, 0.0]);
         assert_eq!(slopes[1..], [0.0, 0.0, 1.0]);
         let mut values = [f64::NAN, f64::NEG_INFINITY, -800.0, 0.0];
-        exp_below(&mut values, 0.0);
+        exp_minus_max(&mut values, 0.0);
         assert!(values[0].is_nan());
         assert_eq!(values[1..], [0.0, 0.0, 1.0]);
     }

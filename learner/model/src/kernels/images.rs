@@ -45,7 +45,7 @@ impl<E: Element> Images<'_, E> {
         }
     }
 
-    /// Returns image `index` as an operand: `len` scalars, then `padding` zeros. `scratch` is scratch memory for conversions and copies.
+    /// Returns image `index` as an operand: `len` scalars, then `padding` zeros. `scratch` holds conversions and copies.
     ///
     /// The next image in memory cannot serve as padding: 0 times a NaN in it is NaN.
     pub(crate) fn image<'r, S: Simd<Element = E>>(

@@ -3,7 +3,7 @@
 
 use candle_core::{Result, Tensor, bail};
 
-use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
+use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stage_shapes};
 use crate::kernels::candle::BorderedTensors;
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
@@ -36,7 +36,7 @@ pub(crate) fn residual_stages(
         weight.dims() == [shape.channels_out, shape.channels_in, 3, 3]
             && bias.dims() == [shape.channels_out]
     };
-    let (shapes, (rows, cols, width)) = stages(input, &widths);
+    let (shapes, (rows, cols, width)) = stage_shapes(input, &widths);
     let is_whole = !layers.is_empty() && layers.len() == shapes.len() && images.elem_count() > 0;
     if !is_whole || !layers.iter().zip(&shapes).all(fits) {
         let weights: Vec<_> = layers.iter().map(|(weight, _)| weight.shape()).collect();

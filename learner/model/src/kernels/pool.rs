@@ -3,7 +3,7 @@
 //!
 //! The padding is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
 
-use crate::geometry::pooled;
+use crate::geometry::pooled_size;
 use crate::kernels::isa::{LANES, vectorized};
 
 /// Height, width and channels of maps.
@@ -12,7 +12,7 @@ pub(crate) type Size = (usize, usize, usize);
 /// Iterates over the windows of maps of this size, row by row.
 #[inline(always)]
 fn windows(size: Size) -> impl Iterator<Item = Window> {
-    let (rows, cols, channels) = pooled(size);
+    let (rows, cols, channels) = pooled_size(size);
     (0..rows).flat_map(move |y| {
         (0..cols).map(move |x| Window {
             start: (y * cols + x) * channels,
@@ -152,7 +152,7 @@ mod tests {
 
     /// Returns the maxima on every instruction set, and the gradients of the maps for window gradients of 1, 2, 3 and so on.
     fn pooled_and_back(maps: &[f32], size: Size) -> Vec<(Vec<f32>, Vec<f32>)> {
-        let (rows, cols, channels) = pooled(size);
+        let (rows, cols, channels) = pooled_size(size);
         let len = rows * cols * channels;
         let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
         let of_simd = |simd| {
@@ -172,7 +172,7 @@ mod tests {
 
     /// The same by definition: the first of the largest pixels of each window, or the first NaN.
     fn wanted(maps: &[f32], size: Size) -> (Vec<f32>, Vec<f32>) {
-        let ((height, width, channels), (rows, cols, _)) = (size, pooled(size));
+        let ((height, width, channels), (rows, cols, _)) = (size, pooled_size(size));
         let (mut largest, mut grads) = (Vec::new(), vec![0.0; maps.len()]);
         for y in 0..rows {
             for x in 0..cols {

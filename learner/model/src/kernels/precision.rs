@@ -83,10 +83,8 @@ mod tests {
     #[test]
     fn names_are_read_back() {
         for precision in Precision::ALL {
-            assert_eq!(
-                precision.to_string().parse::<Precision>().unwrap(),
-                precision
-            );
+            let parsed: Precision = precision.to_string().parse().unwrap();
+            assert_eq!(parsed, precision);
         }
         let error = "f16".parse::<Precision>().unwrap_err().to_string();
         assert!(error.contains("use f32 or bf16"), "{error}");

@@ -4,7 +4,7 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 
-use crate::geometry::{ConvLayer, ConvShape, stages};
+use crate::geometry::{ConvLayer, ConvShape, stage_shapes};
 use crate::kernels::candle;
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
@@ -122,7 +122,7 @@ fn every_instruction_set_gives_what_candle_does_in_f64() -> Result<()> {
         shape
     });
     // Odd runs, and channels beyond a register; maps of 5 x 7 and 3 x 4.
-    let (residual, _) = stages((9, 14, 3), &[5, 18]);
+    let (residual, _) = stage_shapes((9, 14, 3), &[5, 18]);
     let bytes = |len: usize| -> Vec<u8> { (0..len).map(|at| (at * 31 % 253) as u8).collect() };
     let (large, mut small) = (bytes(COUNT * 17 * 23 * 3), bytes(COUNT * 9 * 14 * 3));
     // The last image is flat: most windows of the pools have nine equal values.

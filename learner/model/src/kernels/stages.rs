@@ -1,7 +1,7 @@
 //! The stages of an IMPALA torso over one task's images, forward and backward, on slices: a convolution, a max pool, and two residual
 //! blocks x + conv(relu(conv(relu(x)))) each. It knows no tensors: `impala` splits the batch, `bordered` computes each convolution.
 
-use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, pooled};
+use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, pooled_size};
 use crate::kernels::bordered::{BorderedConvolution, Interior, store_relu};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{relu_backward, store_relu_row};
@@ -211,7 +211,7 @@ impl<S: Simd> Stages<S> {
 
 /// The number of scalars in the output of the pool after `conv`.
 fn pooled_len<E: Element>(conv: &BorderedConvolution<E>) -> usize {
-    let (height, width, channels) = pooled(conv.shape().output());
+    let (height, width, channels) = pooled_size(conv.shape().output());
     height * width * channels
 }
 

@@ -6,8 +6,8 @@ use candle_core::{Result, Tensor};
 
 use super::interface::{ActingTorso, Torso, TorsoParameters};
 use crate::compute::Kernels;
-use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
-use crate::init::InitialLaw;
+use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stage_shapes};
+use crate::init::Initializer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::Dense;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
@@ -38,7 +38,7 @@ pub(crate) struct Impala {
 
 impl Torso for Impala {
     fn convolutions(&self) -> Vec<LayerShape> {
-        let (shapes, _) = stages(self.input, &self.widths);
+        let (shapes, _) = stage_shapes(self.input, &self.widths);
         let blocks = 2 * self.widths.len();
         let smaller = 1.0 / (blocks as f32).sqrt();
         let convolution = |(index, shape): (usize, &ConvShape)| {
@@ -49,14 +49,14 @@ impl Torso for Impala {
             LayerShape {
                 initial_scale: if is_scaled { smaller } else { 1.0 },
                 locations: shape.locations(),
-                ..LayerShape::new(name, &[out, inputs, side, side], InitialLaw::Orthogonal)
+                ..LayerShape::new(name, &[out, inputs, side, side], Initializer::Orthogonal)
             }
         };
         shapes.iter().enumerate().map(convolution).collect()
     }
 
     fn local_shape(&self) -> (usize, usize, usize) {
-        stages(self.input, &self.widths).1
+        stage_shapes(self.input, &self.widths).1
     }
 
     fn fc_inputs(&self) -> usize {
@@ -86,13 +86,13 @@ impl Torso for Impala {
         Ok((local.then_some(f3), f4))
     }
 
-    fn acting(
+    fn for_actor(
         &self,
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
     ) -> Box<dyn ActingTorso> {
-        let (layers, fc) = (parameters.in_line(), parameters.fc);
-        let (shapes, (_, _, channels)) = stages(self.input, &self.widths);
+        let (layers, fc) = (parameters.concatenated(), parameters.fc);
+        let (shapes, (_, _, channels)) = stage_shapes(self.input, &self.widths);
         with_simd!(AnySimd::fastest(precision), simd => Box::new(ActingStages {
             simd,
             stages: Stages::new(simd, &shapes, &layers, false),

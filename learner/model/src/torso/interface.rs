@@ -36,7 +36,7 @@ pub(crate) trait Torso: fmt::Debug + Send + Sync {
     ) -> candle_core::Result<(Option<Tensor>, Tensor)>;
 
     /// Builds the torso for an actor, with products in `precision`.
-    fn acting(
+    fn for_actor(
         &self,
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
@@ -58,7 +58,7 @@ pub(crate) struct TorsoParameters<T> {
 
 impl<T> TorsoParameters<T> {
     /// Collects the parameters of `torso`. `take` returns one, by the layer's name and `weight` or `bias`.
-    pub(crate) fn of<E>(
+    pub(crate) fn collect<E>(
         torso: &dyn Torso,
         mut take: impl FnMut(&str, &str) -> Result<T, E>,
     ) -> Result<Self, E> {
@@ -80,7 +80,7 @@ impl<T> TorsoParameters<T> {
 
 impl TorsoParameters<Vec<f32>> {
     /// Concatenates the convolutions' parameters: of each the weight, then the bias.
-    pub(crate) fn in_line(&self) -> Vec<f32> {
+    pub(crate) fn concatenated(&self) -> Vec<f32> {
         let parts = self.convolutions.iter();
         let parts = parts.flat_map(|it| [&it.weight[..], &it.bias]);
         parts.collect::<Vec<_>>().concat()

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use self::{impala::Impala, interface::Torso, nature::Nature};
 use crate::error::{ModelError, Result};
-use crate::geometry::{ConvLayer, reach};
+use crate::geometry::{ConvLayer, read_size};
 
 /// The torso of a network: `model.torso`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -69,9 +69,9 @@ impl TorsoName {
     }
 
     /// Returns (height, width) of the part of `image` that the torso reads, from the upper left corner. `None` if `conv` does not fit.
-    pub fn reach(self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+    pub fn read_size(self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
         match self {
-            Self::Nature => reach(conv, image),
+            Self::Nature => read_size(conv, image),
             // With zero padding, every pixel is in a window.
             Self::Impala | Self::Impoola => Some(image),
         }
@@ -81,7 +81,7 @@ impl TorsoName {
     ///
     /// # Errors
     /// [`ModelError::Config`] names the setting and the torso.
-    pub(crate) fn check(self, settings: &TorsoSettings<'_>) -> Result<()> {
+    pub(crate) fn check_settings(self, settings: &TorsoSettings<'_>) -> Result<()> {
         let given = [
             ("conv", !settings.conv.is_empty()),
             ("channels", !settings.channels.is_empty()),

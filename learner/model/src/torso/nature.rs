@@ -6,7 +6,7 @@ use candle_core::{Result, Tensor};
 use super::interface::{ActingTorso, Torso, TorsoParameters};
 use crate::compute::Kernels;
 use crate::geometry::{ConvLayer, ConvShape};
-use crate::init::InitialLaw;
+use crate::init::Initializer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::{Dense, pad_rows};
 use crate::kernels::images::Pixels;
@@ -51,7 +51,7 @@ impl Torso for Nature {
             let name = format!("torso.conv{}", index + 1);
             LayerShape {
                 locations: self.shapes.get(index).map_or(0, ConvShape::locations),
-                ..LayerShape::new(name, &weight, InitialLaw::Orthogonal)
+                ..LayerShape::new(name, &weight, Initializer::Orthogonal)
             }
         });
         layers.collect()
@@ -77,21 +77,21 @@ impl Torso for Nature {
             Kernels::Fused(precision) if !local => {
                 Ok((None, torso(frames, &layers, weight, bias, precision)?))
             }
-            with => {
-                let maps = with.conv_stack(frames, &layers)?;
-                let f4 = with.linear_of_maps(&maps, weight, bias)?;
+            _ => {
+                let maps = kernels.conv_stack(frames, &layers)?;
+                let f4 = kernels.linear_of_maps(&maps, weight, bias)?;
                 Ok((local.then_some(maps), f4))
             }
         }
     }
 
-    fn acting(
+    fn for_actor(
         &self,
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
     ) -> Box<dyn ActingTorso> {
         let channels = self.shapes.last().map_or(1, |last| last.channels_out);
-        let (layers, fc) = (parameters.in_line(), parameters.fc);
+        let (layers, fc) = (parameters.concatenated(), parameters.fc);
         with_simd!(AnySimd::fastest(precision), simd => Box::new(ActingNature {
             stack: Stack::new(simd, &self.shapes, &layers, false, false),
             fc: Dense::for_maps(simd, &fc.weight, fc.bias, channels),

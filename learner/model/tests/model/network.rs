@@ -23,14 +23,15 @@ fn outputs_and_gradients(
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
     let noise = HeadNoise::draw(config, &mut rng(3));
     let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
+    let f3 = features.require_f3().unwrap();
     let outputs = vec![
         network.q_values(&logits).unwrap(),
         logits,
-        network.psi3(features.local().unwrap(), &actions).unwrap(),
-        network.phi3(features.local().unwrap()).unwrap(),
+        network.psi3(f3, &actions).unwrap(),
+        network.phi3(f3).unwrap(),
         network.psi4(&features.f4, &actions).unwrap(),
         network.phi4(&features.f4).unwrap(),
-        features.local().unwrap().clone(),
+        f3.clone(),
         features.f4,
     ];
     let mut total = Tensor::new(0f32, &Device::Cpu)?;
@@ -88,7 +89,7 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
         let run = || {
             let features = network.features(&batch).unwrap();
             let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
-            let phi3 = network.phi3(features.local().unwrap()).unwrap();
+            let phi3 = network.phi3(features.require_f3().unwrap()).unwrap();
             let [logits_loss, phi3_loss] =
                 [&logits, &phi3].map(|it| it.sqr().unwrap().sum_all().unwrap());
             let mut grads = Backward::of(&(logits_loss + phi3_loss).unwrap()).unwrap();
@@ -122,7 +123,7 @@ fn heads_that_are_left_out_are_not_there() {
     let network = Network::new(&config, &parameters(&config, 1), Kernels::FUSED).unwrap();
     let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
     let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
-    let psi3 = network.psi3(features.local().unwrap(), &actions);
+    let psi3 = network.psi3(features.require_f3().unwrap(), &actions);
     assert!(matches!(psi3, Err(ModelError::NoHead("psi3"))));
     let phi4 = network.phi4(&features.f4);
     assert!(matches!(phi4, Err(ModelError::NoHead("phi4"))));

@@ -111,7 +111,7 @@ pub(crate) fn small() -> ModelConfig {
         hidden: 19,
         embedding_dim: 13,
         action_embed: 9,
-        dim: DimHeads::EVERY,
+        dim: DimHeads::ALL,
         loss_layers: vec![],
         head: HeadConfig::PLAIN,
     }

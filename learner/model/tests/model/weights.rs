@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ModelConfig, Parameters, Precision, StoredAs, TorsoName};
+use driml_model::{ModelConfig, Parameters, Precision, TorsoName, WeightDtype};
 
 use crate::support::{bits, bytes, parameters, policy, q_values, residual, rng, small, values};
 
@@ -236,7 +236,7 @@ fn a_weight_that_is_too_large_for_its_type_is_named() {
     let weight = parameters.get("head.weight").unwrap();
     let large = (weight.ones_like().unwrap() * 1e5).unwrap();
     weight.set(&large).unwrap();
-    let error = parameters.to_safetensors_as(StoredAs::F16, |_| true);
+    let error = parameters.to_safetensors_as(WeightDtype::F16, |_| true);
     let said = error.unwrap_err().to_string();
     for words in [
         "head.weight",

@@ -1,7 +1,7 @@
 //! Weights as the learner publishes them: rounded to f32, f16 or bf16, and read back.
 
 use candle_core::Device;
-use driml_model::{Parameters, StoredAs};
+use driml_model::{Parameters, WeightDtype};
 
 use crate::{small, stability::property::*};
 
@@ -9,12 +9,12 @@ const NEAREST: &str = "weights not read as the nearest, ties to even, with their
 const ALL: &str = "every number of the type, the middles between them and the floats beside those";
 
 pub(super) fn properties() -> Vec<Property> {
-    let of = |routine, range, stored: StoredAs| {
+    let of = |routine, range, stored: WeightDtype| {
         let property = Property::new(routine, range)
             .promise(NEAREST, 0.0)
-            .promise("a weight, as a share of it", stored.error());
+            .promise("a weight, as a share of it", stored.rounding_error());
         let property = match stored {
-            StoredAs::F32 => property,
+            WeightDtype::F32 => property,
             _ => property.on(ALL, Listed, move |cases| {
                 see(cases, stored, &turning_points(stored))
             }),
@@ -31,9 +31,9 @@ pub(super) fn properties() -> Vec<Property> {
         "as published (learner.publish_dtype); within 3.3895e38",
     ];
     vec![
-        of("f32 weights", f32, StoredAs::F32),
-        of("f16 weights", f16, StoredAs::F16),
-        of("bf16 weights", bf16, StoredAs::Bf16),
+        of("f32 weights", f32, WeightDtype::F32),
+        of("f16 weights", f16, WeightDtype::F16),
+        of("bf16 weights", bf16, WeightDtype::Bf16),
     ]
 }
 
@@ -41,19 +41,19 @@ pub(super) fn properties() -> Vec<Property> {
 const HIDDEN: usize = 256;
 
 /// Returns the distance between neighbouring numbers of the type at `x`.
-fn step_at(stored: StoredAs, x: f32) -> f64 {
+fn step_at(stored: WeightDtype, x: f32) -> f64 {
     // The bits of the significand, and the exponent of the smallest normal number.
     let (bits, least) = match stored {
-        StoredAs::F32 => (24, -126),
-        StoredAs::F16 => (11, -14),
-        StoredAs::Bf16 => (8, -126),
+        WeightDtype::F32 => (24, -126),
+        WeightDtype::F16 => (11, -14),
+        WeightDtype::Bf16 => (8, -126),
     };
     let exponent = (x.abs().to_bits() >> 23) as i32 - 127;
     2f64.powi(exponent.max(least) - bits + 1)
 }
 
 /// Returns every number of the type, every midpoint between two of them, and the floats beside the midpoints, with both signs.
-fn turning_points(stored: StoredAs) -> Vec<f32> {
+fn turning_points(stored: WeightDtype) -> Vec<f32> {
     let mut values = Vec::new();
     let mut x = 0.0f32;
     while x < stored.largest() {
@@ -68,7 +68,7 @@ fn turning_points(stored: StoredAs) -> Vec<f32> {
 }
 
 /// Saves and loads the values as weights, and counts their errors.
-fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Result<()> {
+fn see(cases: &mut Cases<'_>, stored: WeightDtype, values: &[f32]) -> anyhow::Result<()> {
     let atoms = values.len().div_ceil(HIDDEN).max(2);
     let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
     let bytes = small::parameters(&config, values)?.to_safetensors_as(stored, |_| true)?;
@@ -78,7 +78,7 @@ fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Resul
         let nearest = (f64::from(x) / step).round_ties_even() * step;
         let has_its_sign = x.is_sign_negative() == found.is_sign_negative();
         let is_nearest = has_its_sign && f64::from(found) == nearest;
-        let scale = f64::from(x.abs().max(stored.least_normal()));
+        let scale = f64::from(x.abs().max(stored.min_normal()));
         let error = (f64::from(found) - f64::from(x)) / scale;
         let input = format_args!("{x:e} became {found:e}");
         cases.see(input, [f64::from(!is_nearest), error])?;
@@ -92,6 +92,6 @@ mod tests {
 
     #[test]
     fn each_finite_f16_has_its_turning_points() {
-        assert_eq!(turning_points(StoredAs::F16).len(), 2 * (4 * 0x7bff + 1));
+        assert_eq!(turning_points(WeightDtype::F16).len(), 2 * (4 * 0x7bff + 1));
     }
 }

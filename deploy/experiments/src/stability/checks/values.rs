@@ -4,7 +4,6 @@
 use candle_core::{Device, Tensor};
 use driml_model::{
     EXPECTED_RETURN_ERROR, Kernels, ModelConfig, ModelError, Network, PolicyNetwork, Precision,
-    StoredAs,
 };
 
 use crate::{small, stability::property::*};
@@ -69,7 +68,7 @@ fn policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<Po
     };
     let mut values = vec![0.0; small::len(&config)];
     set(&mut values);
-    let bytes = small::parameters(&config, &values)?.to_safetensors_as(StoredAs::F32, |_| true)?;
+    let bytes = small::parameters(&config, &values)?.to_safetensors(|_| true)?;
     Ok(PolicyNetwork::new(&config, &bytes, Precision::F32)?)
 }
 

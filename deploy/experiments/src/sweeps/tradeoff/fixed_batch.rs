@@ -97,7 +97,7 @@ fn history(
     let world = RestrictedWorld::of(world, actions, sent)?;
     let rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut acting = Acting::new(world, run.frame_stack as usize, rng)?;
-    let enlarge = || config.input.enlarge(sent, model);
+    let enlarge = || config.input.resizer(sent, model);
     let enlarged = enlarge()?;
     let precision = config.actor.precision;
     let mut policy: Box<dyn Policy> = match weights {
