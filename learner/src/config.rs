@@ -255,7 +255,7 @@ impl LearnerConfig {
         // The model's input may lack the border pixels that no layer reads, so that both inputs give the same local shape.
         let sizes_follow = this.model.input_channels == states
             && this.model.num_actions == this.spec.num_actions as usize
-            && this.model.local_shape() == whole.local_shape()
+            && this.model.f3_shape() == whole.f3_shape()
             && this.input.resizer(frame_size, &this.model).is_ok();
         if !sizes_follow {
             return Err(LearnerConfigError::Sizes);

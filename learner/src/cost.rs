@@ -77,7 +77,7 @@ impl UpdateCost {
         } else {
             model.num_actions as u64
         };
-        let (height, width, _) = model.local_shape();
+        let (height, width, _) = model.f3_shape();
         let matrices = passes.local_scores * (height * width) as u64 + passes.global_scores;
         // The forward product and the gradients of both operands; keys have no gradient.
         let products = if passes.keys > 0 { 2 } else { 3 };

@@ -59,8 +59,8 @@ impl Insight {
     }
 
     /// Rows and columns of the local features that are compared; `None` if the agent does not compare local features.
-    pub fn local_shape(&self) -> Option<(usize, usize)> {
-        let (rows, columns, _) = self.model.local_shape();
+    pub fn f3_shape(&self) -> Option<(usize, usize)> {
+        let (rows, columns, _) = self.model.f3_shape();
         self.local_clip.map(|_| (rows, columns))
     }
 

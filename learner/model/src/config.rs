@@ -8,7 +8,7 @@ use crate::geometry::{ConvLayer, ConvShape};
 pub(crate) use crate::heads::config::HeadConfig;
 use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::init::Initializer;
-use crate::layers::LayerShape;
+use crate::layers::LayerSpec;
 use crate::torso::{TorsoName, TorsoSettings, interface::Torso};
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
@@ -235,8 +235,8 @@ impl ModelConfig {
     }
 
     /// Returns the height, width and channels of f3. Meaningful for a valid configuration.
-    pub fn local_shape(&self) -> (usize, usize, usize) {
-        self.torso().local_shape()
+    pub fn f3_shape(&self) -> (usize, usize, usize) {
+        self.torso().f3_shape()
     }
 
     /// Bytes of one input frame: height * width * channels.
@@ -276,30 +276,30 @@ impl ModelConfig {
     }
 
     /// All layers in the order of [`ModelConfig::parameter_shapes`].
-    pub(crate) fn layers(&self) -> Vec<LayerShape> {
+    pub(crate) fn layers(&self) -> Vec<LayerSpec> {
         use Initializer::{Orthogonal, Uniform};
         let torso = self.torso();
         let mut layers = torso.convolutions();
         let fc = [self.hidden, torso.fc_inputs()];
-        layers.push(LayerShape::new("torso.fc", &fc, Orthogonal));
+        layers.push(LayerSpec::new("torso.fc", &fc, Orthogonal));
         // The means of noisy layers are uniform too, as in Fortunato et al. 2018.
         for (name, outputs) in self.head_layers() {
-            layers.push(LayerShape {
+            layers.push(LayerSpec {
                 noisy_sigma: self.head.noisy_sigma,
                 // The value stream's weight is added to the advantage stream's, which is then applied to f4.
                 locations: usize::from(name != VALUE),
-                ..LayerShape::new(name, &[outputs, self.hidden], Uniform)
+                ..LayerSpec::new(name, &[outputs, self.hidden], Uniform)
             });
         }
         let mut embed_width = 0;
         if self.dim.embeds_action() {
             embed_width = self.action_embed;
             let shape = [self.num_actions, 0, embed_width];
-            let mut block = LayerShape::block("dim.action", 1, shape, Orthogonal);
+            let mut block = LayerSpec::block("dim.action", 1, shape, Orthogonal);
             block[2].has_bias = true;
             layers.extend(block);
         }
-        let (height, width, channels) = torso.local_shape();
+        let (height, width, channels) = torso.f3_shape();
         let (local, global) = ((height.saturating_mul(width), channels), (1, self.hidden));
         for (exists, name, (locations, features), joined, initial) in [
             (self.dim.psi3, "dim.psi3", local, embed_width, Orthogonal),
@@ -309,12 +309,12 @@ impl ModelConfig {
         ] {
             if exists {
                 let shape = [features, joined, self.embedding_dim];
-                layers.extend(LayerShape::block(name, locations, shape, initial));
+                layers.extend(LayerSpec::block(name, locations, shape, initial));
             }
         }
         for layer in &self.loss_layers {
             let shape = [layer.outputs, layer.inputs];
-            layers.push(LayerShape::new(layer.prefix(), &shape, Uniform));
+            layers.push(LayerSpec::new(layer.prefix(), &shape, Uniform));
         }
         layers
     }

@@ -36,11 +36,11 @@ impl FeatureLayers {
     }
 
     /// Computes f4 [B, hidden] before its ReLU, of `frames` [B, H, W, C] u8 scaled by 1/255. Computes f3
-    /// [B, h, w, c] after its ReLU too, if `local` features are wanted.
+    /// [B, h, w, c] after its ReLU too, if `needs_f3`.
     pub(crate) fn features(
         &self,
         frames: &Tensor,
-        local: bool,
+        needs_f3: bool,
     ) -> Result<(Option<Tensor>, Tensor)> {
         if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
             let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
@@ -49,6 +49,6 @@ impl FeatureLayers {
             )));
         }
         let torso = &self.torso;
-        Ok(torso.features(self.kernels, &self.parameters, frames, local)?)
+        Ok(torso.features(self.kernels, &self.parameters, frames, needs_f3)?)
     }
 }

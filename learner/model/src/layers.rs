@@ -17,7 +17,7 @@ pub(crate) struct Layer<T> {
 /// Source of the distributions: the paper authors' code. An orthogonal C51 head would double the initial Q
 /// values, and a target network updated once in 312 updates would keep them beyond 100,000 frames.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct LayerShape {
+pub(crate) struct LayerSpec {
     pub(crate) name: String,
     pub(crate) weight_shape: Vec<usize>,
     pub(crate) has_bias: bool,
@@ -32,7 +32,7 @@ pub(crate) struct LayerShape {
     pub(crate) joined_width: usize,
 }
 
-impl LayerShape {
+impl LayerSpec {
     /// A layer with a bias, applied once a state, of a weight [out, in] or [out, in, k, k].
     pub(crate) fn new(name: impl Into<String>, weight: &[usize], initializer: Initializer) -> Self {
         Self {
@@ -90,7 +90,7 @@ impl LayerShape {
         weights.chain(biases).collect()
     }
 
-    /// Draws the initial values of [`LayerShape::parameters`]. A sigma is not drawn: it is sigma_0 / sqrt(fan_in).
+    /// Draws the initial values of [`LayerSpec::parameters`]. A sigma is not drawn: it is sigma_0 / sqrt(fan_in).
     ///
     /// Source: Fortunato et al. 2018, section 3.2 (b).
     pub(crate) fn draw_initial_values(&self, rng: &mut ChaCha8Rng) -> Vec<Vec<f32>> {

@@ -102,8 +102,8 @@ impl Network {
 
     /// Computes f4, and f3 if a head reads it, of `frames` [B, H, W, C] u8. Frames are scaled by 1/255.
     pub fn features(&self, frames: &Tensor) -> Result<Features> {
-        let local = self.psi3.is_some() || self.phi3.is_some();
-        let (f3, f4) = self.torso.features(frames, local)?;
+        let needs_f3 = self.psi3.is_some() || self.phi3.is_some();
+        let (f3, f4) = self.torso.features(frames, needs_f3)?;
         Ok(Features { f3, f4 })
     }
 

@@ -48,10 +48,10 @@ impl Parameters {
         Self::part_from_tensors(config, |_| true, tensors, device)
     }
 
-    /// [`Parameters::from_tensors`] for the parameters whose names pass `part`.
+    /// [`Parameters::from_tensors`] for the parameters whose names pass `filter`.
     pub fn part_from_tensors(
         config: &ModelConfig,
-        part: impl Fn(&str) -> bool,
+        filter: impl Fn(&str) -> bool,
         tensors: HashMap<String, Tensor>,
         device: &Device,
     ) -> Result<Self> {
@@ -61,7 +61,7 @@ impl Parameters {
             return Err(ModelError::parameter(name, why));
         }
         let file = safetensors::serialize(&tensors, None)?;
-        Self::load_part(config, part, &file, device)
+        Self::load_part(config, filter, &file, device)
     }
 
     /// Loads parameters from the bytes of a safetensors file that holds exactly the parameters of `config`.
@@ -72,15 +72,15 @@ impl Parameters {
         Self::load_part(config, |_| true, bytes, device)
     }
 
-    /// [`Parameters::load_safetensors`] for the parameters whose names pass `part`.
+    /// [`Parameters::load_safetensors`] for the parameters whose names pass `filter`.
     pub fn load_part(
         config: &ModelConfig,
-        part: impl Fn(&str) -> bool,
+        filter: impl Fn(&str) -> bool,
         bytes: &[u8],
         device: &Device,
     ) -> Result<Self> {
         let mut vars = BTreeMap::new();
-        for (name, (shape, values)) in decode(config, part, bytes, |_| false)? {
+        for (name, (shape, values)) in decode(config, filter, bytes, |_| false)? {
             vars.insert(name, Var::from_vec(values, shape, device)?);
         }
         Ok(Self(vars))
@@ -162,10 +162,10 @@ impl Parameters {
         self.copy_part(|name| !is_dim(name))
     }
 
-    /// Returns a deep copy, which shares no storage, of the parameters whose names pass `part`.
-    pub fn copy_part(&self, part: impl Fn(&str) -> bool) -> Result<Self> {
+    /// Returns a deep copy, which shares no storage, of the parameters whose names pass `filter`.
+    pub fn copy_part(&self, filter: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
-        for (name, var) in self.iter().filter(|(name, _)| part(name)) {
+        for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
             let copy = Var::from_tensor(&var.as_detached_tensor().copy()?)?;
             vars.insert(name.to_owned(), copy);
         }
@@ -190,11 +190,11 @@ pub fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }
 
-/// Decodes the shapes and values of the parameters of `config` that pass `part` from a safetensors file. The
+/// Decodes the shapes and values of the parameters of `config` that pass `filter` from a safetensors file. The
 /// file may also hold names that pass `ignore`.
 pub(crate) fn decode(
     config: &ModelConfig,
-    part: impl Fn(&str) -> bool,
+    filter: impl Fn(&str) -> bool,
     bytes: &[u8],
     ignore: impl Fn(&str) -> bool,
 ) -> Result<BTreeMap<String, ShapeAndValues>> {
@@ -203,7 +203,7 @@ pub(crate) fn decode(
     let mut found: BTreeMap<&str, TensorView<'_>> = file.iter().collect();
     let mut parameters = BTreeMap::new();
     let shapes = config.parameter_shapes();
-    for (name, shape) in shapes.into_iter().filter(|(name, _)| part(name)) {
+    for (name, shape) in shapes.into_iter().filter(|(name, _)| filter(name)) {
         let view = found
             .remove(name.as_str())
             .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
@@ -230,11 +230,9 @@ fn check_shape(name: &str, found: &[usize], wanted: &[usize]) -> Result<()> {
 }
 
 fn check_finite(name: &str, values: &[f32]) -> Result<()> {
-    match values.iter().position(|value| !value.is_finite()) {
-        Some(index) => Err(ModelError::parameter(
-            name,
-            format!("is {} at index {index}", values[index]),
-        )),
-        None => Ok(()),
-    }
+    let Some(index) = values.iter().position(|value| !value.is_finite()) else {
+        return Ok(());
+    };
+    let why = format!("is {} at index {index}", values[index]);
+    Err(ModelError::parameter(name, why))
 }

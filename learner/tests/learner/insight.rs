@@ -26,7 +26,7 @@ fn matches_are_what_the_loss_is_made_of() {
     let (agent, mut rows) = (agent(ALL_DIM, 5), random_batch(4, 3));
     rows.positive_valid.fill(1);
     let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
-    assert_eq!(insight.local_shape(), Some((2, 3)));
+    assert_eq!(insight.f3_shape(), Some((2, 3)));
     let [now, later] = [&rows.states_t, &rows.states_k].map(|it| insight.evaluate(it).unwrap());
     let matches = insight.local_matches(&now, &rows.action, &later).unwrap();
     let matches = matches.expect("this agent compares local features");
@@ -46,7 +46,7 @@ fn an_agent_without_the_local_pair_has_no_map() {
     let (agent, rows) = (agent(lambda, 5), random_batch(4, 3));
     let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
     let it = insight.evaluate(&rows.states_t).unwrap();
-    assert_eq!(insight.local_shape(), None);
+    assert_eq!(insight.f3_shape(), None);
     let matches = insight.local_matches(&it, &rows.action, &it).unwrap();
     assert_eq!(matches, None);
 }

@@ -78,7 +78,7 @@ impl Recording {
             Horizon::Fixed { k } => k as usize,
             _ => 1,
         };
-        let shape = viewer.as_ref().and_then(|it| it.insight.local_shape());
+        let shape = viewer.as_ref().and_then(|it| it.insight.f3_shape());
         let local = shape.filter(|_| played > 1).map(|(rows, columns)| Local {
             k,
             rows,

@@ -57,22 +57,22 @@ fn padded_conv2d(images: &Tensor, (weight, bias): BorderedTensors<'_>) -> Result
 fn max_pool(maps: &Tensor) -> Result<Tensor> {
     let (batch, height, width, channels) = maps.dims4()?;
     let (rows, cols, _) = pooled_size((height, width, channels));
-    let border = |maps: &Tensor, dim: usize, before: usize, after: usize| {
-        let part = |len: usize| {
+    let pad = |maps: &Tensor, dim: usize, before: usize, after: usize| {
+        let padding = |len: usize| {
             let mut shape = maps.dims().to_vec();
             shape[dim] = len;
             Tensor::full(f32::NEG_INFINITY, shape, maps.device())?.to_dtype(maps.dtype())
         };
-        Tensor::cat(&[&part(before)?, maps, &part(after)?], dim)
+        Tensor::cat(&[&padding(before)?, maps, &padding(after)?], dim)
     };
-    let maps = border(maps, 1, 1, 2 * rows + 1 - height)?;
-    let maps = border(&maps, 2, 1, 2 * cols + 1 - width)?;
+    let maps = pad(maps, 1, 1, 2 * rows + 1 - height)?;
+    let maps = pad(&maps, 2, 1, 2 * cols + 1 - width)?;
     let blocks = maps.reshape(vec![batch, rows + 1, 2, cols + 1, 2, channels])?;
     let pixel = |row: usize, col: usize| {
-        let at = |blocks: &Tensor, dim: usize, at: usize, len: usize| {
+        let select = |blocks: &Tensor, dim: usize, at: usize, len: usize| {
             blocks.narrow(dim, at / 2, len)?.narrow(dim + 1, at % 2, 1)
         };
-        let pixel = at(&at(&blocks, 1, row, rows)?, 3, col, cols)?;
+        let pixel = select(&select(&blocks, 1, row, rows)?, 3, col, cols)?;
         pixel.reshape((batch, rows, cols, channels))
     };
     let mut largest = pixel(0, 0)?;

@@ -98,7 +98,7 @@ impl<S: Simd> ConvStack<S> {
         &self.shapes[self.shapes.len() - 1]
     }
 
-    /// Prepares the layers of `parameters` for a forward pass, or for a `backward` pass. `image_grad` says whether the images need a gradient.
+    /// Prepares the layers of `parameters` for a forward pass, or for a `backward` pass. `image_grad`: the images need a gradient.
     pub(crate) fn prepare(&self, parameters: &[f32], backward: bool, image_grad: bool) -> Stack<S> {
         Stack::new(self.simd, &self.shapes, parameters, backward, image_grad)
     }

@@ -51,24 +51,24 @@ impl Window {
 
 vectorized! {
     /// Writes the maximum of each window of `maps` into `largest`, and the index of its pixel, 0 to 8, into
-    /// `taken`. A NaN counts as the largest. Channels that do not fill a register are processed one by one.
+    /// `argmax`. A NaN counts as the largest. Channels that do not fill a register are processed one by one.
     pub(crate) fn pool<S>(
         simd,
         maps: &'a [f32],
         size: Size,
         largest: &'a mut [f32],
-        taken: &'a mut [u8],
+        argmax: &'a mut [u8],
     ) {
         let channels = size.2;
         let whole = channels - channels % LANES;
         for window in windows(size) {
             let to = window.start..window.start + channels;
-            let (largest, taken) = (&mut largest[to.clone()], &mut taken[to]);
+            let (largest, argmax) = (&mut largest[to.clone()], &mut argmax[to]);
             for first in (0..whole).step_by(LANES) {
-                pool_block::<LANES>(maps, window, first, largest, taken);
+                pool_block::<LANES>(maps, window, first, largest, argmax);
             }
             for first in whole..channels {
-                pool_block::<1>(maps, window, first, largest, taken);
+                pool_block::<1>(maps, window, first, largest, argmax);
             }
         }
     }
@@ -81,7 +81,7 @@ fn pool_block<const N: usize>(
     window: Window,
     first: usize,
     largest: &mut [f32],
-    taken: &mut [u8],
+    argmax: &mut [u8],
 ) {
     let (mut best, mut best_at) = ([f32::NEG_INFINITY; N], [u32::MAX; N]);
     for (at, from) in window.pixels() {
@@ -93,8 +93,8 @@ fn pool_block<const N: usize>(
         }
     }
     largest[first..][..N].copy_from_slice(&best);
-    for (taken, at) in taken[first..][..N].iter_mut().zip(best_at) {
-        *taken = at as u8;
+    for (argmax, at) in argmax[first..][..N].iter_mut().zip(best_at) {
+        *argmax = at as u8;
     }
 }
 
@@ -104,19 +104,19 @@ vectorized! {
         simd,
         grads: &'a [f32],
         size: Size,
-        taken: &'a [u8],
+        argmax: &'a [u8],
         grad_maps: &'a mut [f32],
     ) {
         let channels = size.2;
         let whole = channels - channels % LANES;
         for window in windows(size) {
             let from = window.start..window.start + channels;
-            let (grads, taken) = (&grads[from.clone()], &taken[from]);
+            let (grads, argmax) = (&grads[from.clone()], &argmax[from]);
             for first in (0..whole).step_by(LANES) {
-                unpool_block::<LANES>(grads, window, first, taken, grad_maps);
+                unpool_block::<LANES>(grads, window, first, argmax, grad_maps);
             }
             for first in whole..channels {
-                unpool_block::<1>(grads, window, first, taken, grad_maps);
+                unpool_block::<1>(grads, window, first, argmax, grad_maps);
             }
         }
     }
@@ -128,13 +128,13 @@ fn unpool_block<const N: usize>(
     grads: &[f32],
     window: Window,
     first: usize,
-    taken: &[u8],
+    argmax: &[u8],
     grad_maps: &mut [f32],
 ) {
     let (mut own, mut own_at) = ([0.0; N], [0; N]);
     own.copy_from_slice(&grads[first..][..N]);
-    for (at, &taken) in own_at.iter_mut().zip(&taken[first..][..N]) {
-        *at = u32::from(taken);
+    for (at, &argmax) in own_at.iter_mut().zip(&argmax[first..][..N]) {
+        *at = u32::from(argmax);
     }
     for (at, to) in window.pixels() {
         let sums = &mut grad_maps[to + first..][..N];
@@ -156,11 +156,11 @@ mod tests {
         let len = rows * cols * channels;
         let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
         let of_simd = |simd| {
-            let (mut largest, mut taken) = (vec![f32::NAN; len], vec![u8::MAX; len]);
+            let (mut largest, mut argmax) = (vec![f32::NAN; len], vec![u8::MAX; len]);
             let mut grad_maps = vec![0.0; maps.len()];
             with_simd!(simd, simd => {
-                pool(simd, maps, size, &mut largest, &mut taken);
-                unpool(simd, &grads, size, &taken, &mut grad_maps);
+                pool(simd, maps, size, &mut largest, &mut argmax);
+                unpool(simd, &grads, size, &argmax, &mut grad_maps);
             });
             (largest, grad_maps)
         };

@@ -22,7 +22,7 @@ pub(crate) struct Tape<E: Element> {
     /// of a product. If a ReLU comes before it, it is above 0 exactly where a gradient passes that ReLU.
     inputs: Buffer<E>,
     /// For each image, the index of the pixel that each pool window took.
-    taken: Buffer<u8>,
+    argmax: Buffer<u8>,
 }
 
 impl<S: Simd> Stages<S> {
@@ -49,10 +49,10 @@ impl<S: Simd> Stages<S> {
 
     /// Allocates memory for what the forward pass of this many images keeps.
     pub(crate) fn allocate_tape(&self, images: usize) -> Tape<S::Element> {
-        let (inputs, taken) = self.tape_lens();
+        let (inputs, argmax) = self.tape_lens();
         Tape {
             inputs: Buffer::new(images * inputs),
-            taken: Buffer::new(images * taken),
+            argmax: Buffer::new(images * argmax),
         }
     }
 
@@ -69,20 +69,22 @@ impl<S: Simd> Stages<S> {
 
     /// Computes f3 of some images, one after the other.
     pub(crate) fn forward(&self, images: &[u8], tape: &mut Tape<S::Element>, f3: &mut [f32]) {
-        let (inputs, taken) = self.tape_lens();
+        let (inputs, argmax) = self.tape_lens();
         images
             .chunks_exact(self.image_len())
             .zip(tape.inputs.chunks_exact_mut(inputs))
-            .zip(tape.taken.chunks_exact_mut(taken))
+            .zip(tape.argmax.chunks_exact_mut(argmax))
             .zip(f3.chunks_exact_mut(self.output_len()))
-            .for_each(|(((image, inputs), taken), f3)| self.forward_one(image, inputs, taken, f3));
+            .for_each(|(((image, inputs), argmax), f3)| {
+                self.forward_image(image, inputs, argmax, f3);
+            });
     }
 
-    fn forward_one(
+    fn forward_image(
         &self,
         image: &[u8],
         mut inputs: &mut [S::Element],
-        mut taken: &mut [u8],
+        mut argmax: &mut [u8],
         f3: &mut [f32],
     ) {
         let simd = self.simd;
@@ -103,22 +105,22 @@ impl<S: Simd> Stages<S> {
                 add_bias(simd, row, scale, conv.bias(), to);
             });
             x = Buffer::new(pooled_len(conv));
-            let (own, rest) = std::mem::take(&mut taken).split_at_mut(x.len());
-            taken = rest;
+            let (own, rest) = std::mem::take(&mut argmax).split_at_mut(x.len());
+            argmax = rest;
             pool(simd, &maps, conv.shape().output(), &mut x, own);
             for block in blocks {
-                let (one, two) = (&block[0], &block[1]);
-                let outer = take_input(one, &mut inputs);
-                one.shape().write_interior(simd, Interior::Relu(&x), outer);
-                let inner = take_input(two, &mut inputs);
-                two.shape().clear_border(inner);
-                one.forward(simd, outer, |y, row| {
-                    let to = &mut inner[two.shape().interior_row(y)];
-                    store_relu_row(simd, row, one.bias(), 1.0, to);
+                let (conv1, conv2) = (&block[0], &block[1]);
+                let x1 = take_input(conv1, &mut inputs);
+                conv1.shape().write_interior(simd, Interior::Relu(&x), x1);
+                let x2 = take_input(conv2, &mut inputs);
+                conv2.shape().clear_border(x2);
+                conv1.forward(simd, x1, |y, row| {
+                    let to = &mut x2[conv2.shape().interior_row(y)];
+                    store_relu_row(simd, row, conv1.bias(), 1.0, to);
                 });
-                two.forward(simd, inner, |y, row| {
+                conv2.forward(simd, x2, |y, row| {
                     let to = &mut x[y * row.len()..][..row.len()];
-                    add_residual(simd, row, two.bias(), to);
+                    add_residual(simd, row, conv2.bias(), to);
                 });
             }
         }
@@ -136,17 +138,17 @@ impl<S: Simd> Stages<S> {
     ) -> Buffer<f32> {
         let shapes: Vec<_> = self.convolutions.iter().map(|it| *it.shape()).collect();
         let mut sums = Buffer::zeros(parameters_len(&shapes));
-        let ((inputs, taken), len) = (self.tape_lens(), self.output_len());
+        let ((inputs, argmax), len) = (self.tape_lens(), self.output_len());
         images
             .chunks_exact(self.image_len())
             .zip(tape.inputs.chunks_exact(inputs))
-            .zip(tape.taken.chunks_exact(taken))
+            .zip(tape.argmax.chunks_exact(argmax))
             .zip(f3.chunks_exact(len).zip(grad_f3.chunks_exact(len)))
-            .for_each(|(((image, inputs), taken), (f3, grad_f3))| {
+            .for_each(|(((image, inputs), argmax), (f3, grad_f3))| {
                 let mut grad = Buffer::new(len);
                 relu_backward(self.simd, f3, grad_f3, &mut grad);
-                let own_sums = split_parameters_mut(&shapes, &mut sums);
-                self.backward_one(image, inputs, taken, grad, own_sums);
+                let layer_sums = split_parameters_mut(&shapes, &mut sums);
+                self.backward_image(image, inputs, argmax, grad, layer_sums);
             });
         // Products with bytes are scaled only now.
         for sum in &mut sums[..shapes[0].weight_len()] {
@@ -156,16 +158,16 @@ impl<S: Simd> Stages<S> {
     }
 
     /// Adds one image's gradients to the `sums` of each convolution. `grad` is the gradient of the last stage's output.
-    fn backward_one(
+    fn backward_image(
         &self,
         image: &[u8],
         mut inputs: &[S::Element],
-        mut taken: &[u8],
+        mut argmax: &[u8],
         mut grad: Buffer<f32>,
         mut sums: Vec<[&mut [f32]; 2]>,
     ) {
         let simd = self.simd;
-        let mut own_sums =
+        let mut add_gradients =
             |conv: &BorderedConvolution<S::Element>, input: &[S::Element], grad: &[f32]| {
                 let own = sums.pop().expect("each convolution has sums");
                 conv.parameter_gradients(simd, input, grad, own);
@@ -174,33 +176,33 @@ impl<S: Simd> Stages<S> {
         for (stage, convolutions) in stages.enumerate().rev() {
             let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
             for block in blocks.rev() {
-                let (one, two) = (&block[0], &block[1]);
-                let inner = take_last_input(two, &mut inputs);
-                let outer = take_last_input(one, &mut inputs);
-                own_sums(two, inner, &grad);
-                let mut between = Buffer::<f32>::new(one.shape().map_len());
-                two.image_gradient(simd, &grad, |y, row| {
-                    let to = &mut between[y * row.len()..][..row.len()];
-                    relu_backward(simd, &inner[two.shape().interior_row(y)], row, to);
+                let (conv1, conv2) = (&block[0], &block[1]);
+                let x2 = take_last_input(conv2, &mut inputs);
+                let x1 = take_last_input(conv1, &mut inputs);
+                add_gradients(conv2, x2, &grad);
+                let mut grad_x2 = Buffer::<f32>::new(conv1.shape().map_len());
+                conv2.image_gradient(simd, &grad, |y, row| {
+                    let to = &mut grad_x2[y * row.len()..][..row.len()];
+                    relu_backward(simd, &x2[conv2.shape().interior_row(y)], row, to);
                 });
-                own_sums(one, outer, &between);
-                one.image_gradient(simd, &between, |y, row| {
+                add_gradients(conv1, x1, &grad_x2);
+                conv1.image_gradient(simd, &grad_x2, |y, row| {
                     let to = &mut grad[y * row.len()..][..row.len()];
-                    add_relu_backward(simd, &outer[one.shape().interior_row(y)], row, to);
+                    add_relu_backward(simd, &x1[conv1.shape().interior_row(y)], row, to);
                 });
             }
-            let before;
-            (taken, before) = split_tail(taken, grad.len());
+            let own;
+            (argmax, own) = split_tail(argmax, grad.len());
             let mut grad_maps = Buffer::zeros(conv.shape().map_len());
-            unpool(simd, &grad, conv.shape().output(), before, &mut grad_maps);
+            unpool(simd, &grad, conv.shape().output(), own, &mut grad_maps);
             if stage == 0 {
                 let mut input = Buffer::new(conv.shape().bordered_len::<S::Element>());
                 conv.shape()
                     .write_interior(simd, Interior::Bytes(image), &mut input);
-                own_sums(conv, &input, &grad_maps);
+                add_gradients(conv, &input, &grad_maps);
                 return;
             }
-            own_sums(conv, take_last_input(conv, &mut inputs), &grad_maps);
+            add_gradients(conv, take_last_input(conv, &mut inputs), &grad_maps);
             grad = Buffer::new(conv.shape().locations() * conv.shape().channels_in);
             conv.image_gradient(simd, &grad_maps, |y, row| {
                 grad[y * row.len()..][..row.len()].copy_from_slice(row);

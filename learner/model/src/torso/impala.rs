@@ -15,7 +15,7 @@ use crate::kernels::linear::add_rows;
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
-use crate::layers::LayerShape;
+use crate::layers::LayerSpec;
 
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "conv",
@@ -37,7 +37,7 @@ pub(crate) struct Impala {
 }
 
 impl Torso for Impala {
-    fn convolutions(&self) -> Vec<LayerShape> {
+    fn convolutions(&self) -> Vec<LayerSpec> {
         let (shapes, _) = stage_shapes(self.input, &self.widths);
         let blocks = 2 * self.widths.len();
         let smaller = 1.0 / (blocks as f32).sqrt();
@@ -46,21 +46,21 @@ impl Torso for Impala {
             let is_scaled = self.scale_blocks && name.ends_with(".conv2");
             let name = format!("torso.stage{}.{name}", index / STAGE_CONVOLUTIONS + 1);
             let (out, inputs, side) = (shape.channels_out, shape.channels_in, shape.kernel);
-            LayerShape {
+            LayerSpec {
                 initial_scale: if is_scaled { smaller } else { 1.0 },
                 locations: shape.locations(),
-                ..LayerShape::new(name, &[out, inputs, side, side], Initializer::Orthogonal)
+                ..LayerSpec::new(name, &[out, inputs, side, side], Initializer::Orthogonal)
             }
         };
         shapes.iter().enumerate().map(convolution).collect()
     }
 
-    fn local_shape(&self) -> (usize, usize, usize) {
+    fn f3_shape(&self) -> (usize, usize, usize) {
         stage_shapes(self.input, &self.widths).1
     }
 
     fn fc_inputs(&self) -> usize {
-        let (height, width, channels) = self.local_shape();
+        let (height, width, channels) = self.f3_shape();
         if self.takes_mean {
             return channels;
         }
@@ -72,7 +72,7 @@ impl Torso for Impala {
         kernels: Kernels,
         parameters: &TorsoParameters<Tensor>,
         frames: &Tensor,
-        local: bool,
+        needs_f3: bool,
     ) -> Result<(Option<Tensor>, Tensor)> {
         let layers = parameters.convolutions.iter();
         let layers: Vec<_> = layers.map(|it| (&it.weight, &it.bias)).collect();
@@ -83,7 +83,7 @@ impl Torso for Impala {
         } else {
             kernels.linear_of_maps(&f3, weight, bias)?
         };
-        Ok((local.then_some(f3), f4))
+        Ok((needs_f3.then_some(f3), f4))
     }
 
     fn for_actor(

@@ -8,31 +8,31 @@ use candle_core::Tensor;
 use crate::compute::Kernels;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
-use crate::layers::{Layer, LayerShape};
+use crate::layers::{Layer, LayerSpec};
 
 /// A torso of given sizes, without its parameters. It turns frames into f3, the output of its convolutions, and f4, a fully
 /// connected layer on f3. It ends before f4's ReLU, because DIM reads f4 before the ReLU and the C51 head after it.
 pub(crate) trait Torso: fmt::Debug + Send + Sync {
     /// The convolutions, such as `torso.conv1`, in the order in which they are applied and their initial weights drawn.
-    fn convolutions(&self) -> Vec<LayerShape>;
+    fn convolutions(&self) -> Vec<LayerSpec>;
 
     /// Returns the height, width and channels of f3.
-    fn local_shape(&self) -> (usize, usize, usize);
+    fn f3_shape(&self) -> (usize, usize, usize);
 
     /// The number of inputs to the fully connected layer.
     fn fc_inputs(&self) -> usize {
-        let (height, width, channels) = self.local_shape();
+        let (height, width, channels) = self.f3_shape();
         height.saturating_mul(width).saturating_mul(channels)
     }
 
     /// Computes f4 [B, hidden] before its ReLU, of `frames` [B, H, W, C] u8 scaled by 1/255. Computes f3
-    /// [B, h, w, c] after its ReLU too, if `local` features are wanted.
+    /// [B, h, w, c] after its ReLU too, if `needs_f3`.
     fn features(
         &self,
         kernels: Kernels,
         parameters: &TorsoParameters<Tensor>,
         frames: &Tensor,
-        local: bool,
+        needs_f3: bool,
     ) -> candle_core::Result<(Option<Tensor>, Tensor)>;
 
     /// Builds the torso for an actor, with products in `precision`.

@@ -14,7 +14,7 @@ use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::Stack;
 use crate::kernels::torso::torso;
-use crate::layers::LayerShape;
+use crate::layers::LayerSpec;
 
 #[derive(Debug)]
 pub(crate) struct Nature {
@@ -43,21 +43,21 @@ impl Nature {
 }
 
 impl Torso for Nature {
-    fn convolutions(&self) -> Vec<LayerShape> {
+    fn convolutions(&self) -> Vec<LayerSpec> {
         let mut channels_in = self.input.2;
         let layers = self.conv.iter().enumerate().map(|(index, layer)| {
             let weight = [layer.out, channels_in, layer.kernel, layer.kernel];
             channels_in = layer.out;
             let name = format!("torso.conv{}", index + 1);
-            LayerShape {
+            LayerSpec {
                 locations: self.shapes.get(index).map_or(0, ConvShape::locations),
-                ..LayerShape::new(name, &weight, Initializer::Orthogonal)
+                ..LayerSpec::new(name, &weight, Initializer::Orthogonal)
             }
         });
         layers.collect()
     }
 
-    fn local_shape(&self) -> (usize, usize, usize) {
+    fn f3_shape(&self) -> (usize, usize, usize) {
         self.shapes.last().map_or(self.input, ConvShape::output)
     }
 
@@ -66,7 +66,7 @@ impl Torso for Nature {
         kernels: Kernels,
         parameters: &TorsoParameters<Tensor>,
         frames: &Tensor,
-        local: bool,
+        needs_f3: bool,
     ) -> Result<(Option<Tensor>, Tensor)> {
         let layers = parameters.convolutions.iter().zip(&self.conv);
         let layers: Vec<_> = layers
@@ -74,13 +74,13 @@ impl Torso for Nature {
             .collect();
         let (weight, bias) = (&parameters.fc.weight, &parameters.fc.bias);
         match kernels {
-            Kernels::Fused(precision) if !local => {
+            Kernels::Fused(precision) if !needs_f3 => {
                 Ok((None, torso(frames, &layers, weight, bias, precision)?))
             }
             _ => {
                 let maps = kernels.conv_stack(frames, &layers)?;
                 let f4 = kernels.linear_of_maps(&maps, weight, bias)?;
-                Ok((local.then_some(maps), f4))
+                Ok((needs_f3.then_some(maps), f4))
             }
         }
     }

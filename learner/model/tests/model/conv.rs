@@ -23,10 +23,10 @@ const SHAPES: [Shape; 8] = [
 /// Computes relu(conv2d + bias) of channels-last images with candle's operations.
 ///
 /// Pixels that no window covers are cut off first, because candle's backward pass fails on them.
-fn stock(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
-    let used = |size: usize, kernel: usize| (size - kernel) / stride * stride + kernel;
-    let height = used(images.dim(1)?, weight.dim(2)?);
-    let width = used(images.dim(2)?, weight.dim(3)?);
+fn candle_conv(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
+    let covered = |size: usize, kernel: usize| (size - kernel) / stride * stride + kernel;
+    let height = covered(images.dim(1)?, weight.dim(2)?);
+    let width = covered(images.dim(2)?, weight.dim(3)?);
     let images = images.narrow(1, 0, height)?.narrow(2, 0, width)?;
     let maps = images
         .permute((0, 3, 1, 2))?
@@ -53,7 +53,7 @@ fn images_of_floats_and_of_bytes_match_candle_forward_and_backward() -> Result<(
             precision,
             rng,
             |args| conv2d_relu(&args[0], &args[1], &args[2], stride, precision),
-            |args| stock(&args[0], &args[1], &args[2], stride),
+            |args| candle_conv(&args[0], &args[1], &args[2], stride),
         )?;
         let bytes = bytes(images.iter().product(), rng);
         let bytes = Var::from_tensor(&Tensor::from_vec(bytes, &images[..], &Device::Cpu)?)?;
@@ -64,7 +64,7 @@ fn images_of_floats_and_of_bytes_match_candle_forward_and_backward() -> Result<(
             precision,
             rng,
             |args| conv2d_relu(&bytes, &args[0], &args[1], stride, precision),
-            |args| stock(&scaled, &args[0], &args[1], stride),
+            |args| candle_conv(&scaled, &args[0], &args[1], stride),
         )?;
         let maps = conv2d_relu(&bytes, &weight, &bias, stride, precision)?;
         let gradients = maps.sum_all()?.backward()?;

@@ -6,7 +6,7 @@ use driml_model::{Precision, linear, relu};
 use crate::support::{assert_layer, double, floats, rng, rounded, values, variable};
 
 /// Computes the layer with candle's operations: x [rows, in], b [out].
-fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
+fn candle_linear(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
     let y = x.matmul(&w.t()?)?.broadcast_add(b)?;
     if with_relu { y.relu() } else { Ok(y) }
 }
@@ -41,7 +41,7 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
                     let y = linear(&args[0], &args[1], &args[2], precision)?;
                     if with_relu { relu(&y) } else { Ok(y) }
                 },
-                |args| stock(&args[0], &args[1], &args[2], with_relu),
+                |args| candle_linear(&args[0], &args[1], &args[2], with_relu),
             )?;
         }
     }

@@ -114,12 +114,12 @@ fn heads_that_are_left_out_are_not_there() {
         change(&mut config.dim);
         config
     };
-    let has = |config: &ModelConfig, layer: &str| {
+    let has_layer = |config: &ModelConfig, layer: &str| {
         let mut shapes = config.parameter_shapes().into_iter();
         shapes.any(|(name, _)| name.starts_with(layer))
     };
     let config = without(|dim| (dim.psi3, dim.phi4) = (false, false));
-    assert!(!has(&config, "dim.psi3") && !has(&config, "dim.phi4"));
+    assert!(!has_layer(&config, "dim.psi3") && !has_layer(&config, "dim.phi4"));
     let network = Network::new(&config, &parameters(&config, 1), Kernels::FUSED).unwrap();
     let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
     let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
@@ -130,7 +130,7 @@ fn heads_that_are_left_out_are_not_there() {
     assert!(network.psi4(&features.f4, &actions).is_ok());
 
     let without_psi = without(|dim| (dim.psi3, dim.psi4) = (false, false));
-    assert!(!has(&without_psi, "dim.action"));
+    assert!(!has_layer(&without_psi, "dim.action"));
 }
 
 #[test]
@@ -199,7 +199,7 @@ fn configurations_that_cannot_work_are_errors() {
             width: 1,
             ..with(&[1, 2, 3])
         };
-        assert!(one.validate().is_ok() && one.local_shape() == (1, 1, 3));
+        assert!(one.validate().is_ok() && one.f3_shape() == (1, 1, 3));
     }
     fails(|config| config.conv[1].kernel = 9);
     fails(|config| config.conv[0].stride = 0);

@@ -255,7 +255,7 @@ impl View {
         Self {
             side,
             step,
-            columns: model.local_shape().1,
+            columns: model.f3_shape().1,
         }
     }
 

@@ -16,7 +16,7 @@ pub(super) const TILE_ROWS: usize = 16;
 /// The number of tile registers that serve as accumulators.
 pub(super) const ACCUMULATORS: usize = 4;
 
-/// Eight tile registers: four accumulators, and a left and a right operand, each twice: for whole rows of steps and for the remaining steps.
+/// Eight tile registers: four accumulators, and a left and a right operand, each twice: for whole rows and for the remaining steps.
 ///
 /// # Safety
 /// For all methods: `configure` was called before, pointers may be read or written for the sizes given to it,
