@@ -5,7 +5,7 @@ use safetensors::tensor::TensorView;
 
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::stored::WeightDtype;
+use crate::weight_dtype::WeightDtype;
 
 /// The cost of one layer. FLOPs are multiplications and additions, each counted as one.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,9 +59,9 @@ impl ModelConfig {
     }
 
     /// Returns the size in bytes of a safetensors file of all parameters, names and shapes included.
-    pub fn weights_bytes(&self, stored: WeightDtype) -> Result<usize> {
+    pub fn weights_bytes(&self, dtype: WeightDtype) -> Result<usize> {
         let shapes = self.parameter_shapes();
-        let scalars = |shape: &[usize]| shape.iter().product::<usize>() * stored.bytes();
+        let scalars = |shape: &[usize]| shape.iter().product::<usize>() * dtype.bytes();
         let largest = shapes.iter().map(|(_, shape)| scalars(shape)).max();
         let zeros = vec![0; largest.unwrap_or(0)];
         let mut views = Vec::with_capacity(shapes.len());
@@ -69,7 +69,7 @@ impl ModelConfig {
             let values = &zeros[..scalars(shape)];
             views.push((
                 name,
-                TensorView::new(stored.dtype(), shape.clone(), values)?,
+                TensorView::new(dtype.safetensors_dtype(), shape.clone(), values)?,
             ));
         }
         Ok(safetensors::serialize(views, None)?.len())
@@ -199,9 +199,9 @@ mod tests {
             let all: usize = built.iter().map(|(_, var)| var.elem_count()).sum();
             let counted: u64 = config.layer_costs().iter().map(|it| it.parameters).sum();
             assert_eq!(all as u64, counted);
-            for stored in [WeightDtype::F32, WeightDtype::F16, WeightDtype::Bf16] {
-                let file = built.to_safetensors_as(stored, |_| true).unwrap();
-                assert_eq!(config.weights_bytes(stored).unwrap(), file.len());
+            for dtype in [WeightDtype::F32, WeightDtype::F16, WeightDtype::Bf16] {
+                let file = built.to_safetensors_as(dtype, |_| true).unwrap();
+                assert_eq!(config.weights_bytes(dtype).unwrap(), file.len());
             }
         }
     }

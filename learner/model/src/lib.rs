@@ -45,8 +45,8 @@ mod layers;
 mod network;
 mod parameters;
 mod policy;
-mod stored;
 mod torso;
+mod weight_dtype;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
 pub use config::{DimHeads, LossLayer, ModelConfig};
@@ -68,5 +68,5 @@ pub use kernels::tensors::{Values, floats, values_of};
 pub use network::{Features, Network};
 pub use parameters::{Parameters, is_dim};
 pub use policy::{PolicyNetwork, argmax};
-pub use stored::WeightDtype;
 pub use torso::TorsoName;
+pub use weight_dtype::WeightDtype;

@@ -9,7 +9,7 @@ use safetensors::tensor::{SafeTensors, TensorView};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::stored::{self, WeightDtype};
+use crate::weight_dtype::{self, WeightDtype};
 
 /// Parameters by name, as candle variables with PyTorch's names and shapes.
 ///
@@ -100,27 +100,27 @@ impl Parameters {
     /// As [`Parameters::to_safetensors`], or a parameter that is too large for the type.
     pub fn to_safetensors_as(
         &self,
-        stored: WeightDtype,
+        dtype: WeightDtype,
         filter: impl Fn(&str) -> bool,
     ) -> Result<Vec<u8>> {
-        self.serialize_part(stored, filter, None)
+        self.serialize_part(dtype, filter, None)
     }
 
     /// Serialises all parameters as a safetensors file with the metadata entry `key`: `value`, for readers that
     /// know only the file. There is one entry, because several would be written in a random order each time.
     pub fn to_described_safetensors(
         &self,
-        stored: WeightDtype,
+        dtype: WeightDtype,
         key: &str,
         value: &str,
     ) -> Result<Vec<u8>> {
         let entry = HashMap::from([(key.to_owned(), value.to_owned())]);
-        self.serialize_part(stored, |_| true, Some(entry))
+        self.serialize_part(dtype, |_| true, Some(entry))
     }
 
     fn serialize_part(
         &self,
-        stored: WeightDtype,
+        dtype: WeightDtype,
         filter: impl Fn(&str) -> bool,
         metadata: Option<HashMap<String, String>>,
     ) -> Result<Vec<u8>> {
@@ -128,9 +128,9 @@ impl Parameters {
         for (name, var) in self.iter().filter(|(name, _)| filter(name)) {
             let values = var.flatten_all()?.to_vec1::<f32>()?;
             check_finite(name, &values)?;
-            let bytes = stored.encode(&values).map_err(|at| {
+            let bytes = dtype.encode(&values).map_err(|at| {
                 let why = format!(
-                    "is {} at index {at}, too large for {stored}: set learner.publish_dtype to f32 or bf16",
+                    "is {} at index {at}, too large for {dtype}: set learner.publish_dtype to f32 or bf16",
                     values[at]
                 );
                 ModelError::parameter(name, why)
@@ -141,7 +141,7 @@ impl Parameters {
         for (name, shape, bytes) in &tensors {
             views.push((
                 *name,
-                TensorView::new(stored.dtype(), shape.clone(), bytes)?,
+                TensorView::new(dtype.safetensors_dtype(), shape.clone(), bytes)?,
             ));
         }
         Ok(safetensors::serialize(views, metadata)?)
@@ -208,7 +208,7 @@ pub(crate) fn decode(
             .remove(name.as_str())
             .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
         check_shape(&name, view.shape(), &shape)?;
-        let values = stored::decode(view.dtype(), view.data()).ok_or_else(|| {
+        let values = weight_dtype::decode(view.dtype(), view.data()).ok_or_else(|| {
             let why = format!("has type {:?}, wanted F32, F16 or BF16", view.dtype());
             ModelError::parameter(&name, why)
         })?;

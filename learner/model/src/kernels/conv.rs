@@ -106,7 +106,7 @@ impl<S: Simd> ConvStack<S> {
     pub(crate) fn tasks(&self) -> Tasks {
         Tasks {
             count: self.count,
-            images: TASK_IMAGES,
+            task_images: TASK_IMAGES,
             image_len: self.shapes[0].image_len(),
             map_len: self.last_shape().map_len(),
         }

@@ -62,7 +62,7 @@ impl<S: Simd> ResidualStages<S> {
     fn tasks(&self, stages: &Stages<S>) -> Tasks {
         Tasks {
             count: self.count,
-            images: TASK_IMAGES,
+            task_images: TASK_IMAGES,
             image_len: stages.image_len(),
             map_len: stages.output_len(),
         }

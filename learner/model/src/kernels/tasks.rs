@@ -14,7 +14,7 @@ pub(crate) struct Tasks {
     /// The number of images in the batch.
     pub(crate) count: usize,
     /// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
-    pub(crate) images: usize,
+    pub(crate) task_images: usize,
     pub(crate) image_len: usize,
     pub(crate) map_len: usize,
 }
@@ -27,8 +27,8 @@ pub(crate) struct Task {
 
 impl Tasks {
     fn task(&self, index: usize) -> Task {
-        let first = index * self.images;
-        let end = self.count.min(first + self.images);
+        let first = index * self.task_images;
+        let end = self.count.min(first + self.task_images);
         Task {
             images: first * self.image_len..end * self.image_len,
             maps: first * self.map_len..end * self.map_len,
@@ -41,7 +41,7 @@ impl Tasks {
         maps: &mut [f32],
         forward: impl Fn(Range<usize>, &mut [f32]) -> T + Sync,
     ) -> Vec<T> {
-        maps.par_chunks_mut(self.images * self.map_len)
+        maps.par_chunks_mut(self.task_images * self.map_len)
             .enumerate()
             .with_max_len(1)
             .map(|(index, maps)| forward(self.task(index).images, maps))
@@ -57,7 +57,7 @@ impl Tasks {
         grad_images: &mut [f32],
         backward: impl Fn(Task, &T, Option<&mut [f32]>) -> Buffer<f32> + Sync,
     ) -> Vec<f32> {
-        let mut grad_images = grad_images.chunks_mut(self.images * self.image_len);
+        let mut grad_images = grad_images.chunks_mut(self.task_images * self.image_len);
         let grad_images: Vec<_> = saved.iter().map(|_| grad_images.next()).collect();
         let tasks = saved.par_iter().zip(grad_images).enumerate();
         let sums: Vec<_> = tasks

@@ -8,7 +8,7 @@ use driml_model::{
 };
 
 use crate::support::{
-    assert_close, assert_layer, bits, floats, frames, kinds, parameters, pool, residual, rng,
+    assert_close, assert_layer, bits, configs, floats, frames, parameters, pool, residual, rng,
     small, variable, with_biases,
 };
 
@@ -56,7 +56,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
             .to_vec(),
         ..small()
     };
-    for config in kinds().chain([uneven, even]) {
+    for config in configs().chain([uneven, even]) {
         let parameters = with_biases(&config);
         let (ours, mut our_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
@@ -77,7 +77,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
     for (precision, config) in Precision::ALL
         .into_iter()
-        .flat_map(|precision| kinds().map(move |config| (precision, config)))
+        .flat_map(|precision| configs().map(move |config| (precision, config)))
     {
         let streams = if config.head.dueling { 2 } else { 1 };
         let noise = HeadNoise::draw(&config, &mut rng(3));

@@ -4,13 +4,13 @@
 use driml_model::{HeadConfig, HeadNoise, Kernels, Network, PolicyNetwork, Precision, TorsoName};
 
 use crate::support::{
-    bytes, frames, kinds, parameters, policy, pool, q_values, residual, rng, small, small_with,
+    bytes, configs, frames, parameters, policy, pool, q_values, residual, rng, small, small_with,
     values,
 };
 
 #[test]
 fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
-    for config in kinds() {
+    for config in configs() {
         let parameters = parameters(&config, 3);
         let network = Network::new(&config, &parameters, Kernels::FUSED).unwrap();
         let mut policy = policy(&config, &parameters, Precision::F32);

@@ -144,7 +144,7 @@ pub(crate) const NOISY: HeadConfig = HeadConfig {
 };
 
 /// Small networks with every kind of head, and with every torso.
-pub(crate) fn kinds() -> impl Iterator<Item = ModelConfig> {
+pub(crate) fn configs() -> impl Iterator<Item = ModelConfig> {
     let heads = [HeadConfig::PLAIN, DUELING, NOISY, HeadConfig::RAINBOW].map(small_with);
     let torsos = [TorsoName::Impala, TorsoName::Impoola].map(residual);
     heads.into_iter().chain(torsos)

@@ -62,7 +62,7 @@ impl WeightDtype {
     }
 
     /// The type's name in a safetensors file.
-    pub(crate) const fn dtype(self) -> Dtype {
+    pub(crate) const fn safetensors_dtype(self) -> Dtype {
         match self {
             Self::F32 => Dtype::F32,
             Self::F16 => Dtype::F16,
