@@ -31,12 +31,12 @@ pub(super) struct Shot {
     pub(super) action: u8,
     pub(super) is_last: bool,
     /// `None` if the network is not asked.
-    pub(super) outputs: Option<NetworkOutputs>,
+    pub(super) outputs: Option<ActionOutputs>,
 }
 
-/// The network's outputs for a state.
+/// The outputs of the network for a state and the action taken there.
 #[derive(Clone, Debug)]
-pub(super) struct NetworkOutputs {
+pub(super) struct ActionOutputs {
     /// Q-values [A].
     q_values: Vec<f32>,
     /// The return distribution [N] of the action that was taken.
@@ -112,10 +112,10 @@ impl Layout {
     }
 
     /// Returns the outputs in `seen` for environment `i`, in which `action` was taken.
-    pub(super) fn outputs_of(&self, seen: &NetworkOutputs, i: usize, action: u8) -> NetworkOutputs {
+    pub(super) fn outputs_of(&self, seen: &NetworkOutputs, i: usize, action: u8) -> ActionOutputs {
         let (actions, atoms) = (self.action_names.len(), self.support.len());
         let taken = i * actions + usize::from(action);
-        NetworkOutputs {
+        ActionOutputs {
             q_values: row_of(&seen.q_values, actions, i).to_vec(),
             probabilities: row_of(&seen.probabilities, atoms, taken).to_vec(),
         }
@@ -158,7 +158,7 @@ impl Layout {
         }
     }
 
-    fn draw_panel(&self, picture: &mut Picture, area: Rect, shot: &Shot, outputs: &NetworkOutputs) {
+    fn draw_panel(&self, picture: &mut Picture, area: Rect, shot: &Shot, outputs: &ActionOutputs) {
         let action = usize::from(shot.action);
         let (q, name) = (outputs.q_values[action], &self.action_names[action]);
         let q_values = outputs.q_values.iter().copied();
