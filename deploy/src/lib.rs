@@ -43,9 +43,9 @@ pub fn main_with(registry: Registry) -> ExitCode {
         }
     };
     let is_replay_server = matches!(cli.command, Command::ReplayServer(_));
-    let settled = process_env::settle(is_replay_server);
+    let environment = process_env::ensure_environment(is_replay_server);
     console::log_to_stderr();
-    if let Err(e) = settled {
+    if let Err(e) = environment {
         tracing::warn!("this process runs without the environment that makes it fast: {e}");
     }
     let ran = cli.command.run();

@@ -38,7 +38,7 @@ fn settings(game: &str) -> RunConfig {
     // The memory that is free now must not change the settings.
     let machine = Machine {
         memory_bytes: u64::MAX,
-        ..Machine::this()
+        ..Machine::detect()
     };
     let world = format!("procgen:{game}");
     let config = of_names("paper", &world, "driml-ada", &[], &machine).unwrap();

@@ -1,6 +1,6 @@
 """What all peers' scripts share: the command line, how long a thing is measured, and the one line of JSON at the end.
 
-The rules are those of deploy/machine/src/effort.rs, so that both sides are measured alike.
+The rules are those of deploy/machine/src/speed_meter.rs, so that both sides are measured alike.
 """
 
 import argparse

@@ -3,7 +3,7 @@
 
 use driml_envs::StepEnd;
 use driml_launch::console;
-use driml_machine::effort::Effort;
+use driml_machine::speed_meter::SpeedMeter;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -37,13 +37,18 @@ pub(super) fn measure(worlds: &[String], bench: &mut Bench<'_>) -> anyhow::Resul
     }
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     for (name, world, threads) in cases {
-        let rate = rate(&world, threads, &bench.effort, &mut rng)?;
+        let rate = rate(&world, threads, &bench.meter, &mut rng)?;
         bench.figures.record(name, rate, "steps/s");
     }
     Ok(())
 }
 
-fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> anyhow::Result<f64> {
+fn rate(
+    world: &str,
+    threads: usize,
+    meter: &SpeedMeter,
+    rng: &mut ChaCha8Rng,
+) -> anyhow::Result<f64> {
     let config = settings::run_config(world, "c51", "paper", &[])?;
     let mut world = config.world.build(ENVS, 1, threads)?;
     let num_actions = world.num_actions() as u8;
@@ -52,7 +57,7 @@ fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> a
     let mut frames = vec![0; ENVS * world.frame_shape().bytes()];
     let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
     // A step that starts episodes takes longer than others, so measure the mean.
-    let calls = effort.rate_overall(|| {
+    let calls = meter.rate_overall(|| {
         for actions in &actions {
             world.step(actions, &mut rewards, &mut ends)?;
             world.observe(&mut frames);

@@ -4,7 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{anyhow, ensure};
-use driml_machine::effort::Work;
+use driml_machine::speed_meter::Work;
 use driml_protocol::{ActorJoin, Batch, BufferPool, InsertReply, Sampling};
 use driml_replay_server::Replay;
 use driml_settings::config::RunConfig;
@@ -36,7 +36,7 @@ pub(super) fn time_assembly(recording: &Recording, bench: &mut Bench<'_>) -> any
     let config = settings::run_config(WORLD, AGENT, "paper", &settings::REPLAY_SETS)?;
     let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes);
     let mut filled = FullReplay::new(&config, CAPACITY, recording)?;
-    let sampling = bench.effort.rate_by_median(|| {
+    let sampling = bench.meter.rate_by_median(|| {
         black_box(filled.draw()?);
         Ok(())
     })?;
@@ -45,7 +45,7 @@ pub(super) fn time_assembly(recording: &Recording, bench: &mut Bench<'_>) -> any
 
     let held = vec![1_u8; CAPACITY as usize * frame_bytes];
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let copying = bench.effort.rate_by_median(|| {
+    let copying = bench.meter.rate_by_median(|| {
         let mut copy = Vec::with_capacity(3 * rows as usize * frame_bytes);
         for _ in 0..3 * rows {
             let from = rng.random_range(0..CAPACITY as usize) * frame_bytes;
@@ -89,7 +89,7 @@ pub(super) fn time_sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<
         Box::new(|| prioritised.draw().map(|batch| drop(black_box(batch)))),
         Box::new(|| updated.draw_and_update()),
     ];
-    for (what, rate) in names.iter().zip(bench.effort.rates_in_turn(&mut works)?) {
+    for (what, rate) in names.iter().zip(bench.meter.rates_in_turn(&mut works)?) {
         let what = format!("{rows} rows of {held} transitions {what}");
         bench.figures.record(what, rate, "batches/s");
     }

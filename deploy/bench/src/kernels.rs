@@ -22,14 +22,14 @@ const TILES: usize = 10_000;
 
 /// Measures GFLOP/s in each precision.
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
-    let effort = bench.effort;
+    let meter = bench.meter;
     for precision in bench.flags.precisions(DeviceName::Cpu) {
         let mut record = |what: &str, gflop: f64, calls: f64| {
             let figures = &mut bench.figures;
             figures.record(with_precision(what, precision), gflop * calls, "GFLOP/s");
         };
         let gflop = multiply_in_first_cache(precision, TILES) / 1e9;
-        let calls = effort.rate_by_median(|| {
+        let calls = meter.rate_by_median(|| {
             multiply_in_first_cache(precision, TILES);
             Ok(())
         })?;
@@ -38,7 +38,7 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
             let maps = random(&[ROWS, side + 2, side + 2, channels])?;
             let (weight, bias) = (random(&[channels, channels, 3, 3])?, random(&[channels])?);
             let gflop = (2 * ROWS * side * side * 9 * channels * channels) as f64 / 1e9;
-            let calls = effort.rate_by_median(|| {
+            let calls = meter.rate_by_median(|| {
                 conv2d_relu(&maps, &weight, &bias, 1, precision)?;
                 Ok(())
             })?;
@@ -50,7 +50,7 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
             let set = format!("model.torso={torso}");
             let (work, gflop) = work_and_gflop("c51", &[&set], &compute)?;
             let what = format!("update of C51, {torso}: {gflop:.2} GFLOP");
-            record(&what, gflop, effort.rate_by_median(work)?);
+            record(&what, gflop, meter.rate_by_median(work)?);
         }
     }
     Ok(())

@@ -5,7 +5,7 @@ use driml_learner::{
     Agent, Compute, DeviceName, Kernels, OwnedBatch, Precision,
     cost::{UpdateCost, UpdateShape},
 };
-use driml_machine::effort::Work;
+use driml_machine::speed_meter::Work;
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -77,7 +77,7 @@ fn paper(
     on_cpu: bool,
     bench: &mut Bench<'_>,
 ) -> anyhow::Result<()> {
-    let effort = bench.effort;
+    let meter = bench.meter;
     let mut record = |what: &str, rate| {
         let figures = &mut bench.figures;
         figures.record(with_precision(what, precision), rate, "updates/s");
@@ -86,12 +86,12 @@ fn paper(
         let words: Vec<&str> = case.split('|').collect();
         let (name, sets) = (words[0], &words[3..]);
         let config = settings::run_config(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
-        let rate = effort.rate_by_median(updates(&config, compute, 0.0)?)?;
+        let rate = meter.rate_by_median(updates(&config, compute, 0.0)?)?;
         record(name, rate);
         if name == GLOBAL_DIM_CASE && on_cpu && precision == Precision::F32 {
             let mut candle = compute.clone();
             candle.kernels = Kernels::Candle;
-            let rate = effort.rate_by_median(updates(&config, &candle, 0.0)?)?;
+            let rate = meter.rate_by_median(updates(&config, &candle, 0.0)?)?;
             record(&format!("{name}, {CANDLE_SUFFIX}"), rate);
         }
     }
@@ -108,7 +108,7 @@ fn paper(
             ));
         }
     }
-    for (name, rate) in names.iter().zip(effort.rates_in_turn(&mut works)?) {
+    for (name, rate) in names.iter().zip(meter.rates_in_turn(&mut works)?) {
         record(name, rate);
     }
     Ok(())
@@ -119,7 +119,7 @@ fn growth(precision: Precision, compute: &Compute, bench: &mut Bench<'_>) -> any
     for (name, sets) in SIZES {
         let sets = [sets, &["learner.deduplicate_states=false"]].concat();
         let (work, gflop) = work_and_gflop(AGENT, &sets, compute)?;
-        let rate = bench.effort.rate_by_median(work)?;
+        let rate = bench.meter.rate_by_median(work)?;
         let name = format!("{name}: {gflop:.2} GFLOP");
         let (what, figures) = (with_precision(&name, precision), &mut bench.figures);
         figures.record(what, rate, "updates/s");

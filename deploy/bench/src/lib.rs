@@ -38,7 +38,7 @@ mod subprocess;
 mod system;
 
 use driml_learner::DeviceName;
-use driml_machine::{device, effort::Effort, resources::MachineNote};
+use driml_machine::{device, resources::MachineInfo, speed_meter::SpeedMeter};
 
 use crate::{
     flags::{BenchArgs, BenchCommand},
@@ -52,7 +52,7 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
         BenchCommand::Learner(args) => args.on.device,
         _ => DeviceName::Cpu,
     };
-    device::ready_for(device_name)?;
+    device::check_device(device_name)?;
     let starts_processes = matches!(
         command,
         BenchCommand::System { .. } | BenchCommand::Scale { .. } | BenchCommand::Peers(_)
@@ -60,10 +60,10 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
     if !starts_processes {
         subprocess::ensure_threads(flags.threads)?;
     }
-    let machine = MachineNote::this(device::gpu(device_name));
+    let machine = MachineInfo::detect(device::describe_gpu(device_name));
     let mut bench = Bench {
         flags,
-        effort: Effort::new(flags.quick),
+        meter: SpeedMeter::new(flags.quick),
         figures: Figures::default(),
         table: None,
     };

@@ -34,7 +34,7 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
                 let mut frames = vec![0; batch * model.frame_len()];
                 rng.fill_bytes(&mut frames);
                 let mut actions = vec![0; batch];
-                let rate = bench.effort.rate_by_median(|| {
+                let rate = bench.meter.rate_by_median(|| {
                     policy.greedy_actions(&frames, &mut actions)?;
                     Ok(())
                 })?;

@@ -84,14 +84,14 @@ pub(super) fn insert_name(transitions: u32, wire: &str) -> String {
 
 /// Measures the transitions that a server stores per second and the batches that it serves per second, once its replay is full.
 fn rates(server: &mut Server, recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
-    let (effort, held) = (bench.effort, server.wire.capacity);
+    let (meter, held) = (bench.meter, server.wire.capacity);
     server.deliver(recording, CHUNKS[3], |sent, _| sent >= held)?;
     for chunk in CHUNKS {
-        let rate = server.deliver(recording, chunk, |_, started| effort.is_spent(started))?;
+        let rate = server.deliver(recording, chunk, |_, started| meter.is_long_enough(started))?;
         let name = insert_name(chunk.transitions(), server.wire.name);
         bench.figures.record(name, rate, "transitions/s");
     }
-    let (rate, wire) = (server.fetch(&effort)?, server.wire.name);
+    let (rate, wire) = (server.fetch(&meter)?, server.wire.name);
     let name = format!("batch of 3 states, {wire}");
     bench.figures.record(name, rate, "batches/s");
     Ok(())

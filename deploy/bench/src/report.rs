@@ -7,9 +7,9 @@ use anyhow::Context;
 use driml_launch::console::{self, aligned, print};
 use driml_learner::Precision;
 use driml_machine::{
-    effort::{Effort, median},
-    resources::MachineNote,
-    units::number,
+    resources::MachineInfo,
+    speed_meter::{SpeedMeter, median},
+    units::format_number,
 };
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +18,7 @@ use crate::flags::BenchFlags;
 /// The flags of a bench, and its figures so far.
 pub(super) struct Bench<'a> {
     pub(super) flags: &'a BenchFlags,
-    pub(super) effort: Effort,
+    pub(super) meter: SpeedMeter,
     pub(super) figures: Figures,
     /// A table that is printed instead of one row per figure.
     pub(super) table: Option<String>,
@@ -43,7 +43,7 @@ impl Figures {
     /// Adds a figure, or its value in another round, and prints it to stderr at once.
     pub(super) fn record(&mut self, what: impl Into<String>, value: f64, unit: &str) {
         let (what, unit) = (what.into(), unit.to_owned());
-        console::line(&format!("  {what}: {} {unit}", number(value)));
+        console::line(&format!("  {what}: {} {unit}", format_number(value)));
         self.add(Measurement { what, value, unit });
     }
 
@@ -89,7 +89,7 @@ pub(super) struct Report {
     /// Threads for arithmetic.
     pub(super) threads: u32,
     /// The machine, as it was before the first measurement.
-    pub(super) machine: MachineNote,
+    pub(super) machine: MachineInfo,
     /// The medians of the figures.
     pub(super) figures: Vec<Measurement>,
 }
@@ -97,7 +97,8 @@ pub(super) struct Report {
 impl Report {
     /// Returns the figures as rows of three fields, separated by blanks: value, unit, and as the rest of the line what was measured.
     pub(super) fn rows(&self) -> String {
-        let row = |it: &Measurement| vec![number(it.value), it.unit.clone(), it.what.clone()];
+        let row =
+            |it: &Measurement| vec![format_number(it.value), it.unit.clone(), it.what.clone()];
         aligned(&self.figures.iter().map(row).collect::<Vec<_>>(), &[0])
     }
 }
@@ -137,7 +138,7 @@ mod tests {
             bench: "learner".into(),
             quick: true,
             threads: 2,
-            machine: MachineNote::this(None),
+            machine: MachineInfo::detect(None),
             figures: figures.medians(),
         };
         expect![[r#"

@@ -14,7 +14,7 @@ use driml_learner::{
     LearnerConfig,
     remote::batch_source::{BatchSource, Counters, NextBatch, Requests},
 };
-use driml_machine::effort::Effort;
+use driml_machine::speed_meter::SpeedMeter;
 use driml_protocol::{
     ActorJoin, Alive, JoinReply, Keys, LearnerJoin, Request, RunClient, Shutdown, join,
     session::{self, Endpoints, MESSAGE_BYTES_MAX},
@@ -122,7 +122,7 @@ impl Server {
     }
 
     /// Measures batches per second, each read as a learner would.
-    pub(super) fn fetch(&mut self, effort: &Effort) -> anyhow::Result<f64> {
+    pub(super) fn fetch(&mut self, meter: &SpeedMeter) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
         // A learner that has made no update.
         let join = LearnerJoin {
@@ -143,7 +143,7 @@ impl Server {
         };
         let clients = std::slice::from_ref(&client);
         let mut source = BatchSource::start(clients, requests, &Counters::at_start(1), &shutdown)?;
-        let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
+        let rate = meter.rate_overall(|| match source.next(ANSWER_MAX)? {
             NextBatch::Ready(served) => {
                 // Read one byte of each cache line, so that all states have arrived.
                 let batch = &served.batch;

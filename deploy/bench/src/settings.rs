@@ -28,5 +28,5 @@ pub(super) fn run_config(
     preset: &str,
     sets: &[&str],
 ) -> Result<RunConfig, Usage> {
-    flags::of_names(preset, world, agent, sets, &Machine::this())
+    flags::of_names(preset, world, agent, sets, &Machine::detect())
 }

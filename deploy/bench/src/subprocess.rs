@@ -21,7 +21,7 @@ pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
     if std::env::var(THREADS).is_ok_and(|it| it == threads) {
         return Ok(());
     }
-    let again = process_env::start_again_with([(THREADS, threads.as_str())]);
+    let again = process_env::restart_with([(THREADS, threads.as_str())]);
     again.context("starting this program again with other threads")
 }
 

@@ -13,7 +13,7 @@ use driml_launch::{
     run_folder::{RunFolder, Summary},
     view::{Poller, Reached},
 };
-use driml_machine::units::number;
+use driml_machine::units::format_number;
 use driml_protocol::{LearnerStatus, ReplayStatus};
 use tempfile::TempDir;
 
@@ -89,7 +89,7 @@ pub(super) fn scale(
             let mut heads = ["ratio", "actors"].map(String::from).to_vec();
             let mut row = vec![ratio.to_string(), actors.to_string()];
             for (column, value) in measure_columns(actors, ratio, slack, seconds)? {
-                row.push(value.map_or("-".into(), number));
+                row.push(value.map_or("-".into(), format_number));
                 if let Some(value) = value {
                     let what = format!("ratio {ratio}, {actors} actors: {column}");
                     let unit = column.clone();

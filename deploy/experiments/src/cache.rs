@@ -107,7 +107,7 @@ impl Session {
             missing: Vec::new(),
         };
         if !report_only {
-            session.keep(CORES, Machine::this().cores)?;
+            session.keep(CORES, Machine::detect().cores)?;
         }
         Ok(session)
     }
@@ -288,7 +288,7 @@ fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
 
 /// Identifies this program and its processor, for [`Session::piece_of`]: the size and modification time of its file, and the model.
 pub(crate) fn program() -> anyhow::Result<String> {
-    let file = process_env::program();
+    let file = process_env::program_path();
     let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
     let written = about.modified().ok();
     let written = written.and_then(|it| it.duration_since(SystemTime::UNIX_EPOCH).ok());
@@ -296,7 +296,7 @@ pub(crate) fn program() -> anyhow::Result<String> {
         "{} bytes of {} s, {}",
         about.len(),
         written.map_or(0.0, |it| it.as_secs_f64()),
-        resources::processor()
+        resources::processor_name()
     ))
 }
 
@@ -345,7 +345,7 @@ mod tests {
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
         let mut reported = report("a").unwrap();
         let cores = reported.kept_piece(CORES);
-        assert_eq!(cores, Some(Machine::this().cores));
+        assert_eq!(cores, Some(Machine::detect().cores));
         let made = session.piece_of("w, an old program", "errors", 1, |_| Ok(1));
         assert_eq!(made.unwrap(), 1);
         let computed = |session: &mut Session, what: &str, made: u32| {

@@ -12,8 +12,8 @@ use std::{
 use anyhow::{Context, ensure};
 use driml_machine::{
     error::EXIT_INTERRUPTED,
-    process_env::program,
-    units::{duration, kib},
+    process_env::program_path,
+    units::{duration, proc_kib},
 };
 use nix::{
     sys::signal::{Signal, kill},
@@ -64,7 +64,7 @@ impl ManagedProcess {
         let held = rendezvous.map(Rendezvous::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
-        let mut command = Command::new(program());
+        let mut command = Command::new(program_path());
         // The child inherits the rest of its environment from this process.
         command
             .env(THREADS, threads.to_string())
@@ -160,7 +160,7 @@ impl ManagedProcess {
             return None;
         }
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
-        Some(kib(&status, "VmRSS:")? as f64 / 1024.0)
+        Some(proc_kib(&status, "VmRSS:")? as f64 / 1024.0)
     }
 
     /// How the process ended, and its error or the last lines of its log, as one message.

@@ -28,7 +28,7 @@ pub fn end_the_process() {
             }
         }
         let scarce = match panic.location() {
-            Some(place) if !is_ours(place.file()) => limits::scarce(),
+            Some(place) if !is_ours(place.file()) => limits::scarce_resources(),
             _ => Vec::new(),
         };
         say(&line(panic, thread.name(), &scarce));

@@ -8,7 +8,7 @@ use driml_learner::{
     Compute,
     checkpoint::{METADATA_KEY, describe, read_description},
 };
-use driml_machine::error::{nearest, usage};
+use driml_machine::error::{did_you_mean, usage};
 use driml_model::{Parameters, Precision, WeightDtype, is_bf16_fast};
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
@@ -60,7 +60,7 @@ pub fn find(name: &Path) -> anyhow::Result<Option<Player>> {
 fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
     let games: Vec<_> = all.iter().map(|(game, _)| *game).collect();
     let Some((_, bytes)) = all.iter().find(|(known, _)| *known == game) else {
-        let near = nearest(game, games.iter().copied());
+        let near = did_you_mean(game, games.iter().copied());
         let known = match games.len() {
             0 => "this program has none".into(),
             _ => format!("there are {PREFIX}{}", games.join(&format!(", {PREFIX}"))),

@@ -7,7 +7,7 @@ use driml_model::DeviceName;
 use crate::error::{Usage, usage};
 
 #[cfg(not(feature = "cuda"))]
-const TO_BUILD: &str = "this program was built without CUDA; with a CUDA toolkit `cargo build --release --features cuda` builds one \
+const BUILD_HINT: &str = "this program was built without CUDA; with a CUDA toolkit `cargo build --release --features cuda` builds one \
      that has it, without a toolkit `deploy/cuda/build.sh`";
 
 /// What the learner computes on.
@@ -19,12 +19,12 @@ pub struct DeviceFlag {
 }
 
 /// Checks that the device exists and that this program was built for it. Otherwise the error says what to do.
-pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
+pub fn check_device(device: DeviceName) -> Result<(), Usage> {
     let DeviceName::Cuda(ordinal) = device else {
         return Ok(());
     };
-    let described = count().and_then(|count| match ordinal < count {
-        true => describe(ordinal),
+    let described = device_count().and_then(|count| match ordinal < count {
+        true => describe_cuda(ordinal),
         false => Err(format!(
             "the driver finds {count} device(s), counted from cuda:0"
         )),
@@ -34,30 +34,30 @@ pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
 }
 
 /// Describes a GPU: its name, compute capability and memory. None for the CPU, or if the GPU cannot be used.
-pub fn gpu(device: DeviceName) -> Option<String> {
+pub fn describe_gpu(device: DeviceName) -> Option<String> {
     match device {
         DeviceName::Cpu => None,
-        DeviceName::Cuda(ordinal) => describe(ordinal).ok(),
+        DeviceName::Cuda(ordinal) => describe_cuda(ordinal).ok(),
     }
 }
 
 /// A GPU's device name, such as `cuda:0`, and its description, or why this program cannot compute there.
-pub(crate) type Gpu = (String, Result<String, String>);
+pub(crate) type GpuCheck = (String, Result<String, String>);
 
 /// Every GPU that the driver finds, or why there is none.
-pub(crate) fn gpus() -> Result<Vec<Gpu>, String> {
-    let one = |ordinal| (format!("cuda:{ordinal}"), describe(ordinal));
-    count().map(|count| (0..count).map(one).collect())
+pub(crate) fn gpus() -> Result<Vec<GpuCheck>, String> {
+    let check = |ordinal| (format!("cuda:{ordinal}"), describe_cuda(ordinal));
+    device_count().map(|count| (0..count).map(check).collect())
 }
 
 /// The number of devices that the driver finds, at least one, or why there is none.
 #[cfg(not(feature = "cuda"))]
-fn count() -> Result<usize, String> {
-    Err(TO_BUILD.to_owned())
+fn device_count() -> Result<usize, String> {
+    Err(BUILD_HINT.to_owned())
 }
 
 #[cfg(feature = "cuda")]
-fn count() -> Result<usize, String> {
+fn device_count() -> Result<usize, String> {
     use candle_core::cuda_backend::cudarc::driver::CudaContext;
 
     match CudaContext::device_count() {
@@ -69,22 +69,22 @@ fn count() -> Result<usize, String> {
 
 /// Describes a device: its name, compute capability and memory. An error if the query fails or the program was not built for it.
 #[cfg(not(feature = "cuda"))]
-fn describe(_ordinal: usize) -> Result<String, String> {
-    Err(TO_BUILD.to_owned())
+fn describe_cuda(_ordinal: usize) -> Result<String, String> {
+    Err(BUILD_HINT.to_owned())
 }
 
 #[cfg(feature = "cuda")]
-fn describe(ordinal: usize) -> Result<String, String> {
+fn describe_cuda(ordinal: usize) -> Result<String, String> {
     use candle_core::cuda_backend::cudarc::driver::{CudaContext, DriverError};
 
-    let ask = || -> Result<_, DriverError> {
+    let query = || -> Result<_, DriverError> {
         let context = CudaContext::new(ordinal)?;
         let (free, total) = context.mem_get_info()?;
         let capability: (i32, i32) = context.compute_capability()?;
         Ok((context.name()?, capability, free, total))
     };
     let (name, (major, minor), free, total) =
-        ask().map_err(|why| format!("asking for its properties: {why}"))?;
+        query().map_err(|why| format!("asking for its properties: {why}"))?;
     let [free, total] = [free, total].map(|bytes| crate::units::gib(bytes as u64));
     let text = format!("{name}, compute capability {major}.{minor}, {total}, {free} free");
     match option_env!("CUDA_COMPUTE_CAP").and_then(|it| it.parse().ok()) {
@@ -127,7 +127,7 @@ mod tests {
     #[cfg(not(feature = "cuda"))]
     #[test]
     fn a_program_without_cuda_says_how_to_build_one_that_has_it() {
-        let said = ready_for(DeviceName::Cuda(0)).unwrap_err().to_string();
+        let said = check_device(DeviceName::Cuda(0)).unwrap_err().to_string();
         assert!(said.starts_with("cuda:0 cannot be used: this program"));
         assert!(said.contains("--features cuda"), "{said}");
         assert!(gpus().is_err());

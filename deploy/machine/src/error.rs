@@ -28,7 +28,7 @@ pub const EXIT_INTERRUPTED: u8 = 130;
 pub struct Interrupted;
 
 /// Returns ` (did you mean "..."?)` with the candidate most similar to `name`, or an empty string if none is similar.
-pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
+pub fn did_you_mean<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
     let distance = |candidate: &str| strsim::levenshtein(name, candidate);
     match candidates.into_iter().min_by_key(|it| distance(it)) {
         Some(best) if distance(best) <= 1 + name.len() / 4 => format!(" (did you mean {best:?}?)"),
@@ -42,9 +42,9 @@ mod tests {
 
     #[test]
     fn near_names_are_offered_and_far_ones_are_not() {
-        let found = nearest("drimlada", ["c51", "driml-ada"]);
+        let found = did_you_mean("drimlada", ["c51", "driml-ada"]);
         assert_eq!(found, " (did you mean \"driml-ada\"?)");
-        assert_eq!(nearest("zzz", ["c51", "driml-ada"]), "");
-        assert_eq!(nearest("zzz", []), "");
+        assert_eq!(did_you_mean("zzz", ["c51", "driml-ada"]), "");
+        assert_eq!(did_you_mean("zzz", []), "");
     }
 }

@@ -7,7 +7,7 @@
 //! ```
 //! use driml_machine::{resources::Machine, units::gib};
 //!
-//! let machine = Machine::this();
+//! let machine = Machine::detect();
 //! println!("{} cores, {} of memory free", machine.cores, gib(machine.memory_bytes));
 //! ```
 
@@ -15,11 +15,11 @@
 
 pub mod device;
 pub mod doctor;
-pub mod effort;
 pub mod error;
 pub mod limits;
 pub mod process_env;
 pub mod resources;
 pub mod shell;
+pub mod speed_meter;
 pub mod units;
 pub mod whole_number;

@@ -9,7 +9,7 @@ use nix::{
     sys::resource::{Resource, getrlimit},
 };
 
-use crate::{resources::Machine, units::kib};
+use crate::{resources::Machine, units::proc_kib};
 
 /// Open files that a library may need at once, to connect or to share memory. With fewer left, files are scarce.
 const FILES_SPARE: u64 = 8;
@@ -17,7 +17,7 @@ const MAPS_SPARE: u64 = 64;
 const MEMORY_SPARE: u64 = 64 << 20;
 
 /// Lists the resources that this process has nearly used up: each with its limit and what to do.
-pub fn scarce() -> Vec<String> {
+pub fn scarce_resources() -> Vec<String> {
     let all = [open_files(), shared_memory(), locked_memory()];
     let all = all.into_iter().chain([memory_maps(), memory()]);
     all.flatten().collect()
@@ -31,10 +31,10 @@ fn open_files() -> Option<String> {
         Err(e) if e.raw_os_error() == Some(Errno::EMFILE as i32) => max,
         Err(_) => return None,
     };
-    few_files(used, max)
+    scarce_files(used, max)
 }
 
-fn few_files(used: u64, max: u64) -> Option<String> {
+fn scarce_files(used: u64, max: u64) -> Option<String> {
     (used.saturating_add(FILES_SPARE) > max)
         .then(|| format!("{used} of at most {max} files are open: raise the limit (`ulimit -n`)"))
 }
@@ -50,7 +50,7 @@ fn shared_memory() -> Option<String> {
 
 fn locked_memory() -> Option<String> {
     let max = shared_memory::lockable_bytes()?;
-    let locked = kib(&fs::read_to_string("/proc/self/status").ok()?, "VmLck:")? << 10;
+    let locked = proc_kib(&fs::read_to_string("/proc/self/status").ok()?, "VmLck:")? << 10;
     (locked + METADATA_BYTES as u64 > max).then(|| {
         format!(
             "{} of at most {} KiB of memory are locked: raise the limit (`ulimit -l`), or --set transport.shared_memory=false",
@@ -69,7 +69,7 @@ fn memory_maps() -> Option<String> {
 }
 
 fn memory() -> Option<String> {
-    let free = Machine::this().memory_bytes;
+    let free = Machine::detect().memory_bytes;
     (free < MEMORY_SPARE).then(|| format!("{} MiB of memory are free", free >> 20))
 }
 
@@ -80,7 +80,7 @@ mod tests {
     #[test]
     fn open_files_are_scarce_where_a_library_may_want_more() {
         let said = "53 of at most 60 files are open: raise the limit (`ulimit -n`)";
-        let found = [52, 53].map(|used| few_files(used, 60));
+        let found = [52, 53].map(|used| scarce_files(used, 60));
         assert_eq!(found, [None, Some(said.to_owned())]);
     }
 }

@@ -5,53 +5,51 @@ use std::{env, ffi::OsString, io, os::unix::process::CommandExt, path::PathBuf, 
 
 /// The variables of every process. candle's second thread pool spins while it waits, which costs more than it gains on busy cores.
 /// glibc returns each large tensor's memory to the system and faults it in again, unless these thresholds forbid it.
-const EVERYONE: [(&str, &str); 3] = [
+const COMMON_VARIABLES: [(&str, &str); 3] = [
     ("CANDLE_NUM_THREADS", "1"),
     ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
     ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
 ];
 /// The additional variable of a replay server. glibc gives each thread its own heap, up to eight per core. Each heap keeps the
 /// chunks freed in it, so memory only grows in a run whose actors come and go.
-const REPLAY_SERVER: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
+const REPLAY_SERVER_VARIABLE: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
 
 /// Restarts this program in the same process with the same arguments if the environment lacks one of the variables. Variables
 /// that the user has set stay unchanged.
 ///
 /// # Errors
 /// The program cannot be started again. It may continue without the variables, only slower.
-pub fn settle(is_replay_server: bool) -> io::Result<()> {
-    let missing = missing(is_replay_server, |name| env::var_os(name).is_some());
+pub fn ensure_environment(is_replay_server: bool) -> io::Result<()> {
+    let missing = missing_variables(is_replay_server, |name| env::var_os(name).is_some());
     if missing.is_empty() {
         return Ok(());
     }
-    start_again_with(missing)
+    restart_with(missing)
 }
 
 /// Restarts this program in the same process, with the same arguments and with these variables added. Returns only if that
 /// fails.
-pub fn start_again_with<'a>(
-    variables: impl IntoIterator<Item = (&'a str, &'a str)>,
-) -> io::Result<()> {
+pub fn restart_with<'a>(variables: impl IntoIterator<Item = (&'a str, &'a str)>) -> io::Result<()> {
     let mut args = env::args_os();
     let name = args.next().unwrap_or_else(|| OsString::from("driml"));
-    let mut again = Command::new(program());
-    Err(again.arg0(name).args(args).envs(variables).exec())
+    let mut command = Command::new(program_path());
+    Err(command.arg0(name).args(args).envs(variables).exec())
 }
 
 /// The path of this program, to start another process of it. If a build has replaced the file, `/proc/self/exe` still reaches it.
-pub fn program() -> PathBuf {
+pub fn program_path() -> PathBuf {
     let file = env::current_exe().ok().filter(|it| it.exists());
     file.unwrap_or_else(|| "/proc/self/exe".into())
 }
 
 /// The variables that this process lacks, with their values.
-fn missing(
+fn missing_variables(
     is_replay_server: bool,
-    has: impl Fn(&str) -> bool,
+    is_set: impl Fn(&str) -> bool,
 ) -> Vec<(&'static str, &'static str)> {
-    let own = is_replay_server.then_some(REPLAY_SERVER);
-    let needed = EVERYONE.into_iter().chain(own);
-    needed.filter(|(name, _)| !has(name)).collect()
+    let server_variable = is_replay_server.then_some(REPLAY_SERVER_VARIABLE);
+    let needed = COMMON_VARIABLES.into_iter().chain(server_variable);
+    needed.filter(|(name, _)| !is_set(name)).collect()
 }
 
 #[cfg(test)]
@@ -80,15 +78,16 @@ mod tests {
             }
             // The first child removed this file, and then started this second child.
             Some(_) if fs::remove_file(env::current_exe().unwrap()).is_err() => {}
-            Some(_) => assert!(status(program()).success()),
+            Some(_) => assert!(status(program_path()).success()),
         }
     }
 
     #[test]
     fn what_is_missing_is_added_and_what_is_set_stays() {
-        assert_eq!(missing(false, |_| false), EVERYONE);
-        assert_eq!(missing(false, |_| true), []);
-        let server = missing(true, |name| name == "CANDLE_NUM_THREADS");
-        assert_eq!(server, [EVERYONE[1], EVERYONE[2], REPLAY_SERVER]);
+        assert_eq!(missing_variables(false, |_| false), COMMON_VARIABLES);
+        assert_eq!(missing_variables(false, |_| true), []);
+        let server = missing_variables(true, |name| name == "CANDLE_NUM_THREADS");
+        let [_, mmap, trim] = COMMON_VARIABLES;
+        assert_eq!(server, [mmap, trim, REPLAY_SERVER_VARIABLE]);
     }
 }

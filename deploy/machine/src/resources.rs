@@ -5,10 +5,10 @@ use std::{fs, path::Path};
 
 use serde::{Deserialize, Serialize};
 
-use crate::units::kib;
+use crate::units::proc_kib;
 
 /// Environments of one actor: enough for batched inference, few enough that each environment soon completes a chunk.
-pub const ENVS: u32 = 16;
+pub const ENVS_PER_ACTOR: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
 /// Share of the free memory that a replay of a requested size may take, where other processes of the run start beside it.
@@ -18,7 +18,7 @@ const REPLAY_SHARE_MAX: f64 = 0.9;
 pub const LEARNER_BYTES: u64 = 512 << 20;
 
 /// The environment variable through which a sweep gives a run its share of the free memory, in bytes.
-pub const MEMORY_SHARE: &str = "DRIML_MEMORY_SHARE";
+pub const MEMORY_SHARE_ENV: &str = "DRIML_MEMORY_SHARE";
 
 /// Estimates the bytes that `actors` processes of 16 environments take in a world. Procgen's engine keeps its images in memory
 /// (410 to 423 MiB measured per actor; 97 MiB on Ms. PacMan).
@@ -43,9 +43,9 @@ pub struct Machine {
 
 impl Machine {
     /// Reads the resources of this machine. Where the memory cannot be read, 4 GiB are assumed.
-    pub fn this() -> Self {
+    pub fn detect() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
-        let share = std::env::var(MEMORY_SHARE).ok();
+        let share = std::env::var(MEMORY_SHARE_ENV).ok();
         Self {
             cores,
             memory_bytes: bounded(free_memory_bytes().unwrap_or(4 << 30), share.as_deref()),
@@ -54,7 +54,7 @@ impl Machine {
     }
 
     /// The default number of actor processes. Few, as an update needs only 32 new steps: one actor feeds several learners' worth of cores.
-    pub const fn actors(&self) -> u32 {
+    pub const fn default_actors(&self) -> u32 {
         match self.cores {
             0..4 => 1,
             4..16 => 2,
@@ -62,28 +62,28 @@ impl Machine {
         }
     }
 
-    /// Bytes that a replay sized by the machine may take, if the processes that start beside it take `beside` bytes.
-    pub fn replay_bytes(&self, beside: u64) -> u64 {
-        self.share(REPLAY_SHARE, beside)
+    /// Bytes that a replay sized by the machine may take, if the processes that start beside it take `other_bytes` bytes.
+    pub fn replay_bytes(&self, other_bytes: u64) -> u64 {
+        self.share_bytes(REPLAY_SHARE, other_bytes)
     }
 
-    /// Bytes that a replay of a requested size may take, if the processes that start beside it take `beside` bytes.
-    pub fn replay_bytes_max(&self, beside: u64) -> u64 {
-        match beside {
+    /// Bytes that a replay of a requested size may take, if the processes that start beside it take `other_bytes` bytes.
+    pub fn replay_bytes_max(&self, other_bytes: u64) -> u64 {
+        match other_bytes {
             0 => self.memory_bytes,
-            _ => self.share(REPLAY_SHARE_MAX, beside),
+            _ => self.share_bytes(REPLAY_SHARE_MAX, other_bytes),
         }
     }
 
-    fn share(&self, share: f64, beside: u64) -> u64 {
+    fn share_bytes(&self, share: f64, other_bytes: u64) -> u64 {
         let bytes = (self.memory_bytes as f64 * share) as u64;
-        bytes.min(self.memory_bytes.saturating_sub(beside))
+        bytes.min(self.memory_bytes.saturating_sub(other_bytes))
     }
 }
 
 /// A description of the machine that measured, as far as measured figures depend on it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct MachineNote {
+pub struct MachineInfo {
     /// The processor's name.
     pub processor: String,
     /// Cores that this process may use.
@@ -94,12 +94,12 @@ pub struct MachineNote {
     pub gpu: Option<String>,
 }
 
-impl MachineNote {
+impl MachineInfo {
     /// Describes this machine and its load now. `gpu` is the GPU that computes, or none for the processor.
-    pub fn this(gpu: Option<String>) -> Self {
+    pub fn detect(gpu: Option<String>) -> Self {
         Self {
-            processor: processor(),
-            cores: Machine::this().cores,
+            processor: processor_name(),
+            cores: Machine::detect().cores,
             load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
             gpu,
         }
@@ -111,12 +111,12 @@ fn load(loadavg: &str) -> Option<f64> {
 }
 
 /// The processor's name; "unknown" if the kernel does not report it.
-pub fn processor() -> String {
+pub fn processor_name() -> String {
     let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    processor_in(&cpuinfo).unwrap_or("unknown").to_owned()
+    parse_processor(&cpuinfo).unwrap_or("unknown").to_owned()
 }
 
-fn processor_in(cpuinfo: &str) -> Option<&str> {
+fn parse_processor(cpuinfo: &str) -> Option<&str> {
     let mut lines = cpuinfo.lines();
     let line = lines.find(|line| line.starts_with("model name"))?;
     let (_, name) = line.split_once(':')?;
@@ -131,25 +131,25 @@ fn bounded(bytes: u64, share: Option<&str>) -> u64 {
 /// The kernel's estimate of available memory, or what the control groups leave, whichever is less.
 fn free_memory_bytes() -> Option<u64> {
     let table = fs::read_to_string("/proc/meminfo").unwrap_or_default();
-    let system = kib(&table, "MemAvailable:").map(|kib| kib << 10);
+    let system = proc_kib(&table, "MemAvailable:").map(|kib| kib << 10);
     let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
-    let left = left_by_groups(Path::new("/sys/fs/cgroup"), &groups);
+    let left = cgroup_bytes_left(Path::new("/sys/fs/cgroup"), &groups);
     system.into_iter().chain(left).min()
 }
 
 /// Bytes that a process's control groups leave it: the least over its group and all parents, for cgroup versions 1 and 2.
 /// `groups` is the process's `/proc/PID/cgroup`. The page cache of files counts as free, as the kernel reclaims it.
-fn left_by_groups(mount: &Path, groups: &str) -> Option<u64> {
+fn cgroup_bytes_left(mount: &Path, groups: &str) -> Option<u64> {
     let left = |group: &Path, [max, used, cache]: [&str; 3]| {
         let text = |file: &str| fs::read_to_string(group.join(file)).ok();
         let number = |file| text(file)?.trim().parse::<u64>().ok();
         let stat = text("memory.stat").unwrap_or_default();
-        let of_files = ["active_file", "inactive_file"].map(|list| {
+        let cached = ["active_file", "inactive_file"].map(|list| {
             let mut lines = stat.lines();
             let bytes = lines.find_map(|it| it.strip_prefix(cache)?.strip_prefix(list));
             bytes.and_then(|it| it.trim().parse().ok()).unwrap_or(0)
         });
-        let used = number(used)?.saturating_sub(of_files.iter().sum());
+        let used = number(used)?.saturating_sub(cached.iter().sum());
         Some(number(max)?.saturating_sub(used))
     };
     let lines = groups.lines().filter_map(|line| {
@@ -179,8 +179,8 @@ mod tests {
     fn load_and_processor_are_read_from_the_kernel_s_tables() {
         assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
         let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
-        assert_eq!(processor_in(cpuinfo), Some("AMD EPYC 9999"));
-        assert_eq!(processor_in(""), None);
+        assert_eq!(parse_processor(cpuinfo), Some("AMD EPYC 9999"));
+        assert_eq!(parse_processor(""), None);
     }
 
     #[test]
@@ -199,7 +199,7 @@ mod tests {
                 fs::write(folder.join(name), format!("{text}\n")).unwrap();
             }
         };
-        let left = |groups| left_by_groups(root.path(), groups);
+        let left = |groups| cgroup_bytes_left(root.path(), groups);
         assert_eq!(left("0::/\n"), None);
         let stat = "anon 500\nfile 450\nactive_file 200\ninactive_file 100";
         let files = format!("memory.max 1000, memory.current 900, memory.stat {stat}");

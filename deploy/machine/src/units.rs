@@ -30,13 +30,13 @@ pub fn gib(bytes: u64) -> String {
 }
 
 /// Reads the number of KiB after `name` in one of the kernel's tables, such as `/proc/meminfo`.
-pub fn kib(table: &str, name: &str) -> Option<u64> {
+pub fn proc_kib(table: &str, name: &str) -> Option<u64> {
     let line = table.lines().find_map(|line| line.strip_prefix(name))?;
     line.trim().strip_suffix("kB")?.trim().parse().ok()
 }
 
 /// Formats a number with three significant digits, but with all digits before the point and at most three decimals.
-pub fn number(value: f64) -> String {
+pub fn format_number(value: f64) -> String {
     match value.abs() {
         size if size >= 99.95 => format!("{value:.0}"),
         size if size >= 9.995 => format!("{value:.1}"),
@@ -55,9 +55,9 @@ mod tests {
         assert_eq!(texts, ["5 s", "1 min 5 s", "1 h 1 min", "1 d 1 h"]);
         let texts = [3.2, 99.0, 100.0, 3_600.0, 9_000.0].map(rough_duration);
         assert_eq!(texts, ["3 s", "99 s", "2 min", "60 min", "2.5 h"]);
-        let texts = [0.0, 0.12345, 1.2345, 12.345, 123.45, 61_234.5].map(number);
+        let texts = [0.0, 0.12345, 1.2345, 12.345, 123.45, 61_234.5].map(format_number);
         assert_eq!(texts, ["0.00", "0.123", "1.23", "12.3", "123", "61234"]);
-        let texts = [0.9994, 0.9996, 9.994, 9.996, 99.94, 99.96].map(number);
+        let texts = [0.9994, 0.9996, 9.994, 9.996, 99.94, 99.96].map(format_number);
         assert_eq!(texts, ["0.999", "1.00", "9.99", "10.0", "99.9", "100"]);
         assert_eq!(gib(3 << 29), "1.5 GiB");
     }
@@ -65,7 +65,7 @@ mod tests {
     #[test]
     fn memory_is_read_from_the_kernel_s_tables() {
         let table = "MemFree:        1000 kB\nVmLck:\t    2048 kB\n";
-        assert_eq!(kib(table, "VmLck:"), Some(2048));
-        assert_eq!(kib(table, "VmRSS:"), None);
+        assert_eq!(proc_kib(table, "VmLck:"), Some(2048));
+        assert_eq!(proc_kib(table, "VmRSS:"), None);
     }
 }

@@ -11,22 +11,23 @@ pub fn read(text: &str) -> Result<u64, String> {
     let none = || format!("{text:?} is not a whole number; write one as 1000000, 1_000_000 or 1e6");
     let plain = text.replace('_', "");
     let (mantissa, exponent) = plain.split_once(['e', 'E']).unwrap_or((&plain, "0"));
-    let (whole, part) = mantissa.split_once('.').unwrap_or((mantissa, ""));
-    let part = part.trim_end_matches('0');
-    let digits = format!("{whole}{part}");
+    let (whole, fraction) = mantissa.split_once('.').unwrap_or((mantissa, ""));
+    let fraction = fraction.trim_end_matches('0');
+    let digits = format!("{whole}{fraction}");
     if digits.is_empty() || whole.is_empty() || !digits.bytes().all(|it| it.is_ascii_digit()) {
         return Err(none());
     }
     let exponent: usize = exponent.parse().map_err(|_| none())?;
-    let zeros = exponent.checked_sub(part.len()).ok_or_else(none)?;
+    let zeros = exponent.checked_sub(fraction.len()).ok_or_else(none)?;
     // No 64-bit number has more than 20 digits.
     let zeros = match digits.bytes().all(|it| it == b'0') {
         true => 0,
         false => zeros.min(20),
     };
     let digits = digits + &"0".repeat(zeros);
-    let number = digits.parse();
-    number.map_err(|_| format!("{text} is more than {}", u64::MAX))
+    digits
+        .parse()
+        .map_err(|_| format!("{text} is more than {}", u64::MAX))
 }
 
 /// Returns a parser for a flag whose value is a whole number in `range`.

@@ -146,10 +146,10 @@ impl Source {
                     derived::declare(&mut table, command)?;
                 }
                 for (path, value) in [
-                    ("local.actors", Value::from(machine.actors())),
+                    ("local.actors", Value::from(machine.default_actors())),
                     ("local.learner_threads", machine.cores.into()),
                     ("local.learner_device", "cpu".into()),
-                    ("actor.envs", resources::ENVS.into()),
+                    ("actor.envs", resources::ENVS_PER_ACTOR.into()),
                     ("actor.world_threads", 0.into()),
                 ] {
                     derived::put_missing(&mut table, path, value);

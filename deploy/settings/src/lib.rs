@@ -8,7 +8,7 @@
 //! use driml_settings::flags::of_names;
 //!
 //! let sets = ["replay.transitions_max=200000", "learner.update.adam.lr=1e-4"];
-//! let config = of_names("paper", "procgen:bigfish", "driml-ada", &sets, &Machine::this())?;
+//! let config = of_names("paper", "procgen:bigfish", "driml-ada", &sets, &Machine::detect())?;
 //! assert_eq!(config.run.world, "procgen:bigfish");
 //! assert_eq!(config.frames(), 200_000);
 //! # Ok::<(), driml_machine::error::Usage>(())

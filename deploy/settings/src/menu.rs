@@ -79,7 +79,7 @@ pub fn sourced(
     // Shows what the preset asks for on any machine, whatever memory is free at this moment.
     let machine = Machine {
         memory_bytes: u64::MAX,
-        ..Machine::this()
+        ..Machine::detect()
     };
     let table = source.resolve(&Flags::default(), &machine)?.to_table();
     let mut sources = BTreeMap::new();

@@ -1,7 +1,7 @@
 //! `--set key=value`: one value of the settings, by its dotted path.
 //! Keys and types are checked against the existing settings; each component checks its own ranges.
 
-use driml_machine::error::{Usage, nearest, usage};
+use driml_machine::error::{Usage, did_you_mean, usage};
 use toml::{Table, Value};
 
 /// The largest number up to which a float represents every whole number exactly.
@@ -91,7 +91,7 @@ impl Override {
         let elsewhere = paths.iter().filter(|path| key(path) == key(&self.path));
         let near = match elsewhere.min_by_key(|path| strsim::levenshtein(&self.path, path)) {
             Some(path) => format!(" (did you mean {path:?}?)"),
-            None => nearest(&self.path, paths.iter().map(String::as_str)),
+            None => did_you_mean(&self.path, paths.iter().map(String::as_str)),
         };
         let keys: Vec<_> = known.keys().map(String::as_str).collect();
         let place = match &at[..] {

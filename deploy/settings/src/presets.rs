@@ -4,7 +4,7 @@
 use std::sync::OnceLock;
 
 use driml_envs::WorldName;
-use driml_machine::error::{Usage, nearest, usage};
+use driml_machine::error::{Usage, did_you_mean, usage};
 use serde::Deserialize;
 use toml::{Table, Value};
 
@@ -193,7 +193,7 @@ pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
 /// The error for an unknown name after the flag `kind`: the nearest name, as a question, and all names.
 fn unknown(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> String {
     let all: Vec<_> = all.collect();
-    let (near, names) = (nearest(name, all.iter().copied()), all.join(", "));
+    let (near, names) = (did_you_mean(name, all.iter().copied()), all.join(", "));
     format!("there is no {kind} {name:?}{near}; --{kind} takes {names}")
 }
 

@@ -29,7 +29,7 @@ pub(crate) struct InspectArgs {
 }
 
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
-    let machine = Machine::this();
+    let machine = Machine::detect();
     if args.worlds {
         let of_world = |world: WorldName| {
             let flags = RunFlags {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
-use driml_machine::device::{DeviceFlag, ready_for};
+use driml_machine::device::{DeviceFlag, check_device};
 use driml_protocol::{Shutdown, tls::Role};
 
 use super::join::{JoinFlags, KeepAliveFlag, TlsFlags, clean_up_after, prepare_join};
@@ -33,7 +33,7 @@ pub(crate) struct LearnerArgs {
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Learner)?;
-    ready_for(args.on.device)?;
+    check_device(args.on.device)?;
     let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;
     let run = driml_learner::RunArgs {
         connect: args.connect,

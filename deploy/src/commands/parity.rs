@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::console::print;
 use driml_learner::{Kernels, Precision};
-use driml_machine::device::{DeviceFlag, ready_for};
+use driml_machine::device::{DeviceFlag, check_device};
 
 #[derive(Debug, Args)]
 pub(crate) struct ParityArgs {
@@ -24,7 +24,7 @@ pub(crate) struct ParityArgs {
 
 /// Checks each file and prints what differs. A file out of tolerance is an error.
 pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
-    ready_for(args.on.device)?;
+    check_device(args.on.device)?;
     let mut failed = 0;
     let mut compute = args.on.device.open(args.precision)?;
     if args.stock {

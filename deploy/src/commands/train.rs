@@ -13,7 +13,7 @@ use driml_launch::{
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
-use driml_machine::{device::ready_for, error::usage, resources::Machine, whole_number};
+use driml_machine::{device::check_device, error::usage, resources::Machine, whole_number};
 use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
     config::RunConfig,
@@ -77,7 +77,7 @@ pub(crate) struct TrainArgs {
 const CHECKPOINT_PERIOD: u64 = 1_000;
 
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
-    let machine = Machine::this();
+    let machine = Machine::detect();
     let sets = &mut args.run.over.sets;
     sets.extend((args.device).map(|device| format!("local.learner_device={device}")));
     for (is_set, set) in [
@@ -129,7 +129,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     // Report errors in the certificates before anything is created.
     args.tls.credentials(Role::ReplayServer)?;
-    ready_for(config.local.learner_device)?;
+    check_device(config.local.learner_device)?;
     check(&config, args.lockstep)?;
     let run_dir = match args.resume {
         Some(folder) => RunFolder::new(folder),

@@ -12,7 +12,7 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console::{self, aligned};
-use driml_machine::{effort::median, resources::MachineNote, units::number};
+use driml_machine::{resources::MachineInfo, speed_meter::median, units::format_number};
 use serde::Serialize;
 
 use crate::{
@@ -70,7 +70,7 @@ struct Comparison {
     quick: bool,
     threads: u32,
     /// The machine, as it was before the first measurement.
-    machine: MachineNote,
+    machine: MachineInfo,
     rows: Vec<Row>,
 }
 
@@ -78,7 +78,7 @@ struct Comparison {
 pub(super) fn run(
     args: &BenchPeersArgs,
     flags: &BenchFlags,
-    machine: MachineNote,
+    machine: MachineInfo,
 ) -> anyhow::Result<()> {
     let rounds = args.rounds.unwrap_or(match flags.quick {
         true => ROUNDS.1,
@@ -194,7 +194,7 @@ fn format_table(comparison: &Comparison) -> String {
     let mut cells = vec![heads.map(String::from).to_vec()];
     let mut skipped = BTreeSet::new();
     for row in &comparison.rows {
-        let number = |value: Option<f64>| value.map_or("-".into(), number);
+        let number = |value: Option<f64>| value.map_or("-".into(), format_number);
         let verdict = match (row.ratio, row.goal) {
             _ if row.skipped.is_some() => "skipped",
             (_, None) => "",
@@ -224,7 +224,7 @@ fn format_table(comparison: &Comparison) -> String {
     if load > LOAD_MAX {
         text.push_str(&format!(
             "The machine was not idle before: {} tasks wanted a core. These figures are not reliable.\n",
-            number(load)
+            format_number(load)
         ));
     }
     if comparison.quick {

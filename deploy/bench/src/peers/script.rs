@@ -128,7 +128,7 @@ impl Script {
 
 /// Runs this program's bench of a component and returns the figures. Progress goes to stderr.
 pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
-    let mut command = Command::new(process_env::program());
+    let mut command = Command::new(process_env::program_path());
     command.args(["bench", &component.name(), "--json", "-"]);
     command.args(["--threads", &flags.threads.to_string()]);
     command.args(flags.quick.then_some("--quick"));

@@ -49,7 +49,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
         rounds: 1,
         quick: true,
         threads: 2,
-        machine: MachineNote {
+        machine: MachineInfo {
             processor: "a processor".into(),
             cores: 2,
             load: 6.6,

@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_launch::run_folder::{RunFolder, Table};
-use driml_machine::error::{Usage, nearest, usage};
+use driml_machine::error::{Usage, did_you_mean, usage};
 use driml_settings::leaves;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
@@ -116,7 +116,7 @@ impl Run {
             usage!(
                 "{} has no column of numbers {column:?}{}; it has {}",
                 self.folder.metrics().display(),
-                nearest(column, numbers()),
+                did_you_mean(column, numbers()),
                 numbers().collect::<Vec<_>>().join(", ")
             )
         })

@@ -107,7 +107,7 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
         verdict => verdict(rows),
         broken => broken.collect::<Vec<_>>(),
         nearest => nearest.collect::<Vec<_>>().join(", "),
-        processor => resources::processor(),
+        processor => resources::processor_name(),
         kernels => Precision::ALL.map(describe_kernels).join("; "),
         draws => HumanCount(settings.draws).to_string(),
         seeds => settings.seeds,

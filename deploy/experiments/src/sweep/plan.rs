@@ -55,7 +55,7 @@ impl Call {
                 ..Flags::default()
             },
         };
-        Ok(resolve(&flags, &Machine::this())?.0)
+        Ok(resolve(&flags, &Machine::detect())?.0)
     }
 }
 

@@ -19,7 +19,7 @@ use driml_launch::{
 use driml_machine::{
     error::{EXIT_USAGE, usage},
     process_env,
-    resources::{MEMORY_SHARE, Machine},
+    resources::{MEMORY_SHARE_ENV, Machine},
 };
 use driml_protocol::lock_file;
 use driml_settings::flags::Flags;
@@ -50,7 +50,8 @@ pub(crate) fn make<P>(
     let mut queue = Queue {
         runs,
         jobs,
-        memory_share: Machine::this().memory_bytes / u64::from(jobs).min(plans.len() as u64).max(1),
+        memory_share: Machine::detect().memory_bytes
+            / u64::from(jobs).min(plans.len() as u64).max(1),
         waiting: VecDeque::new(),
         running: Vec::new(),
     };
@@ -79,7 +80,7 @@ pub(crate) fn make<P>(
 
 /// Returns the commit of this program's file, which `--version` prints in brackets. Another build may have replaced the file.
 fn commit() -> anyhow::Result<String> {
-    let mut command = Command::new(process_env::program());
+    let mut command = Command::new(process_env::program_path());
     let output = command.arg("--version").output();
     let output = output.context("asking this program for its version")?;
     let text = String::from_utf8_lossy(&output.stdout);
@@ -275,7 +276,7 @@ impl Queue {
     /// Builds the command that starts a run, or resumes it. A resumed run keeps its replay size and its number of threads.
     fn command(&self, plan: &PlannedRun, resumed: bool) -> Command {
         let folder = self.runs.folder(plan);
-        let mut command = Command::new(process_env::program());
+        let mut command = Command::new(process_env::program_path());
         command
             .args(["train", "--no-play"])
             .args(exit_with_this_process());
@@ -284,7 +285,7 @@ impl Queue {
         } else {
             command.arg("--run-dir").arg(folder.path());
             command.args(self.threads()).args(plan.call.args());
-            command.env(MEMORY_SHARE, self.memory_share.to_string());
+            command.env(MEMORY_SHARE_ENV, self.memory_share.to_string());
         }
         command
     }
@@ -303,7 +304,7 @@ impl Queue {
         if !is_resumable {
             return Ok(None);
         }
-        match resume::find(&folder, &Flags::default(), &Machine::this())? {
+        match resume::find(&folder, &Flags::default(), &Machine::detect())? {
             Found::Nothing(sentence) => {
                 progress.line(&sentence);
                 Ok(None)
@@ -321,7 +322,7 @@ impl Queue {
         if self.jobs == 1 {
             return Vec::new();
         }
-        let threads = (Machine::this().cores / self.jobs).max(1);
+        let threads = (Machine::detect().cores / self.jobs).max(1);
         vec!["--set".into(), format!("local.learner_threads={threads}")]
     }
 
@@ -410,7 +411,9 @@ mod tests {
         let (queue, plan) = queue(root.path());
         let share = |resumed| {
             let command = queue.command(&plan, resumed);
-            let mut shares = command.get_envs().filter(|(name, _)| *name == MEMORY_SHARE);
+            let mut shares = command
+                .get_envs()
+                .filter(|(name, _)| *name == MEMORY_SHARE_ENV);
             shares.next().map(|(_, value)| value == Some("7".as_ref()))
         };
         assert_eq!([share(false), share(true)], [Some(true), None]);

@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 
 use driml_protocol::tls::{self, Credentials, Role};
 
-use super::fact::{Fact, Found, State};
+use super::fact::{Fact, Finding, State};
 
 /// A certificate that expires within this time gets the state `Note`.
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
@@ -25,22 +25,22 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let name = |entry: fs::DirEntry| {
         let path = entry.path();
         let extension = path.extension();
-        let is_one = extension.is_some_and(|it| it == "pem" || it == "key");
-        let name = path.file_stem().filter(|it| is_one && *it != "ca")?;
+        let is_tls_file = extension.is_some_and(|it| it == "pem" || it == "key");
+        let name = path.file_stem().filter(|it| is_tls_file && *it != "ca")?;
         name.to_str().map(str::to_owned)
     };
     let names: BTreeSet<_> = entries.flatten().filter_map(name).collect();
     let (mut facts, mut roles) = (Vec::new(), Vec::new());
-    let mut note = |what: &str, found: Found| facts.push(Fact::new(what, found));
+    let mut add = |what: &str, found: Finding| facts.push(Fact::new(what, found));
     for name in &names {
         match name.parse::<Role>() {
             Ok(role) => roles.push(role),
-            Err(e) => note("tls other", (State::Note, format!("{dir}/{name}.*: {e}"))),
+            Err(e) => add("tls other", (State::Note, format!("{dir}/{name}.*: {e}"))),
         }
     }
     if roles.is_empty() {
         let text = format!("{dir} has none: `deploy/certs.sh {dir}` makes them");
-        note("tls folder", (State::Missing, text));
+        add("tls folder", (State::Missing, text));
     }
     roles.sort_by_key(|role| match role {
         Role::ReplayServer => (0, 0),
@@ -52,21 +52,21 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     for role in roles {
         let what = format!("tls {role}");
         match Credentials::examine(folder, role) {
-            Err(e) => note(&what, (State::Missing, e.to_string())),
-            Ok(it) => match (complaint(&it), role) {
-                (Some(text), _) => note(&what, (State::Note, text)),
+            Err(e) => add(&what, (State::Missing, e.to_string())),
+            Ok(it) => match (advice(&it), role) {
+                (Some(text), _) => add(&what, (State::Note, text)),
                 (None, Role::Actor(number)) => actors.push((number, it)),
                 (None, Role::ReplayServer) => {
-                    let (until, names) = (good_until(&it), it.hosts.join(", "));
+                    let (until, names) = (validity(&it), it.hosts.join(", "));
                     let text = format!("{until}, for {names}: connect to one of these names");
-                    note(&what, (State::Ok, text));
+                    add(&what, (State::Ok, text));
                 }
-                (None, _) => note(&what, (State::Ok, good_until(&it))),
+                (None, _) => add(&what, (State::Ok, validity(&it))),
             },
         }
     }
-    if let Some(text) = all_well(&actors) {
-        note("tls actors", (State::Ok, text));
+    if let Some(text) = describe_valid_actors(&actors) {
+        add("tls actors", (State::Ok, text));
     }
     // The authority's certificate is checked with each process's certificate.
     let key = tls::authority_path(folder).with_extension("key");
@@ -75,13 +75,13 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
             "{} is here, with which any certificate can be made: leave it on the machine on which it was made, and copy it to no other",
             key.display()
         );
-        note("tls authority", (State::Note, text));
+        add("tls authority", (State::Note, text));
     }
     facts
 }
 
 /// What the user should do about a certificate that is valid; none if nothing.
-fn complaint(credentials: &Credentials) -> Option<String> {
+fn advice(credentials: &Credentials) -> Option<String> {
     let (role, key) = (credentials.role, credentials.key.display());
     let left = credentials.expires_in();
     if credentials.is_key_open() {
@@ -104,16 +104,16 @@ fn complaint(credentials: &Credentials) -> Option<String> {
     }
 }
 
-fn good_until(credentials: &Credentials) -> String {
+fn validity(credentials: &Credentials) -> String {
     let days = credentials.expires_in().as_secs() / DAY_S;
     format!("good until {} ({days} days)", credentials.expires_on)
 }
 
 /// One text for all actors that have no complaint.
-fn all_well(actors: &[(u32, Credentials)]) -> Option<String> {
+fn describe_valid_actors(actors: &[(u32, Credentials)]) -> Option<String> {
     let (first, last) = (actors.first()?.0, actors.last()?.0);
     let (_, soonest) = actors.iter().min_by_key(|(_, it)| it.expires_in())?;
-    let until = good_until(soonest);
+    let until = validity(soonest);
     Some(match actors.len() {
         1 => format!("{first}: {until}"),
         count => format!("{count} of them, from {first} to {last}: {until}"),

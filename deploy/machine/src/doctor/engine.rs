@@ -3,10 +3,10 @@
 
 use procgen_sys::{Engine, ProcgenError};
 
-use super::fact::{Found, State};
+use super::fact::{Finding, State};
 
 /// Whether Procgen's engine is in the cache folder and loads.
-pub(super) fn found() -> Found {
+pub(super) fn check_engine() -> Finding {
     match Engine::locate() {
         Ok(engine) => {
             let library = engine.library().display();
@@ -15,13 +15,13 @@ pub(super) fn found() -> Found {
                 Err(why) => (State::Missing, why.to_string()),
             }
         }
-        Err(ProcgenError::Missing { reason, .. }) => not_there(&reason, Engine::source()),
+        Err(ProcgenError::Missing { reason, .. }) => not_installed(&reason, Engine::source()),
         Err(why) => (State::Missing, why.to_string()),
     }
 }
 
 /// The fact for an engine that is not installed; `source` is where it would be downloaded from.
-fn not_there(reason: &str, source: Result<String, ProcgenError>) -> Found {
+fn not_installed(reason: &str, source: Result<String, ProcgenError>) -> Finding {
     match source {
         Ok(source) => {
             let text = format!(
@@ -44,7 +44,7 @@ mod tests {
             (Ok("`pip`".into()), State::Note, "`driml procgen install`"),
             (Err(no_pip), State::Missing, "python3-pip"),
         ] {
-            let found = not_there("it is not installed", source);
+            let found = not_installed("it is not installed", source);
             assert!(found.0 == state && found.1.contains(text), "{found:?}");
         }
     }

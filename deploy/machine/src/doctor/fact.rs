@@ -17,7 +17,7 @@ pub(super) enum State {
 }
 
 /// The state of a fact and its text, which says what to do if something should change.
-pub(super) type Found = (State, String);
+pub(super) type Finding = (State, String);
 
 /// The result of the check of one thing that a run needs.
 #[derive(Debug, Serialize)]
@@ -29,7 +29,7 @@ pub(super) struct Fact {
 }
 
 impl Fact {
-    pub(super) fn new(what: impl Into<String>, (state, text): Found) -> Self {
+    pub(super) fn new(what: impl Into<String>, (state, text): Finding) -> Self {
         Self {
             state,
             what: what.into(),

@@ -7,7 +7,7 @@ use driml_model::{Precision, describe_kernels};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
-use super::fact::{Fact, Found, State};
+use super::fact::{Fact, Finding, State};
 use crate::{
     resources::{LEARNER_BYTES, Machine},
     units::gib,
@@ -27,12 +27,12 @@ const FRAME_BYTES: u64 = 64 * 64 * 3;
 
 /// All facts about the host. `runs` is the folder that would hold the run folders.
 pub(super) fn facts(runs: &Path) -> Vec<Fact> {
-    let machine = Machine::this();
+    let machine = Machine::detect();
     let [f32, bf16] = Precision::ALL.map(describe_kernels);
     let kernels = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
     let all = [
         ("cores", cores(&machine)),
-        ("vectors", vectors(floats_at_once())),
+        ("vectors", vectors(vector_lanes())),
         ("kernels", (State::Ok, kernels)),
         ("memory", memory(&machine)),
         ("shared memory", shared_memory(shared_memory::free_bytes())),
@@ -42,8 +42,8 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     all.map(|(what, found)| Fact::new(what, found)).into()
 }
 
-fn cores(machine: &Machine) -> Found {
-    let (cores, actors) = (machine.cores, machine.actors());
+fn cores(machine: &Machine) -> Finding {
+    let (cores, actors) = (machine.cores, machine.default_actors());
     let text = format!("{cores}, all of them for the learner; --actors is {actors} unless given");
     match cores {
         0 | 1 => (State::Note, format!("{text}; all processes share it")),
@@ -53,7 +53,7 @@ fn cores(machine: &Machine) -> Found {
 
 /// Number of f32 lanes of the vector instructions that the kernels can use; 1 without AVX2 and FMA.
 #[cfg(target_arch = "x86_64")]
-fn floats_at_once() -> Option<u32> {
+fn vector_lanes() -> Option<u32> {
     let has_avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
     Some(match (is_x86_feature_detected!("avx512f"), has_avx2) {
         (true, _) => 16,
@@ -63,12 +63,12 @@ fn floats_at_once() -> Option<u32> {
 }
 
 #[cfg(not(target_arch = "x86_64"))]
-fn floats_at_once() -> Option<u32> {
+fn vector_lanes() -> Option<u32> {
     None
 }
 
-fn vectors(at_once: Option<u32>) -> Found {
-    match at_once {
+fn vectors(lanes: Option<u32>) -> Finding {
+    match lanes {
         None => {
             let arch = std::env::consts::ARCH;
             let text = format!("not x86-64 but {arch}: it was never measured there");
@@ -86,7 +86,7 @@ fn vectors(at_once: Option<u32>) -> Found {
     }
 }
 
-fn memory(machine: &Machine) -> Found {
+fn memory(machine: &Machine) -> Finding {
     let (free, replay) = (machine.memory_bytes, machine.replay_bytes(LEARNER_BYTES));
     let text = format!(
         "{} free; a replay sized by the machine takes {}, {:.2} million of Procgen's frames",
@@ -103,7 +103,7 @@ fn memory(machine: &Machine) -> Found {
     (state, text + advice)
 }
 
-fn shared_memory(free: Result<u64, String>) -> Found {
+fn shared_memory(free: Result<u64, String>) -> Finding {
     let folder = shared_memory::FOLDER;
     let why = match free {
         Ok(free) if free >= SHARED_MEMORY_ENOUGH => {
@@ -120,7 +120,7 @@ fn shared_memory(free: Result<u64, String>) -> Found {
 }
 
 /// `limit` is the number of bytes of shared memory that a process may lock; none if unlimited. zenoh locks what it shares.
-fn locked_memory(limit: Option<u64>) -> Found {
+fn locked_memory(limit: Option<u64>) -> Finding {
     match limit {
         None => (State::Ok, "no limit (`ulimit -l`)".into()),
         Some(limit) if limit >= SHARED_MEMORY_ENOUGH => {
@@ -139,29 +139,29 @@ fn locked_memory(limit: Option<u64>) -> Found {
     }
 }
 
-fn disk(runs: &Path) -> Found {
+fn disk(runs: &Path) -> Finding {
     let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
-    let there = runs.ancestors().find(|it| it.is_dir()).unwrap_or(&runs);
-    let elsewhere = "; --run-dir puts a run elsewhere";
-    let folder = there.display();
-    match (free(there), tempfile::tempfile_in(there)) {
+    let existing = runs.ancestors().find(|it| it.is_dir()).unwrap_or(&runs);
+    let hint = "; --run-dir puts a run elsewhere";
+    let folder = existing.display();
+    match (free_disk_bytes(existing), tempfile::tempfile_in(existing)) {
         (Ok(free), Ok(_)) => {
             let text = format!("{} free in {folder}", gib(free));
             match free {
-                0..DISK_MIN => (State::Missing, text + elsewhere),
-                DISK_MIN..DISK_ENOUGH => (State::Note, text + elsewhere),
+                0..DISK_MIN => (State::Missing, text + hint),
+                DISK_MIN..DISK_ENOUGH => (State::Note, text + hint),
                 _ => (State::Ok, text),
             }
         }
         (Err(why), _) => (State::Missing, why),
         (_, Err(why)) => (
             State::Missing,
-            format!("{folder} cannot be written to: {why}{elsewhere}"),
+            format!("{folder} cannot be written to: {why}{hint}"),
         ),
     }
 }
 
-fn free(folder: &Path) -> Result<u64, String> {
+fn free_disk_bytes(folder: &Path) -> Result<u64, String> {
     let disk = statvfs(folder).map_err(|e| format!("{}: {e}", folder.display()))?;
     Ok(disk.blocks_available().saturating_mul(disk.fragment_size()))
 }
@@ -207,7 +207,7 @@ mod tests {
     fn a_folder_that_is_not_there_yet_is_judged_by_the_one_above() {
         let folder = tempfile::tempdir().unwrap();
         let (_, text) = disk(&folder.path().join("runs/one"));
-        let there = folder.path().display().to_string();
-        assert!(text.contains(&there) && !text.contains("runs"), "{text}");
+        let existing = folder.path().display().to_string();
+        assert!(text.contains(&existing) && !text.contains("runs"), "{text}");
     }
 }

@@ -11,7 +11,7 @@ use std::path::Path;
 use anyhow::ensure;
 
 use self::fact::{Fact, State};
-use crate::device::{self, Gpu};
+use crate::device::{self, GpuCheck};
 
 /// The facts about this machine: for training on the CPU, for CUDA, and about the certificates.
 #[derive(Debug)]
@@ -24,14 +24,14 @@ pub struct Report {
 /// Examines this machine. `run_dir` is where runs would be written; `tls_dir` holds the certificates, if any.
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
-    cpu.push(Fact::new("Procgen", engine::found()));
+    cpu.push(Fact::new("Procgen", engine::check_engine()));
     // Training on the CPU needs no GPU.
-    let of_gpu = |(name, found): Gpu| match found {
+    let gpu_fact = |(name, found): GpuCheck| match found {
         Ok(text) => Fact::new(name, (State::Ok, text)),
         Err(why) => Fact::new(name, (State::Missing, why)),
     };
     let cuda = match device::gpus() {
-        Ok(gpus) => gpus.into_iter().map(of_gpu).collect(),
+        Ok(gpus) => gpus.into_iter().map(gpu_fact).collect(),
         Err(why) => vec![Fact::new("cuda", (State::Note, why))],
     };
     Report {
@@ -44,10 +44,9 @@ pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
 impl Report {
     /// One line per fact, and a last line that says which devices this machine can train on.
     pub fn describe(&self) -> String {
-        let lines = self.all().map(|fact| format!("{fact}\n"));
-        let lines: String = lines.collect();
-        let lacks_nothing = self.cpu.iter().all(|fact| fact.state != State::Missing);
-        let verdict = match (lacks_nothing, self.is_ready_for_cuda()) {
+        let lines: String = self.facts().map(|fact| format!("{fact}\n")).collect();
+        let is_cpu_ready = self.cpu.iter().all(|fact| fact.state != State::Missing);
+        let verdict = match (is_cpu_ready, self.is_ready_for_cuda()) {
             (true, true) => "This machine can train on the CPU and with --device cuda.",
             (true, false) => "This machine can train on the CPU, not with --device cuda.",
             (false, _) => "This machine cannot train yet.",
@@ -57,11 +56,10 @@ impl Report {
 
     /// The facts as JSON.
     pub fn json(&self) -> anyhow::Result<String> {
-        let all: Vec<_> = self.all().collect();
-        Ok(serde_json::to_string_pretty(&all)? + "\n")
+        Ok(serde_json::to_string_pretty(&self.facts().collect::<Vec<_>>())? + "\n")
     }
 
-    fn all(&self) -> impl Iterator<Item = &Fact> {
+    fn facts(&self) -> impl Iterator<Item = &Fact> {
         self.cpu.iter().chain(&self.cuda).chain(&self.certificates)
     }
 
@@ -74,11 +72,11 @@ impl Report {
     /// something is missing that training on a GPU needs.
     pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
         let is_missing = |state| state == State::Missing;
-        let missing = lacking(&self.cpu, is_missing);
+        let missing = names_where(&self.cpu, is_missing);
         ensure!(missing.is_empty(), "training on the CPU needs: {missing}");
-        let bad = lacking(&self.certificates, is_missing);
+        let bad = names_where(&self.certificates, is_missing);
         ensure!(bad.is_empty(), "these certificates cannot be used: {bad}");
-        let missing = lacking(&self.cuda, |state| state != State::Ok);
+        let missing = names_where(&self.cuda, |state| state != State::Ok);
         ensure!(
             !cuda || self.is_ready_for_cuda(),
             "--device cuda needs: {missing}"
@@ -88,7 +86,7 @@ impl Report {
 }
 
 /// The names of the facts whose state is bad, joined by commas.
-fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
+fn names_where(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
     let bad = facts.iter().filter(|fact| bad(fact.state));
     let names: Vec<_> = bad.map(|fact| fact.what.as_str()).collect();
     names.join(", ")

@@ -73,7 +73,7 @@ impl Setting {
 
     /// Creates two agents with the same scaled initial weights: one with our kernels, one with candle's.
     fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
-        let run = of_names("paper", "chain", "driml-fix", &SETS, &Machine::this())?;
+        let run = of_names("paper", "chain", "driml-fix", &SETS, &Machine::detect())?;
         let model = ModelConfig {
             height: 20,
             width: 20,

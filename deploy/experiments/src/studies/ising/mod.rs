@@ -27,7 +27,7 @@ const LOSS_WINDOW: usize = 10;
 fn task(settings: &Settings) -> anyhow::Result<Task> {
     let sets: Vec<_> = settings.sets.iter().map(String::as_str).collect();
     // `driml-fix` gives DIM with k = 1. Nothing else of the agent is used here.
-    let config = of_names("paper", "ising", "driml-fix", &sets, &Machine::this())?;
+    let config = of_names("paper", "ising", "driml-fix", &sets, &Machine::detect())?;
     // The experiment steps the world directly, and the world has full-size frames.
     let config = config.with_whole_frames()?;
     let WorldConfig::Ising(world) = config.world else {

@@ -8,7 +8,7 @@ use driml_learner::{
     Agent, Compute, NetworkParameters, checkpoint,
     parity::deviation::{QDeviation, REFERENCE, UpdateDeviation},
 };
-use driml_machine::effort::{Effort, Work};
+use driml_machine::speed_meter::{SpeedMeter, Work};
 use driml_model::PolicyNetwork;
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
@@ -60,10 +60,10 @@ fn side(config: &RunConfig) -> anyhow::Result<Side> {
 
 /// Times `level` and `base` in turns, for some seconds each, less in the smoke length.
 pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow::Result<Measured> {
-    let effort = Effort::new(smoke);
+    let meter = SpeedMeter::new(smoke);
     let (from, to) = (side(base)?, side(level)?);
-    let updates = effort.rates_in_turn(&mut [from.update, to.update])?;
-    let acts = effort.rates_in_turn(&mut [from.act, to.act])?;
+    let updates = meter.rates_in_turn(&mut [from.update, to.update])?;
+    let acts = meter.rates_in_turn(&mut [from.act, to.act])?;
     let gain =
         |rates: &[f64], from: usize, to: usize| rates[1] * to as f64 / (rates[0] * from as f64);
     let run = &level.run;

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use driml_envs::WorldName;
-use driml_machine::error::{Usage, nearest, usage};
+use driml_machine::error::{Usage, did_you_mean, usage};
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
@@ -262,7 +262,7 @@ fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Ve
     if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
         return Err(usage!(
             "unknown dial {unknown:?} in this world{}; --dials takes {}",
-            nearest(unknown, known.iter().copied()),
+            did_you_mean(unknown, known.iter().copied()),
             known.join(", ")
         ));
     }

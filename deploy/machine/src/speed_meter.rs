@@ -8,7 +8,7 @@ pub type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
 
 /// How long each piece of work is measured.
 #[derive(Clone, Copy, Debug)]
-pub struct Effort {
+pub struct SpeedMeter {
     /// Warm-up calls, which are not timed.
     warmup_calls: u32,
     /// Minimum number of timed calls.
@@ -17,7 +17,7 @@ pub struct Effort {
     time_min: Duration,
 }
 
-impl Effort {
+impl SpeedMeter {
     /// At least 4 s of timed calls, or 0.2 s if `quick`.
     pub const fn new(quick: bool) -> Self {
         let (warmup_calls, calls_min, time_min) = match quick {
@@ -60,7 +60,7 @@ impl Effort {
             works.iter_mut().try_for_each(|work| work())?;
         }
         let (first, mut calls, mut seconds) = (Instant::now(), 0, vec![Vec::new(); works.len()]);
-        while calls < self.calls_min || !self.is_spent(first) {
+        while calls < self.calls_min || !self.is_long_enough(first) {
             for (work, seconds) in works.iter_mut().zip(&mut seconds) {
                 let started = Instant::now();
                 work()?;
@@ -72,7 +72,7 @@ impl Effort {
     }
 
     /// Whether a measurement that began at `started` has lasted long enough.
-    pub fn is_spent(&self, started: Instant) -> bool {
+    pub fn is_long_enough(&self, started: Instant) -> bool {
         started.elapsed() >= self.time_min
     }
 }
@@ -104,7 +104,7 @@ mod tests {
 
     #[test]
     fn works_take_turns_and_calls_are_counted_after_the_warm_up() {
-        let effort = Effort {
+        let meter = SpeedMeter {
             warmup_calls: 2,
             calls_min: 3,
             time_min: Duration::ZERO,
@@ -117,10 +117,10 @@ mod tests {
                 Ok(())
             })
         };
-        let durations = effort.durations(&mut [work('a'), work('b')]).unwrap();
+        let durations = meter.durations(&mut [work('a'), work('b')]).unwrap();
         let counts: Vec<_> = durations.iter().map(Vec::len).collect();
         assert_eq!(counts, [3, 3]);
         assert_eq!(*calls.borrow(), "ababababab");
-        assert!(effort.rate_by_median(|| anyhow::bail!("broken")).is_err());
+        assert!(meter.rate_by_median(|| anyhow::bail!("broken")).is_err());
     }
 }
