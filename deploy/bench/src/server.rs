@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, bail, ensure};
 use driml_actor::{ActorSettings, Delivery, DeliveryLimits};
-use driml_launch::{endpoint::NAMESPACE, managed_process::ManagedProcess};
+use driml_launch::{endpoint::DEFAULT_NAMESPACE, managed_process::ManagedProcess};
 use driml_learner::{
     LearnerConfig,
     remote::batch_source::{BatchSource, Counters, NextBatch, Requests},
@@ -74,7 +74,7 @@ impl Server {
             args.extend([*flag, dir]);
         }
         let process = subprocess::start("replay-server", &args, &wire.endpoint, &sets, folder)?;
-        let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
+        let keys = Keys::new(DEFAULT_NAMESPACE).map_err(anyhow::Error::msg)?;
         let session = wire.open(&keys, Role::Observer)?;
         let run_info = join::run_info(&session, &keys, &Shutdown::default())?
             .context("this client was not told to stop")?;

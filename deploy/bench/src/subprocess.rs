@@ -7,7 +7,7 @@ use anyhow::Context;
 use driml_launch::{
     console::Screen,
     endpoint::wait_until_listening,
-    managed_process::{ManagedProcess, THREADS},
+    managed_process::{ManagedProcess, THREADS_VARIABLE},
 };
 use driml_machine::process_env;
 use driml_protocol::Shutdown;
@@ -18,10 +18,10 @@ use crate::settings;
 /// in the same process with the same arguments.
 pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
     let threads = threads.to_string();
-    if std::env::var(THREADS).is_ok_and(|it| it == threads) {
+    if std::env::var(THREADS_VARIABLE).is_ok_and(|it| it == threads) {
         return Ok(());
     }
-    let again = process_env::restart_with([(THREADS, threads.as_str())]);
+    let again = process_env::restart_with([(THREADS_VARIABLE, threads.as_str())]);
     again.context("starting this program again with other threads")
 }
 

@@ -200,7 +200,7 @@ impl Run {
 
     /// Requests the statuses; `None` while a process does not answer, as they start after the replay server and end before it.
     fn sample_status(&mut self) -> anyhow::Result<Option<StatusSample>> {
-        if self.launcher.end().is_some() {
+        if self.launcher.exit_status().is_some() {
             bail!("{}", self.launcher.exit_report());
         }
         let answers = self.poller.ask_replay();
@@ -248,7 +248,7 @@ impl Run {
         match (first, last) {
             (Some(first), Some(last)) => Ok([first, last]),
             _ => {
-                let failed = self.launcher.end().is_some_and(|end| !end.success());
+                let failed = self.launcher.exit_status().is_some_and(|it| !it.success());
                 ensure!(!failed, "{}", self.launcher.exit_report());
                 bail!("the run was over within {WARMUP_UPDATES} updates: give it more --frames")
             }

@@ -14,7 +14,7 @@ use driml_machine::error::{Usage, usage};
 use driml_protocol::{Shutdown, reach};
 
 /// The default prefix of a run's keys.
-pub const NAMESPACE: &str = "driml";
+pub const DEFAULT_NAMESPACE: &str = "driml";
 
 /// The longest path of a unix socket, bytes: `sun_path` of `unix(7)`, whose last byte is 0.
 pub(crate) const SOCKET_PATH_MAX: usize = 107;
@@ -24,10 +24,10 @@ pub(crate) const ADDRESS_ENDS: [char; 2] = ['#', '?'];
 /// How long the replay server may take until it listens.
 const LISTEN_MAX: Duration = Duration::from_secs(60);
 /// How often to check whether the replay server listens.
-const LOOK: Duration = Duration::from_millis(20);
+const LISTEN_POLL: Duration = Duration::from_millis(20);
 
 /// Rejects endpoints to connect to that zenoh cannot open, or that do not fit `--tls-dir`.
-pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
+pub fn check_connect_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
     endpoints.iter().try_for_each(|it| {
         check_endpoint(it, tls)?;
         if it.starts_with("quic/[") {
@@ -39,12 +39,16 @@ pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
     })
 }
 
-/// Rejects endpoints to listen on that zenoh cannot open or that do not fit `--tls-dir`. Without `--allow-insecure`, also rejects
+/// Rejects endpoints to listen on that zenoh cannot open or that do not fit `--tls-dir`. Without `--allow-allow_insecure`, also rejects
 /// endpoints that other machines can reach without a certificate.
-pub fn check_listening(endpoints: &[String], tls: bool, allow_insecure: bool) -> Result<(), Usage> {
+pub fn check_listen_endpoints(
+    endpoints: &[String],
+    tls: bool,
+    allow_insecure: bool,
+) -> Result<(), Usage> {
     for endpoint in endpoints {
         check_endpoint(endpoint, tls)?;
-        if !is_open(endpoint) {
+        if !is_exposed(endpoint) {
             continue;
         }
         if !allow_insecure {
@@ -66,8 +70,8 @@ pub fn check_listening(endpoints: &[String], tls: bool, allow_insecure: bool) ->
 pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
     for endpoint in endpoints {
         let path = endpoint.strip_prefix("unixsock-stream/");
-        let there = path.and_then(|path| fs::symlink_metadata(path).ok());
-        if there.is_some_and(|it| !it.file_type().is_socket()) {
+        let existing = path.and_then(|path| fs::symlink_metadata(path).ok());
+        if existing.is_some_and(|it| !it.file_type().is_socket()) {
             return Err(usage!(
                 "cannot listen on {endpoint}: what is there is not a socket. Choose another path, with --listen for this command and \
                  --connect for all others"
@@ -100,7 +104,7 @@ pub fn wait_until_listening(
         if Instant::now() > deadline {
             return Err(e).context("waiting for the replay server");
         }
-        if interrupted.wait_timeout(LOOK) {
+        if interrupted.wait_timeout(LISTEN_POLL) {
             return Ok(false);
         }
     }
@@ -112,23 +116,23 @@ fn is_taken<T>(bound: std::io::Result<T>) -> bool {
 }
 
 fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
-    let has_host = |address: &str| {
+    let has_host_and_port = |address: &str| {
         let parts = address.rsplit_once(':');
         let is_port = |port: &str| port.parse::<u16>().is_ok_and(|port| port > 0);
         parts.is_some_and(|(host, port)| !host.is_empty() && is_port(port))
     };
     match endpoint.split_once('/') {
-        Some(("tcp", address)) if tls && has_host(address) => Err(usage!(
+        Some(("tcp", address)) if tls && has_host_and_port(address) => Err(usage!(
             "{endpoint} is not encrypted: with --tls-dir it is quic/{address}"
         )),
-        Some(("tls", address)) if has_host(address) => Err(usage!(
+        Some(("tls", address)) if has_host_and_port(address) => Err(usage!(
             "{endpoint}: TLS over TCP is not supported, because zenoh's may break a connection or crash the process \
              (https://github.com/eclipse-zenoh/zenoh/issues/2557): with --tls-dir it is quic/{address}, the TLS of QUIC over UDP"
         )),
-        Some(("quic", address)) if !tls && has_host(address) => Err(usage!(
+        Some(("quic", address)) if !tls && has_host_and_port(address) => Err(usage!(
             "{endpoint} needs certificates: add --tls-dir DIR, which deploy/certs.sh makes"
         )),
-        Some(("tcp" | "quic", address)) if has_host(address) => Ok(()),
+        Some(("tcp" | "quic", address)) if has_host_and_port(address) => Ok(()),
         Some(("unixsock-stream", path)) if path.len() > SOCKET_PATH_MAX => Err(usage!(
             "{endpoint}: the path of a unix socket has at most {SOCKET_PATH_MAX} bytes, and this one has {}: choose a shorter one, such \
              as /tmp/driml.sock",
@@ -144,7 +148,7 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
 }
 
 /// Whether other machines may reach an endpoint without a certificate.
-fn is_open(endpoint: &str) -> bool {
+fn is_exposed(endpoint: &str) -> bool {
     let Some(("tcp", address)) = endpoint.split_once('/') else {
         return false;
     };
@@ -162,7 +166,7 @@ mod tests {
     use super::*;
 
     fn listening(endpoint: &str, tls: bool, allow_insecure: bool) -> Result<(), String> {
-        let checked = check_listening(&[endpoint.into()], tls, allow_insecure);
+        let checked = check_listen_endpoints(&[endpoint.into()], tls, allow_insecure);
         checked.map_err(|e| e.to_string())
     }
 
@@ -200,7 +204,7 @@ mod tests {
             ("tls/host:1", true, quic),
             ("tls/host:1", true, "issues/2557"),
         ] {
-            let checked = check_endpoints(&[endpoint.into()], tls);
+            let checked = check_connect_endpoints(&[endpoint.into()], tls);
             let found = checked.map_or_else(|e| e.to_string(), |()| String::new());
             let fits = found.is_empty() == said.is_empty() && found.contains(said);
             assert!(fits, "{endpoint}: {found}");

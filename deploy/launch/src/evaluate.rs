@@ -18,16 +18,16 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    chosen::{Weights, Which, checkpoint_at, config_of},
+    checkpoint_choice::{CheckpointChoice, WeightsChoice, checkpoint_path, read_config},
     run_folder::RunFolder,
 };
 
 /// Default probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 pub const EPSILON: f64 = 0.001;
-const COPIES_MAX: usize = 32;
+const ENVS_MAX: usize = 32;
 /// Steps of each environment, per round of episodes, after which an evaluation fails. An Atari episode has up to 27,000 steps; a
 /// Procgen episode whose levels follow one another has no bound.
-const STEPS_A_ROUND_MAX: u64 = 200_000;
+const STEPS_PER_ROUND_MAX: u64 = 200_000;
 /// The stream of the policy's random generator. A world with the same seed gives its environments streams that count from 0.
 const POLICY_STREAM: u64 = u64::MAX;
 
@@ -44,7 +44,7 @@ pub enum Levels {
 
 /// The policy that chooses the actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Who {
+pub enum PolicyKind {
     /// The run's network.
     Agent,
     /// A random policy, with the same probability for each action.
@@ -67,20 +67,25 @@ pub struct Player {
 
 impl Player {
     /// Loads a checkpoint from a run's folder.
-    pub fn load_at(folder: &RunFolder, which: Which, weights: Weights) -> anyhow::Result<Self> {
-        Self::read(config_of(folder)?, &checkpoint_at(folder, which)?, weights)
+    pub fn load(
+        folder: &RunFolder,
+        choice: CheckpointChoice,
+        weights: WeightsChoice,
+    ) -> anyhow::Result<Self> {
+        let config = read_config(folder)?;
+        Self::load_checkpoint(config, &checkpoint_path(folder, choice)?, weights)
     }
 
-    pub(crate) fn read(
+    pub(crate) fn load_checkpoint(
         config: RunConfig,
         checkpoint: &Path,
-        weights: Weights,
+        weights: WeightsChoice,
     ) -> anyhow::Result<Self> {
         let (model, update) = (&config.model, &config.learner.update);
         let hash = config.run.hash();
         let loaded = checkpoint::load(checkpoint, model, update, &Compute::CPU, hash)?;
         let mut agent = loaded.agent;
-        let is_averaged = weights == Weights::Average && agent.copy_average_to_online()?;
+        let is_averaged = weights == WeightsChoice::Average && agent.copy_average_to_online()?;
         Ok(Self {
             network: agent.online().clone(),
             updates: agent.updates(),
@@ -100,7 +105,7 @@ impl Player {
 
     /// The same player with f32 weights and arithmetic, whatever the actors of the run use.
     #[must_use]
-    pub fn exact(mut self) -> Self {
+    pub fn with_f32(mut self) -> Self {
         self.config.learner.publish_dtype = WeightDtype::F32;
         self.config.actor.precision = Precision::F32;
         self
@@ -110,18 +115,18 @@ impl Player {
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.
-    pub fn returns(
+    pub fn play_levels(
         &self,
-        who: Who,
-        which: Levels,
+        policy_kind: PolicyKind,
+        levels: Levels,
         episodes: u32,
         seed: u64,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        let Ok(world) = levels(&self.config.world, which) else {
+        let Ok(world) = world_with_levels(&self.config.world, levels) else {
             return Ok(None);
         };
-        let watch = &mut until(|| false);
-        let played = self.play_watched(who, &world, episodes as usize, seed, watch);
+        let watch = &mut stop_when(|| false);
+        let played = self.play(policy_kind, &world, episodes as usize, seed, watch);
         played.map(Some)
     }
 
@@ -130,32 +135,32 @@ impl Player {
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.
-    pub fn play_watched(
+    pub fn play(
         &self,
-        who: Who,
+        policy_kind: PolicyKind,
         world: &WorldConfig,
         episodes: usize,
         seed: u64,
         watch: Watch<'_>,
     ) -> anyhow::Result<Vec<f64>> {
         let config = &self.config;
-        let mut policy: Box<dyn Policy> = match who {
-            Who::Agent => {
+        let mut policy: Box<dyn Policy> = match policy_kind {
+            PolicyKind::Agent => {
                 let (enlarge, precision) = (self.enlarge()?, config.actor.precision);
                 let dtype = config.learner.publish_dtype;
                 let weights = self.network.to_safetensors_as(dtype, |it| !is_dim(it))?;
                 let policy = NetworkPolicy::new(&config.model, enlarge, &weights, precision)?;
                 Box::new(policy)
             }
-            Who::Random => Box::new(random_policy(config)?),
+            PolicyKind::Random => Box::new(random_policy(config)?),
         };
         let (policy, epsilon) = (policy.as_mut(), self.epsilon);
-        play_with(config, policy, world, episodes, epsilon, seed, watch)
+        play_episodes(config, policy, world, episodes, epsilon, seed, watch)
     }
 
-    /// The number of environments that play `episodes` episodes: one each, up to `COPIES_MAX`.
+    /// The number of environments that play `episodes` episodes: one each, up to `ENVS_MAX`.
     pub fn envs(episodes: usize) -> usize {
-        episodes.min(COPIES_MAX)
+        episodes.min(ENVS_MAX)
     }
 
     /// A viewer that shows what the network computes for the states it sees.
@@ -175,19 +180,19 @@ impl Player {
 
     fn enlarge(&self) -> anyhow::Result<Option<Resizer>> {
         let config = &self.config;
-        Ok(config.input.resizer(sent(config), &config.model)?)
+        Ok(config.input.resizer(frame_size(config), &config.model)?)
     }
 }
 
 /// Plays whole episodes with a random policy in a run's world, on the training levels. Returns their returns. Needs no checkpoint.
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
-    let world = levels(&config.world, Levels::Train)?;
-    let (policy, watch) = (&mut random_policy(config)?, &mut until(|| false));
-    play_with(config, policy, &world, episodes, EPSILON, seed, watch)
+    let world = world_with_levels(&config.world, Levels::Train)?;
+    let (policy, watch) = (&mut random_policy(config)?, &mut stop_when(|| false));
+    play_episodes(config, policy, &world, episodes, EPSILON, seed, watch)
 }
 
 /// A watcher that ends the play once `is_over` returns true.
-pub(crate) fn until(
+pub(crate) fn stop_when(
     is_over: impl Fn() -> bool,
 ) -> impl FnMut(&Step<'_>, &[f64]) -> ControlFlow<()> {
     move |_: &Step<'_>, _: &[f64]| match is_over() {
@@ -200,7 +205,7 @@ fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
     Ok(RandomPolicy::new(u8::try_from(config.run.num_actions)?))
 }
 
-fn play_with(
+fn play_episodes(
     config: &RunConfig,
     policy: &mut dyn Policy,
     world: &WorldConfig,
@@ -214,17 +219,17 @@ fn play_with(
         frame_stack: config.run.frame_stack as usize,
         epsilon,
         episodes,
-        steps_max: episodes.div_ceil(envs) as u64 * STEPS_A_ROUND_MAX,
+        steps_max: episodes.div_ceil(envs) as u64 * STEPS_PER_ROUND_MAX,
     };
     let actions = world.actions(config.actor.actions);
-    let world = RestrictedWorld::of(world.build(envs, seed, 0)?, actions, sent(config))?;
+    let world = RestrictedWorld::of(world.build(envs, seed, 0)?, actions, frame_size(config))?;
     let rng = policy_rng(seed);
     episode_returns(world, policy, evaluation, rng, watch)
         .with_context(|| format!("playing {}", config.run.world))
 }
 
 /// Rows and columns of a frame as actors send it.
-const fn sent(config: &RunConfig) -> (usize, usize) {
+const fn frame_size(config: &RunConfig) -> (usize, usize) {
     let spec = &config.run;
     (spec.frame_height as usize, spec.frame_width as usize)
 }
@@ -240,7 +245,7 @@ pub struct Viewer {
 
 impl Viewer {
     /// What the network computes for the states of a step.
-    pub fn look(&mut self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
+    pub fn compute(&mut self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
         let Some(enlarge) = &self.enlarge else {
             return self.insight.evaluate(states);
         };
@@ -260,7 +265,7 @@ fn policy_rng(seed: u64) -> ChaCha8Rng {
 }
 
 /// The world with the given levels.
-pub fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
+pub fn world_with_levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
     let levels = match levels {
         Levels::Train => driml_envs::Levels::Train,
         Levels::TrainSingle => driml_envs::Levels::TrainSingle,
@@ -274,16 +279,16 @@ mod tests {
     use rand::Rng;
 
     use super::*;
-    use crate::testing::{played, untrained};
+    use crate::testing::{play_returns, untrained_player};
 
     #[test]
     fn an_evaluation_explores_as_asked() {
         // Source: section 2 of the project's specification.
         assert_eq!(EPSILON, 0.001);
         let played_by = |agent, epsilon| {
-            let mut player = untrained("chain", agent);
+            let mut player = untrained_player("chain", agent);
             player.epsilon = epsilon;
-            played(&player)
+            play_returns(&player)
         };
         let at_random = played_by("c51", 1.0);
         assert_eq!(at_random, played_by("rainbow", 1.0), "whatever the network");
@@ -295,7 +300,7 @@ mod tests {
         for seed in [0, 1, u64::MAX] {
             let first = policy_rng(seed).random::<u64>();
             // The streams of a world's environments: two for each.
-            for stream in 0..2 * COPIES_MAX as u64 {
+            for stream in 0..2 * ENVS_MAX as u64 {
                 let mut copy = ChaCha8Rng::seed_from_u64(seed);
                 copy.set_stream(stream);
                 assert_ne!(copy.random::<u64>(), first, "stream {stream}");

@@ -12,11 +12,11 @@ use driml_machine::error::Interrupted;
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
-    chosen::{Weights, Which, checkpoint_at, config_of},
+    checkpoint_choice::{CheckpointChoice, WeightsChoice, checkpoint_path, read_config},
     console::Screen,
-    evaluate::{Levels, Player, Who, levels, until},
+    evaluate::{Levels, Player, PolicyKind, stop_when, world_with_levels},
     managed_process::ManagedProcess,
-    run_folder::{Candidate, Evaluated, RunFolder},
+    run_folder::{Candidate, EvaluationRow, RunFolder},
     stats::mean_and_deviation,
 };
 
@@ -25,13 +25,13 @@ pub const SELECTION_SEED: u64 = 1 << 32;
 
 /// The evaluation of a checkpoint, and whether the checkpoint is the run's best.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Judged {
+pub struct RankedEvaluation {
     /// The evaluation of the checkpoint.
-    pub earned: Evaluated,
+    pub evaluation: EvaluationRow,
     /// Whether the checkpoint was kept.
     pub is_best: bool,
     /// The evaluation of the best checkpoint before this one, over at least as many episodes.
-    pub best_before: Option<Evaluated>,
+    pub best_before: Option<EvaluationRow>,
 }
 
 /// Plays a checkpoint of a run on the training levels, with averaged weights if it has them. Adds the evaluation to the run's table, and
@@ -42,60 +42,61 @@ pub struct Judged {
 ///
 /// # Errors
 /// A file system error; [`Interrupted`] once `is_stopped` returns true: then nothing is kept.
-pub fn keep(
+pub fn evaluate_and_keep(
     folder: &RunFolder,
-    which: Which,
+    choice: CheckpointChoice,
     episodes: u32,
     is_stopped: &dyn Fn() -> bool,
-) -> anyhow::Result<Judged> {
-    let path = checkpoint_at(folder, which)?;
+) -> anyhow::Result<RankedEvaluation> {
+    let path = checkpoint_path(folder, choice)?;
     let candidate = Candidate::read(&path)?;
-    let play = |path: &Path| -> anyhow::Result<Evaluated> {
-        let player = Player::read(config_of(folder)?, path, Weights::default())?;
-        let world = levels(&player.config.world, Levels::Train)?;
+    let evaluate = |path: &Path| -> anyhow::Result<EvaluationRow> {
+        let player = Player::load_checkpoint(read_config(folder)?, path, WeightsChoice::default())?;
+        let world = world_with_levels(&player.config.world, Levels::Train)?;
         let count = episodes as usize;
-        let watch = &mut until(is_stopped);
-        let returns = player.play_watched(Who::Agent, &world, count, SELECTION_SEED, watch)?;
+        let watch = &mut stop_when(is_stopped);
+        let returns = player.play(PolicyKind::Agent, &world, count, SELECTION_SEED, watch)?;
         if returns.len() < count {
             return Err(Interrupted.into());
         }
-        let earned = mean_and_deviation(&returns);
-        Ok(Evaluated::at(folder, player.updates, episodes, earned))
+        let stats = mean_and_deviation(&returns);
+        Ok(EvaluationRow::new(folder, player.updates, episodes, stats))
     };
-    let earned = play(&path)?;
-    let mut best_before = Evaluated::best(folder)?;
-    let is_short = |it: &Evaluated| it.updates != earned.updates && it.episodes < episodes;
-    if best_before.is_some_and(|it| is_short(&it))
+    let evaluation = evaluate(&path)?;
+    let mut best_before = EvaluationRow::best(folder)?;
+    let is_shorter =
+        |it: &EvaluationRow| it.updates != evaluation.updates && it.episodes < episodes;
+    if best_before.is_some_and(|it| is_shorter(&it))
         && let Some((_, best)) = checkpoint::list(&folder.best())?.pop()
     {
-        let again = play(&best)?;
-        again.add(folder)?;
+        let again = evaluate(&best)?;
+        again.append_to(folder)?;
         best_before = Some(again);
     }
-    let is_best = candidate.judge(folder, &earned)?;
-    Ok(Judged {
-        earned,
+    let is_best = candidate.keep_if_best(folder, &evaluation)?;
+    Ok(RankedEvaluation {
+        evaluation,
         is_best,
         best_before,
     })
 }
 
-const LAST_MAX: Duration = Duration::from_secs(3600);
+const LAST_EVALUATION_MAX: Duration = Duration::from_secs(3600);
 const POLL: Duration = Duration::from_millis(100);
 
 /// Decides which checkpoints of a run are evaluated.
-pub(crate) struct Due {
+pub(crate) struct EvaluationSchedule {
     config: Option<EvaluationConfig>,
     /// Updates of the newest checkpoint that was evaluated or is being evaluated.
     newest: u64,
 }
 
-impl Due {
+impl EvaluationSchedule {
     /// The checkpoints that are newer than those in the run's table of evaluations.
     pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let config = config.local.evaluation;
         let played = match config {
-            Some(_) => Evaluated::all(run_dir)?,
+            Some(_) => EvaluationRow::all(run_dir)?,
             None => Vec::new(),
         };
         let newest = played.iter().map(|it| it.updates).max().unwrap_or(0);
@@ -103,7 +104,7 @@ impl Due {
     }
 
     /// The number of episodes for the checkpoint after `updates`, if it is due. The last one is due unless it was evaluated before.
-    pub(crate) fn take(&mut self, updates: u64, is_last: bool) -> Option<u32> {
+    pub(crate) fn take_episodes(&mut self, updates: u64, is_last: bool) -> Option<u32> {
         let config = self.config?;
         let step = if is_last { 1 } else { config.every_updates };
         if updates / step <= self.newest / step {
@@ -116,36 +117,36 @@ impl Due {
 
 /// Evaluates the checkpoints that are due, one at a time.
 pub(crate) struct Evaluator {
-    due: Due,
+    schedule: EvaluationSchedule,
     run_dir: RunFolder,
-    playing: Option<ManagedProcess>,
+    process: Option<ManagedProcess>,
 }
 
 impl Evaluator {
     pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         Ok(Self {
-            due: Due::new(config, run_dir)?,
+            schedule: EvaluationSchedule::new(config, run_dir)?,
             run_dir: run_dir.clone(),
-            playing: None,
+            process: None,
         })
     }
 
     /// Reports an evaluation that has ended, and begins the next one if a checkpoint is due.
-    pub(crate) fn look(&mut self, screen: &Screen) {
-        self.take_result(screen);
-        if self.playing.is_none() {
-            self.begin(false, screen);
+    pub(crate) fn poll(&mut self, screen: &Screen) {
+        self.report_result(screen);
+        if self.process.is_none() {
+            self.start_if_due(false, screen);
         }
     }
 
     /// Evaluates the last checkpoint. Waits for the result up to an hour, or until the run is told to stop.
     pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
-        let deadline = Instant::now() + LAST_MAX;
+        let deadline = Instant::now() + LAST_EVALUATION_MAX;
         let mut last = false;
         loop {
-            self.take_result(screen);
-            if self.playing.is_none() {
-                if last || !self.begin(true, screen) {
+            self.report_result(screen);
+            if self.process.is_none() {
+                if last || !self.start_if_due(true, screen) {
                     return;
                 }
                 last = true;
@@ -160,8 +161,8 @@ impl Evaluator {
     }
 
     /// Begins to evaluate the newest checkpoint if it is due. Returns whether it did.
-    fn begin(&mut self, is_last: bool, screen: &Screen) -> bool {
-        if self.due.config.is_none() {
+    fn start_if_due(&mut self, is_last: bool, screen: &Screen) -> bool {
+        if self.schedule.config.is_none() {
             return false;
         }
         let all = checkpoint::list(&self.run_dir.checkpoints()).unwrap_or_else(|e| {
@@ -169,7 +170,7 @@ impl Evaluator {
             Vec::new()
         });
         let newest = all.last().map(|it| it.0);
-        let due = newest.and_then(|it| Some((it, self.due.take(it, is_last)?)));
+        let due = newest.and_then(|it| Some((it, self.schedule.take_episodes(it, is_last)?)));
         let Some((updates, episodes)) = due else {
             return false;
         };
@@ -178,33 +179,33 @@ impl Evaluator {
         args.push(self.run_dir.path().as_os_str());
         let logs = self.run_dir.logs();
         match ManagedProcess::start("evaluation", &args, 1, &logs, screen, None) {
-            Ok(process) => self.playing = Some(process),
+            Ok(process) => self.process = Some(process),
             Err(e) => screen.line(&format!(
                 "the checkpoint after {updates} updates is not played: {e:#}"
             )),
         }
-        self.playing.is_some()
+        self.process.is_some()
     }
 
     /// Reports an evaluation that has ended. A failed evaluation costs the run nothing but a printed line.
-    fn take_result(&mut self, screen: &Screen) {
-        let Some(process) = &mut self.playing else {
+    fn report_result(&mut self, screen: &Screen) {
+        let Some(process) = &mut self.process else {
             return;
         };
-        if process.end().is_none() {
+        if process.exit_status().is_none() {
             return;
         }
         process.wait_until(Instant::now(), || false);
-        let failed = process.end().is_some_and(|status| !status.success());
-        let said = match (failed, Evaluated::all(&self.run_dir)) {
+        let failed = process.exit_status().is_some_and(|it| !it.success());
+        let report = match (failed, EvaluationRow::all(&self.run_dir)) {
             (true, _) => format!(
                 "the run continues without an evaluation: {}",
                 process.exit_report()
             ),
-            (false, Ok(all)) => all.last().map(Evaluated::describe).unwrap_or_default(),
+            (false, Ok(all)) => all.last().map(EvaluationRow::describe).unwrap_or_default(),
             (false, Err(e)) => format!("{e:#}"),
         };
-        screen.line(&said);
-        self.playing = None;
+        screen.line(&report);
+        self.process = None;
     }
 }

@@ -7,9 +7,9 @@ use anyhow::ensure;
 use driml_settings::config::RunConfig;
 
 use crate::{
-    chosen::{Weights, Which},
+    checkpoint_choice::{CheckpointChoice, WeightsChoice},
     console,
-    evaluate::{Levels, Player, Who, levels, until},
+    evaluate::{Levels, Player, PolicyKind, stop_when, world_with_levels},
     run_folder::{Earned, LastPlay, RunFolder, Summary},
 };
 
@@ -50,17 +50,17 @@ pub(crate) fn play(
 /// What the weights in `folder` earn; none if stopped before the first batch was complete.
 fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<Option<LastPlay>> {
     let started = Instant::now();
-    let player = Player::load_at(folder, Which::default(), Weights::default())?;
-    let world = levels(&player.config.world, Levels::Train)?;
-    let watch = &mut until(|| is_stopped() || started.elapsed() > FIRST_BATCH_MAX);
+    let player = Player::load(folder, CheckpointChoice::Newest, WeightsChoice::Average)?;
+    let world = world_with_levels(&player.config.world, Levels::Train)?;
+    let watch = &mut stop_when(|| is_stopped() || started.elapsed() > FIRST_BATCH_MAX);
     let (mut agent, mut random) = (Vec::new(), Vec::new());
     for batch in 0..BATCHES_MAX {
         // The next batch takes about as long as the mean batch before it.
         if batch > 0 && started.elapsed() * (batch + 1) > PLAY_MAX * batch {
             break;
         }
-        let mut of = |who| player.play_watched(who, &world, BATCH, batch.into(), watch);
-        let both = [of(Who::Agent)?, of(Who::Random)?];
+        let mut of = |who| player.play(who, &world, BATCH, batch.into(), watch);
+        let both = [of(PolicyKind::Agent)?, of(PolicyKind::Random)?];
         if both.iter().any(|returns| returns.len() < BATCH) {
             break;
         }

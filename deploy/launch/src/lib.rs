@@ -20,7 +20,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-pub mod chosen;
+pub mod checkpoint_choice;
 pub mod console;
 pub mod endpoint;
 pub mod evaluate;

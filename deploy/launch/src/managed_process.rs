@@ -23,7 +23,7 @@ use nix::{
 use crate::{console::Screen, process_log::ProcessLog, rendezvous::Rendezvous};
 
 /// A process that fails within this time of its start would fail again after a restart.
-const AT_ONCE: Duration = Duration::from_secs(10);
+const EARLY_FAILURE_MAX: Duration = Duration::from_secs(10);
 /// How long a killed process may take to end.
 const KILLED_MAX: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(20);
@@ -35,16 +35,16 @@ pub struct ManagedProcess {
     pub name: String,
     child: Child,
     started: Instant,
-    end: Option<ExitStatus>,
+    exit_status: Option<ExitStatus>,
     pub(crate) log: ProcessLog,
 }
 
 /// The environment variable that sets the number of threads that a process uses for arithmetic.
-pub const THREADS: &str = "RAYON_NUM_THREADS";
+pub const THREADS_VARIABLE: &str = "RAYON_NUM_THREADS";
 
 /// Flags for a child that must exit when this process does. They name this process, because it may have died before the child
 /// looks up its parent.
-pub fn exit_with_this_process() -> [String; 2] {
+pub fn exit_with_parent_flags() -> [String; 2] {
     ["--exit-with-parent".into(), std::process::id().to_string()]
 }
 
@@ -61,15 +61,15 @@ impl ManagedProcess {
         rendezvous: Option<&Rendezvous>,
     ) -> anyhow::Result<Self> {
         let log = ProcessLog::open(name, logs)?;
-        let held = rendezvous.map(Rendezvous::hold).transpose();
-        let held = held.with_context(|| format!("starting {name}"))?;
-        let stdin = held.map_or_else(Stdio::null, Stdio::from);
+        let lock = rendezvous.map(Rendezvous::lock_handle).transpose();
+        let lock = lock.with_context(|| format!("starting {name}"))?;
+        let stdin = lock.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program_path());
         // The child inherits the rest of its environment from this process.
         command
-            .env(THREADS, threads.to_string())
+            .env(THREADS_VARIABLE, threads.to_string())
             .args(args)
-            .args(exit_with_this_process())
+            .args(exit_with_parent_flags())
             .stdin(stdin);
         Self::spawn(name, command, log, screen)
     }
@@ -93,34 +93,34 @@ impl ManagedProcess {
             name: name.into(),
             child,
             started: Instant::now(),
-            end: None,
+            exit_status: None,
             log,
         })
     }
 
     /// Whether the process ended in a way that a restart may fix: it exited in order, a signal other than SIGABRT killed it, or it
-    /// had run for longer than `AT_ONCE`. SIGABRT comes from a broken invariant of our own.
-    pub(crate) fn may_be_started_again(&mut self) -> bool {
+    /// had run for longer than `EARLY_FAILURE_MAX`. SIGABRT comes from a broken invariant of our own.
+    pub(crate) fn is_restartable(&mut self) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;
-        let had_run = self.started.elapsed() > AT_ONCE;
-        self.end().is_some_and(|status| {
-            is_orderly(status) || status.signal().is_some_and(killed) || had_run
+        let ran_long = self.started.elapsed() > EARLY_FAILURE_MAX;
+        self.exit_status().is_some_and(|status| {
+            is_orderly_exit(status) || status.signal().is_some_and(killed) || ran_long
         })
     }
 
     /// Returns an error if the process has ended.
     pub fn check_alive(&mut self) -> anyhow::Result<()> {
-        ensure!(self.end().is_none(), "{}", self.exit_report());
+        ensure!(self.exit_status().is_none(), "{}", self.exit_report());
         Ok(())
     }
 
     /// The exit status of the process, if it has ended.
-    pub fn end(&mut self) -> Option<ExitStatus> {
-        if self.end.is_none() {
+    pub fn exit_status(&mut self) -> Option<ExitStatus> {
+        if self.exit_status.is_none() {
             // An error means that the child does not exist any more, which cannot happen before it was waited for.
-            self.end = self.child.try_wait().ok().flatten();
+            self.exit_status = self.child.try_wait().ok().flatten();
         }
-        self.end
+        self.exit_status
     }
 
     /// Asks the process to drain and exit.
@@ -134,8 +134,8 @@ impl ManagedProcess {
     }
 
     fn signal(&mut self, signal: Signal) {
-        if self.end().is_none() {
-            send(&self.child, &self.name, signal);
+        if self.exit_status().is_none() {
+            send_signal(&self.child, &self.name, signal);
         }
     }
 
@@ -145,18 +145,18 @@ impl ManagedProcess {
         deadline: Instant,
         abort: impl Fn() -> bool,
     ) -> Option<ExitStatus> {
-        while self.end().is_none() && Instant::now() < deadline && !abort() {
+        while self.exit_status().is_none() && Instant::now() < deadline && !abort() {
             std::thread::sleep(POLL);
         }
-        if self.end.is_some() {
+        if self.exit_status.is_some() {
             self.log.finish();
         }
-        self.end
+        self.exit_status
     }
 
     /// Resident memory, MiB; none once the process has ended.
     pub fn rss_mib(&mut self) -> Option<f64> {
-        if self.end().is_some() {
+        if self.exit_status().is_some() {
             return None;
         }
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
@@ -166,7 +166,7 @@ impl ManagedProcess {
     /// How the process ended, and its error or the last lines of its log, as one message.
     pub fn exit_report(&mut self) -> String {
         self.wait_until(Instant::now(), || false);
-        let how = match self.end.map(|it| (it.code(), it.signal())) {
+        let how = match self.exit_status.map(|it| (it.code(), it.signal())) {
             None => "is still running".into(),
             Some((Some(code), _)) => format!("exited with code {code}"),
             Some((None, Some(signal))) => {
@@ -192,16 +192,16 @@ impl Drop for ManagedProcess {
 }
 
 /// Whether a process exited because its run is over or because it was asked to stop.
-pub(crate) fn is_orderly(status: ExitStatus) -> bool {
+pub(crate) fn is_orderly_exit(status: ExitStatus) -> bool {
     status.success() || status.code() == Some(EXIT_INTERRUPTED.into())
 }
 
 /// Asks a child process to drain and exit. The child must not have been waited for yet.
 pub fn ask_to_stop(child: &Child, name: &str) {
-    send(child, name, Signal::SIGTERM);
+    send_signal(child, name, Signal::SIGTERM);
 }
 
-fn send(child: &Child, name: &str, signal: Signal) {
+fn send_signal(child: &Child, name: &str, signal: Signal) {
     // No caller has waited for the child, so its PID cannot belong to another process yet.
     if let Err(e) = kill(Pid::from_raw(child.id() as i32), signal) {
         tracing::debug!("sending {signal} to {name}: {e}");
@@ -210,26 +210,26 @@ fn send(child: &Child, name: &str, signal: Signal) {
 
 /// Waits for processes to end, after SIGTERM to each if `ask`. Kills those that do not end in time, and reports failures. A process
 /// that receives SIGTERM before it listens for signals dies of it, which is not a failure: it has nothing to save.
-pub(crate) fn stop<'a>(
+pub(crate) fn stop_processes<'a>(
     processes: impl IntoIterator<Item = &'a mut ManagedProcess>,
-    ask: bool,
+    send_sigterm: bool,
     drain_max: Duration,
     abort: &impl Fn() -> bool,
 ) -> Vec<String> {
     let mut processes: Vec<_> = processes.into_iter().collect();
-    if ask {
+    if send_sigterm {
         processes.iter_mut().for_each(|it| it.ask_to_stop());
     }
     let deadline = Instant::now() + drain_max;
-    let mut late = Vec::new();
+    let mut failures = Vec::new();
     for process in processes {
         match process.wait_until(deadline, abort) {
-            Some(status) if is_orderly(status) => {}
-            Some(status) if ask && status.signal() == Some(Signal::SIGTERM as i32) => {}
-            Some(_) => late.push(process.exit_report()),
+            Some(status) if is_orderly_exit(status) => {}
+            Some(status) if send_sigterm && status.signal() == Some(Signal::SIGTERM as i32) => {}
+            Some(_) => failures.push(process.exit_report()),
             None => {
                 if !abort() {
-                    late.push(format!(
+                    failures.push(format!(
                         "{} did not end within {} and was killed",
                         process.name,
                         duration(drain_max)
@@ -240,7 +240,7 @@ pub(crate) fn stop<'a>(
             }
         }
     }
-    late
+    failures
 }
 
 #[cfg(test)]
@@ -256,7 +256,7 @@ mod tests {
             let log = ProcessLog::open("script", logs.path()).unwrap();
             let screen = Screen::default();
             let mut process = ManagedProcess::spawn("script", command, log, &screen).unwrap();
-            stop([&mut process], ask, Duration::from_secs(60), &|| false)
+            stop_processes([&mut process], ask, Duration::from_secs(60), &|| false)
         };
         assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);
         let killed = stopped("kill -TERM $$", false);

@@ -265,13 +265,13 @@ mod tests {
     use super::*;
     use crate::{
         run_view::Plan,
-        testing::{view, with},
+        testing::{make, view},
     };
 
     /// The view of a run that is recorded, or, without `learner`, of a run that is not recorded and whose learner does not answer.
     fn of_two_losses(replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
         let is_recorded = learner.is_some();
-        let plan = with(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
+        let plan = make(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
         let mut view = view(plan, replay, learner);
         if is_recorded {
             view.recorded_s = Some(12.5);
@@ -293,8 +293,8 @@ mod tests {
 
     #[test]
     fn what_is_not_known_is_left_out() {
-        let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = 7);
-        let learner = with(|it: &mut LearnerStatus| {
+        let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = 7);
+        let learner = make(|it: &mut LearnerStatus| {
             it.losses = vec![("dim_4t4".into(), 2.0)];
             (it.updates, it.c51_kl) = (3, 0.5);
         });

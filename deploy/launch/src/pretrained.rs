@@ -125,7 +125,7 @@ pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{played, untrained};
+    use crate::testing::{play_returns, untrained_player};
 
     fn said(all: &[(&str, &[u8])], game: &str) -> String {
         format!("{:#}", built_in(all, game).map(drop).unwrap_err())
@@ -140,7 +140,7 @@ mod tests {
 
     #[test]
     fn an_exported_network_is_read_and_plays() {
-        let player = untrained("chain", "driml-ada");
+        let player = untrained_player("chain", "driml-ada");
         let bytes = export(&player).unwrap();
         assert_eq!(bytes, export(&player).unwrap());
         let read = built_in(&[("chain", &bytes[..])], "chain").unwrap();
@@ -156,18 +156,18 @@ mod tests {
                 assert!(is_near, "{name}: {rounded}, {exact}");
             }
         }
-        assert_eq!(played(&read).len(), 4);
+        assert_eq!(play_returns(&read).len(), 4);
         // Exporting what was read rounds nothing again.
         let again = export(&read).unwrap();
         let again = built_in(&[("chain", &again[..])], "chain").unwrap();
-        assert_eq!(played(&read), played(&again));
-        assert_eq!(played(&read), played(&read.exact()));
+        assert_eq!(play_returns(&read), play_returns(&again));
+        assert_eq!(play_returns(&read), play_returns(&read.with_f32()));
     }
 
     #[test]
     fn what_does_not_fit_names_both_sides() {
-        let bytes = export(&untrained("chain", "c51")).unwrap();
-        let other = export(&untrained("mspacman", "c51")).unwrap();
+        let bytes = export(&untrained_player("chain", "c51")).unwrap();
+        let other = export(&untrained_player("mspacman", "c51")).unwrap();
         let all: &[(&str, &[u8])] = &[("chain", &bytes[..]), ("ising", &other[..])];
         for (all, game, why) in [
             (
@@ -189,7 +189,7 @@ mod tests {
         );
 
         // Weights of one network beside the settings of another.
-        let mut mixed = untrained("chain", "c51");
+        let mut mixed = untrained_player("chain", "c51");
         for (from, to, why) in [
             ("hidden = 32", "hidden = 16", "has shape"),
             (
@@ -210,7 +210,7 @@ mod tests {
             let is_told = text.contains(why) && text.contains("pretrained:chain");
             assert!(is_told, "{text}");
         }
-        mixed.network = untrained("mspacman", "c51").network;
+        mixed.network = untrained_player("mspacman", "c51").network;
         let bytes = export(&mixed).unwrap();
         let why = said(&[("chain", &bytes[..])], "chain");
         assert!(why.contains("has shape") && why.contains("wanted"), "{why}");

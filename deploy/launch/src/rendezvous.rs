@@ -71,7 +71,7 @@ impl Rendezvous {
     }
 
     /// A handle on the lock, for a process that uses the folder: its standard input.
-    pub(crate) fn hold(&self) -> io::Result<File> {
+    pub(crate) fn lock_handle(&self) -> io::Result<File> {
         self.lock.try_clone()
     }
 }
@@ -147,7 +147,7 @@ mod tests {
         assert_eq!(folders(place.path()), 3);
 
         // As after the launcher was killed, while a process still uses the folder.
-        let process = rendezvous.hold().unwrap();
+        let process = rendezvous.lock_handle().unwrap();
         let Rendezvous { folder, lock } = rendezvous;
         let path = folder.keep();
         fs::write(path.join("learner.sock"), "").unwrap();

@@ -301,7 +301,7 @@ impl RunView {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{config, with};
+    use crate::testing::{config, make};
     use driml_replay_server::RatioStart;
 
     #[test]
@@ -323,9 +323,9 @@ mod tests {
     #[test]
     fn a_learner_that_ended_before_all_is_sampled_has_not_learned_it() {
         let mut view = RunView::new(Plan::default());
-        view.take_learner(Some(with(|it: &mut LearnerStatus| it.finished = true)));
+        view.take_learner(Some(make(|it: &mut LearnerStatus| it.finished = true)));
         for (waiting, is_learned) in [(Waiting::Neither, false), (Waiting::Finished, true)] {
-            view.take_replay(vec![with(|it: &mut ReplayStatus| {
+            view.take_replay(vec![make(|it: &mut ReplayStatus| {
                 (it.finished, it.waiting) = (true, waiting);
             })]);
             let found = (view.is_learned(), view.is_finished());
@@ -335,7 +335,7 @@ mod tests {
 
     #[test]
     fn updates_before_the_learner_s_first_answer_are_not_its_speed() {
-        let learner = |updates| with(|it: &mut LearnerStatus| it.updates = updates);
+        let learner = |updates| make(|it: &mut LearnerStatus| it.updates = updates);
         let mut view = RunView::new(Plan::default());
         for answer in [None, Some(learner(5_000)), Some(learner(5_000))] {
             view.take_learner(answer);

@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    evaluate::{EPSILON, Levels, Player, Who},
+    evaluate::{EPSILON, Levels, Player, PolicyKind},
     run_view::{Plan, RunView},
 };
 
@@ -20,7 +20,7 @@ pub(crate) const MACHINE: Machine = Machine {
 };
 
 /// A default value in which some fields are `set`.
-pub(crate) fn with<T: Default>(set: impl FnOnce(&mut T)) -> T {
+pub(crate) fn make<T: Default>(set: impl FnOnce(&mut T)) -> T {
     let mut it = T::default();
     set(&mut it);
     it
@@ -39,7 +39,7 @@ pub(crate) fn config(preset: &str, world: &str, agent: &str, sets: &[&str]) -> R
 }
 
 /// An untrained network for this world and agent, with DIM's heads if the agent has them.
-pub(crate) fn untrained(world: &str, agent: &str) -> Player {
+pub(crate) fn untrained_player(world: &str, agent: &str) -> Player {
     let config = config("smoke", world, agent, &[]);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
     let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();
@@ -52,7 +52,7 @@ pub(crate) fn untrained(world: &str, agent: &str) -> Player {
     }
 }
 
-pub(crate) fn played(player: &Player) -> Vec<f64> {
-    let returns = player.returns(Who::Agent, Levels::Train, 4, 3).unwrap();
-    returns.unwrap()
+pub(crate) fn play_returns(player: &Player) -> Vec<f64> {
+    let played = player.play_levels(PolicyKind::Agent, Levels::Train, 4, 3);
+    played.unwrap().unwrap()
 }

@@ -1,7 +1,7 @@
 //! `driml actor`: one actor of a run.
 
 use clap::Args;
-use driml_launch::endpoint::check_endpoints;
+use driml_launch::endpoint::check_connect_endpoints;
 use driml_machine::error::usage;
 use driml_protocol::{Shutdown, tls::Role};
 use driml_settings::presets;
@@ -48,7 +48,7 @@ fn actor_id(text: &str) -> Result<u32, String> {
 }
 
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.connect, args.tls.is_set())?;
+    check_connect_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Actor(args.id))?;
     let world = args.env.as_deref().map(presets::world).transpose();
     let world = world.map_err(|e| usage!("--env: {e}"))?;

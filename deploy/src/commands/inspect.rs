@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_envs::WorldName;
 use driml_launch::{
-    chosen::config_of,
+    checkpoint_choice::read_config,
     console::print,
     inspect::{Inspection, describe_worlds},
     run_folder::RunFolder,
@@ -46,7 +46,7 @@ pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
         };
     }
     let config = match &args.run {
-        Some(folder) => config_of(&RunFolder::new(folder))?,
+        Some(folder) => read_config(&RunFolder::new(folder))?,
         None => resolve(&args.settings, &machine)?.0,
     };
     let inspection = Inspection::of(&config)?;

@@ -4,7 +4,7 @@ use std::{io, path::PathBuf, sync::Arc};
 
 use anyhow::Context;
 use clap::Args;
-use driml_launch::{endpoint::NAMESPACE, rendezvous, shared_memory};
+use driml_launch::{endpoint::DEFAULT_NAMESPACE, rendezvous, shared_memory};
 use driml_machine::error::{Interrupted, Usage};
 use driml_protocol::{
     Keys, session,
@@ -15,7 +15,7 @@ use driml_protocol::{
 #[derive(Debug, Args)]
 pub(crate) struct JoinFlags {
     /// Prefix of the run's keys
-    #[arg(long, value_name = "NS", default_value = NAMESPACE)]
+    #[arg(long, value_name = "NS", default_value = DEFAULT_NAMESPACE)]
     pub(crate) namespace: String,
     /// Exit when the parent process PID exits
     #[arg(long, value_name = "PID", hide = true)]

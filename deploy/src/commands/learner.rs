@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_launch::endpoint::check_endpoints;
+use driml_launch::endpoint::check_connect_endpoints;
 use driml_machine::device::{DeviceFlag, check_device};
 use driml_protocol::{Shutdown, tls::Role};
 
@@ -31,7 +31,7 @@ pub(crate) struct LearnerArgs {
 }
 
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
-    check_endpoints(&args.connect, args.tls.is_set())?;
+    check_connect_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Learner)?;
     check_device(args.on.device)?;
     let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::{
-    endpoint::{check_endpoints, check_listening, check_unused},
+    endpoint::{check_connect_endpoints, check_listen_endpoints, check_unused},
     open_files,
 };
 use driml_machine::{error::usage, resources::Machine};
@@ -41,9 +41,9 @@ pub(crate) struct ReplayServerArgs {
 }
 
 pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
-    check_listening(&args.listen, args.tls.is_set(), args.network.allow_insecure)?;
+    check_listen_endpoints(&args.listen, args.tls.is_set(), args.network.allow_insecure)?;
     check_unused(&args.listen)?;
-    check_endpoints(&args.connect, args.tls.is_set())?;
+    check_connect_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;
     args.run.over.server_alone = true;
     let (config, _) = flags::resolve(&args.run, &Machine::detect())?;

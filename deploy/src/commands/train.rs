@@ -7,7 +7,7 @@ use anyhow::bail;
 use clap::Args;
 use driml_launch::{
     console::{self, print_wrapped},
-    endpoint::{check_listening, check_unused},
+    endpoint::{check_listen_endpoints, check_unused},
     launcher, lockstep, plan,
     resume::{self, Found},
     run_folder::RunFolder,
@@ -120,7 +120,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         }
     };
     let listen = args.listen.as_slice();
-    check_listening(listen, args.tls.is_set(), args.network.allow_insecure)?;
+    check_listen_endpoints(listen, args.tls.is_set(), args.network.allow_insecure)?;
     check_unused(listen)?;
     if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
         bail!(usage!(
@@ -146,13 +146,13 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     if args.lockstep {
         lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
     } else {
-        let outside = launcher::Outside {
+        let external = launcher::ExternalAccess {
             listen: args.listen,
             tls_dir: args.tls.tls_dir,
             allow_insecure: args.network.allow_insecure,
         };
         let parent = args.exit_with_parent;
-        launcher::run(&config, &run_dir, resume_point, outside, parent)
+        launcher::run(&config, &run_dir, resume_point, external, parent)
     }
 }
 

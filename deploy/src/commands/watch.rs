@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args};
 use driml_launch::{
-    endpoint::{NAMESPACE, check_endpoints},
+    endpoint::{DEFAULT_NAMESPACE, check_connect_endpoints},
     run_folder::RunFolder,
     view::Poller,
     watch::{self, Asked, WatchFlags, endpoints_of},
@@ -24,7 +24,7 @@ pub(crate) struct RunSelection {
     #[arg(long, value_name = "DIR", group = "whose")]
     run: Option<PathBuf>,
     /// Prefix of the run's keys
-    #[arg(long, value_name = "NS", default_value = NAMESPACE)]
+    #[arg(long, value_name = "NS", default_value = DEFAULT_NAMESPACE)]
     namespace: String,
     #[command(flatten)]
     tls: TlsFlags,
@@ -67,7 +67,7 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
 impl RunSelection {
     /// Opens a connection to the run, or returns the run's state if it cannot be asked.
     fn open(&self) -> anyhow::Result<Asked<Poller>> {
-        check_endpoints(&self.connect, self.tls.is_set())?;
+        check_connect_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
         let endpoints = match self.endpoints()? {
             Ok(endpoints) => endpoints,

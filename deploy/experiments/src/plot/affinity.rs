@@ -2,7 +2,7 @@
 //! Nothing is computed: A is the matrix that the learner last sent to the replay server.
 
 use driml_figure::{Figure, Heat, Panel};
-use driml_launch::{chosen::config_of, run_folder::RunFolder};
+use driml_launch::{checkpoint_choice::read_config, run_folder::RunFolder};
 use driml_learner::checkpoint;
 use driml_machine::error::usage;
 
@@ -48,7 +48,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
 
 /// Returns the names of the actions, or their numbers if the settings cannot be read.
 fn action_names(folder: &RunFolder, side: usize) -> Vec<String> {
-    let names = config_of(folder).map(|config| config.action_names());
+    let names = read_config(folder).map(|config| config.action_names());
     let names = names.ok().filter(|names| names.len() == side);
     names.unwrap_or_else(|| (0..side).map(|action| action.to_string()).collect())
 }

@@ -11,7 +11,7 @@ use std::{collections::BTreeSet, path::PathBuf};
 
 use driml_figure::{Axis, Chart, Figure, Format, GREY, Look, Mark, Panel, Series};
 use driml_launch::{
-    chosen::config_of,
+    checkpoint_choice::read_config,
     console::{self, print},
     evaluate::random_returns,
     metrics,
@@ -242,7 +242,7 @@ fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
 fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
     let (mut known, mut found) = (Vec::new(), Vec::new());
     for run in runs {
-        let config = config_of(&run.folder)?;
+        let config = read_config(&run.folder)?;
         let task = (config.world.clone(), config.actor.actions);
         if !known.contains(&task) {
             let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0)?);

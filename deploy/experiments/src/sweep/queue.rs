@@ -12,7 +12,7 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::{
-    managed_process::{ask_to_stop, exit_with_this_process},
+    managed_process::{ask_to_stop, exit_with_parent_flags},
     resume::{self, Found},
     run_folder::{Progress as RunProgress, progress as how_far},
 };
@@ -279,7 +279,7 @@ impl Queue {
         let mut command = Command::new(process_env::program_path());
         command
             .args(["train", "--no-play"])
-            .args(exit_with_this_process());
+            .args(exit_with_parent_flags());
         if resumed {
             command.arg("--resume").arg(folder.path());
         } else {

@@ -2,8 +2,8 @@
 //! The returns during training are in the summaries of the runs.
 
 use driml_launch::{
-    chosen::{Weights, Which, config_of},
-    evaluate::{Levels, Player, Who, random_returns},
+    checkpoint_choice::{CheckpointChoice, WeightsChoice, read_config},
+    evaluate::{Levels, Player, PolicyKind, random_returns},
     run_folder::RunFolder,
 };
 use driml_learner::checkpoint::{self, AVERAGE};
@@ -46,7 +46,7 @@ impl Played {
         run: &FinishedRun,
     ) -> anyhow::Result<Vec<f64>> {
         session.piece_of(&self.episodes.to_string(), key, self.units, |_| {
-            random_returns(&config_of(&run.folder)?, self.episodes as usize, SEED)
+            random_returns(&read_config(&run.folder)?, self.episodes as usize, SEED)
         })
     }
 
@@ -57,25 +57,25 @@ impl Played {
     ) -> anyhow::Result<Option<Vec<f64>>> {
         let players = players(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(players.len().max(1) as u32);
-        let returns = players.into_iter().map(|which| {
+        let returns = players.into_iter().map(|choice| {
             progress.advance(0)?;
-            let player = Player::load_at(folder, which, Weights::default())?;
-            player.returns(Who::Agent, self.levels, each, SEED)
+            let player = Player::load(folder, choice, WeightsChoice::default())?;
+            player.play_levels(PolicyKind::Agent, self.levels, each, SEED)
         });
         let all = returns.collect::<anyhow::Result<Option<Vec<_>>>>()?;
         Ok(all.map(|all| all.concat()))
     }
 }
 
-fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>> {
+fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<CheckpointChoice>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
         // Averages of three checkpoints differ little, so the newest suffices. Without a checkpoint the player reports the error.
-        return Ok(vec![Which::Newest]);
+        return Ok(vec![CheckpointChoice::Newest]);
     }
     let newest = all.iter().rev().take(checkpoints);
-    Ok(newest.map(|(updates, _)| Which::After(*updates)).collect())
+    Ok(newest.map(|it| CheckpointChoice::After(it.0)).collect())
 }
 
 #[cfg(test)]
@@ -88,16 +88,16 @@ mod tests {
     fn the_average_plays_before_the_newest_checkpoints() {
         let folder = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(folder.path());
-        assert_eq!(players(&folder, 3).unwrap(), [Which::Newest]);
+        assert_eq!(players(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
         for updates in [1, 2, 3, 4] {
             let name = format!("checkpoint-{updates:012}");
             let path = folder.checkpoints().join(name);
             fs::create_dir_all(path).unwrap();
         }
-        let newest = [4, 3, 2].map(Which::After);
+        let newest = [4, 3, 2].map(CheckpointChoice::After);
         assert_eq!(players(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
-        assert_eq!(players(&folder, 3).unwrap(), [Which::Newest]);
+        assert_eq!(players(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
     }
 }

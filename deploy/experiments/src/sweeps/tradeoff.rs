@@ -13,7 +13,7 @@ mod results;
 use std::{collections::BTreeMap, time::Instant};
 
 use driml_launch::{
-    chosen::config_of,
+    checkpoint_choice::read_config,
     console::{self, print},
     evaluate::Levels,
 };
@@ -296,7 +296,7 @@ impl Tradeoff<'_> {
 
     fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
         // Read the config of this run, whose seed may not be 1.
-        let (units, config) = (self.piece_units(), config_of(&run.folder)?);
+        let (units, config) = (self.piece_units(), read_config(&run.folder)?);
         self.session.progress().again(units);
         let key = format!("exactness-{}", point.key);
         let (rows, states) = measured::sizes(&config);

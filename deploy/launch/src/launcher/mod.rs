@@ -4,8 +4,8 @@
 
 mod processes;
 
+pub use processes::ExternalAccess;
 use processes::Launch;
-pub use processes::Outside;
 pub(crate) use processes::process_names;
 
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ use crate::{
     endpoint::wait_until_listening,
     evaluator::Evaluator,
     last_play,
-    managed_process::{ManagedProcess, stop},
+    managed_process::{ManagedProcess, stop_processes},
     open_files,
     rendezvous::Rendezvous,
     resume,
@@ -54,15 +54,15 @@ pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
     resumed: Option<ResumePoint>,
-    outside: Outside,
+    external: ExternalAccess,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
     let shutdown = shutdown.context("listening for signals")?;
     open_files::check_run(config)?;
     // `RunRecorder::open` removes the summary.
-    let before = resumed.and_then(|_| Summary::read(run_dir).ok());
-    let restarts_before = before.map_or([0; 2], |it| {
+    let summary_before = resumed.and_then(|_| Summary::read(run_dir).ok());
+    let restarts_before = summary_before.map_or([0; 2], |it| {
         [it.replay_servers_restarted, it.actors_restarted]
     });
     let evaluator = Evaluator::new(config, run_dir)?;
@@ -72,12 +72,12 @@ pub fn run(
     let rendezvous = Rendezvous::create()?;
     let servers = names.iter().take(config.replay.shards as usize);
     let mut endpoints: Vec<_> = servers.map(|name| rendezvous.endpoint(name)).collect();
-    if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
+    if let (Some(listen), None) = (&external.listen, &external.tls_dir) {
         endpoints[0].clone_from(listen);
     }
     write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
-    let place = rendezvous.path().as_os_str().as_encoded_bytes();
-    write_whole(&run_dir.rendezvous(), place)?;
+    let rendezvous_path = rendezvous.path().as_os_str().as_encoded_bytes();
+    write_whole(&run_dir.rendezvous(), rendezvous_path)?;
     let display = Display::new(config.frames(), Instant::now(), resume_point.updates);
     // Frees the shared memory that killed processes left behind.
     session::sweep_shared_memory();
@@ -92,7 +92,7 @@ pub fn run(
         run_dir,
         resume_point,
         endpoints,
-        outside,
+        external,
         rendezvous,
         display,
         shutdown,
@@ -105,13 +105,13 @@ pub fn run(
         recorder,
     };
 
-    let ran = launch.start_and_watch();
-    let ended = launch.end(ran);
+    let watched = launch.start_and_watch();
+    let result = launch.stop_all(watched);
     session::sweep_shared_memory();
     crate::shared_memory::remove_own();
     launch.display.screen.clear();
-    let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
-    let (mut summary, written) = launch.conclude(outcome, restarts_before);
+    let outcome = result.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
+    let (mut summary, written) = launch.write_summary(outcome, restarts_before);
     // An interrupted or failed run does not wait for the last evaluation.
     if outcome == Outcome::Finished {
         let evaluator = &mut launch.evaluator;
@@ -125,7 +125,7 @@ pub fn run(
     }
     // A resumed run that did no update most likely failed because of what it was resumed from, and would fail again.
     let has_learned = resumed.is_none() || summary.updates > resume_point.updates;
-    if let Err(failed) = ended {
+    if let Err(failed) = result {
         // The caller reports `failed` last. A summary that could not be written, as on a full disk, is reported before.
         if let Err(e) = written {
             console::line(&console::describe(&e));
@@ -156,21 +156,21 @@ impl Launch<'_> {
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         self.start_up_to(self.endpoints.len())?;
         let hash = self.config.run.hash();
-        let mut reached = Vec::new();
+        let mut connections = Vec::new();
         for (name, endpoint) in self.names.iter().zip(&self.endpoints) {
             let servers = &mut self.processes;
             let mut check_alive = || servers.iter_mut().try_for_each(ManagedProcess::check_alive);
             if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
-            let opened = Reached::open(name, endpoint, hash);
-            if opened.is_err() {
+            let connection = Reached::open(name, endpoint, hash);
+            if connection.is_err() {
                 // If a server died meanwhile, its exit report says more than the connection error.
                 check_alive()?;
             }
-            reached.push(opened?);
+            connections.push(connection?);
         }
-        let mut poller = Poller::new(self.config, reached);
+        let mut poller = Poller::new(self.config, connections);
         let point = &self.resume_point;
         poller.view = RunView::beginning(poller.view.plan, point.frames, point.updates);
         self.poller = Some(poller);
@@ -187,7 +187,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_whole()?;
-            self.revive()?;
+            self.restart_dead()?;
             let poller = self.poller.as_mut();
             let poller = poller.expect("it was set before the run is watched");
             poller.ask();
@@ -214,7 +214,7 @@ impl Launch<'_> {
             self.recorder.complete(&mut poller.view);
             let view = &poller.view;
             self.display.show(view);
-            self.evaluator.look(&self.display.screen);
+            self.evaluator.poll(&self.display.screen);
             if view.is_learned() {
                 return Ok(Outcome::Finished);
             }
@@ -238,31 +238,31 @@ impl Launch<'_> {
 
     /// Stops all processes in order: first the actors, which deliver their transitions; then the learner, which saves; then the
     /// replay servers, which must answer with the final counts. A second interrupt kills all at once. Returns how the run ended.
-    fn end(&mut self, ran: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
-        let failed = ran.as_ref().err().map(|e| format!("{e:#}"));
+    fn stop_all(&mut self, watched: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
+        let failed = watched.as_ref().err().map(|e| format!("{e:#}"));
         // A signal that interrupts this process may reach the others first; their exit then counts as an interruption.
-        let ran = match self.shutdown.ending.is_set() {
-            false => ran,
-            true => ran.or(Ok(Outcome::Interrupted)),
+        let watched = match self.shutdown.ending.is_set() {
+            false => watched,
+            true => watched.or(Ok(Outcome::Interrupted)),
         };
-        if matches!(ran, Ok(Outcome::Interrupted)) {
+        if matches!(watched, Ok(Outcome::Interrupted)) {
             self.display.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
         }
         let now = self.shutdown.now.clone();
         let abort = move || now.is_set();
-        let finished = matches!(ran, Ok(Outcome::Finished));
+        let finished = matches!(watched, Ok(Outcome::Finished));
         // After a failure, the learner will hardly use what the actors still hold.
-        let actors_max = match ran {
+        let actors_max = match watched {
             Ok(_) => ACTORS_DRAIN_MAX,
             Err(_) => FAILED_DRAIN_MAX,
         };
         // In a finished run, the replay server tells the actors so, and they exit.
         let shards = self.endpoints.len();
         let actors = self.processes.iter_mut().skip(shards + 1);
-        let actors = stop(actors, !finished, actors_max, &abort);
+        let actors = stop_processes(actors, !finished, actors_max, &abort);
         self.wait_for_final_checkpoint(&abort);
         let learner = self.processes.iter_mut().skip(shards).take(1);
-        let mut others = stop(learner, true, LEARNER_DRAIN_MAX, &abort);
+        let mut others = stop_processes(learner, true, LEARNER_DRAIN_MAX, &abort);
         if let Some(poller) = &mut self.poller {
             if let Err(e) = poller.ask_replay() {
                 tracing::debug!("the replay server's last answer: {e:#}");
@@ -273,14 +273,14 @@ impl Launch<'_> {
             poller.close();
         }
         let servers = self.processes.iter_mut().take(shards);
-        others.extend(stop(servers, true, REPLAY_DRAIN_MAX, &abort));
+        others.extend(stop_processes(servers, true, REPLAY_DRAIN_MAX, &abort));
         // By the last answers, all transitions are stored and learned from, and the result is saved.
         let is_learned = |Poller { view, .. }: &Poller| {
             let served = updates_served(self.config, view.replay.rows_sampled);
             view.is_learned() && view.learner.updates >= served
         };
         let is_complete = finished || self.poller.as_ref().is_some_and(is_learned);
-        let result = match ran {
+        let result = match watched {
             _ if is_complete => self.run_dir.check_whole().map(|()| Outcome::Finished),
             _ if abort() => Err(anyhow::anyhow!(
                 "stopped at once by a second interrupt: what was not saved is lost"
@@ -309,7 +309,7 @@ impl Launch<'_> {
         let (Some(learner), Some(poller)) = (learner, &mut self.poller) else {
             return;
         };
-        if learner.end().is_some() {
+        if learner.exit_status().is_some() {
             return;
         }
         // Ask once before the signal: a learner that has finished may exit right after it.
@@ -331,15 +331,15 @@ impl Launch<'_> {
     }
 
     /// Writes the last row and the summary. Prints which rows and lines are lost; the result says whether the summary was written.
-    fn conclude(
+    fn write_summary(
         &mut self,
         outcome: Outcome,
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
         let updates = self.resume_point.updates;
-        let nothing = &mut RunView::beginning(Plan::of(self.config), 0, updates);
+        let no_view = &mut RunView::beginning(Plan::of(self.config), 0, updates);
         let view = match &mut self.poller {
-            None => nothing,
+            None => no_view,
             Some(poller) => {
                 self.recorder.record(&mut poller.view, &[]);
                 &mut poller.view

@@ -12,7 +12,7 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     evaluator::Evaluator,
-    managed_process::{ManagedProcess, is_orderly},
+    managed_process::{ManagedProcess, is_orderly_exit},
     rendezvous::Rendezvous,
     run_folder::{ResumePoint, RunFolder, RunRecorder},
     view::{Display, Poller},
@@ -27,7 +27,7 @@ const PROCESS_THREADS: u32 = 1;
 
 /// The role of a process: the replay server of a shard, the learner, or the actor with an ID.
 #[derive(Clone, Copy)]
-enum Part {
+enum ProcessRole {
     ReplayServer(usize),
     Learner,
     Actor(usize),
@@ -46,7 +46,7 @@ pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
 
 /// How clients from outside the run reach the replay server.
 #[derive(Clone, Debug, Default)]
-pub struct Outside {
+pub struct ExternalAccess {
     /// The endpoint that replaces the private unix socket; with certificates, an endpoint in addition to the socket.
     pub listen: Option<String>,
     /// The folder of certificates.
@@ -64,7 +64,7 @@ pub(super) struct Launch<'a> {
     pub(super) resume_point: ResumePoint,
     /// The endpoint of each replay server, one per shard.
     pub(super) endpoints: Vec<String>,
-    pub(super) outside: Outside,
+    pub(super) external: ExternalAccess,
     pub(super) rendezvous: Rendezvous,
     pub(super) display: Display,
     pub(super) shutdown: GracefulShutdown,
@@ -81,11 +81,11 @@ pub(super) struct Launch<'a> {
 
 impl Launch<'_> {
     /// The role of the process at index `number` of `names`.
-    fn part(&self, number: usize) -> Part {
+    fn role(&self, number: usize) -> ProcessRole {
         match number.checked_sub(self.endpoints.len()) {
-            None => Part::ReplayServer(number),
-            Some(0) => Part::Learner,
-            Some(after) => Part::Actor(after - 1),
+            None => ProcessRole::ReplayServer(number),
+            Some(0) => ProcessRole::Learner,
+            Some(after) => ProcessRole::Actor(after - 1),
         }
     }
 
@@ -98,19 +98,19 @@ impl Launch<'_> {
     }
 
     fn start(&self, number: usize) -> anyhow::Result<ManagedProcess> {
-        let part = self.part(number);
-        let (command, threads) = match part {
-            Part::ReplayServer(_) => ("replay-server --keep-alive", PROCESS_THREADS),
-            Part::Learner => ("learner --keep-alive", self.config.local.learner_threads),
-            Part::Actor(_) => ("actor", PROCESS_THREADS),
+        let role = self.role(number);
+        let (command, threads) = match role {
+            ProcessRole::ReplayServer(_) => ("replay-server --keep-alive", PROCESS_THREADS),
+            ProcessRole::Learner => ("learner --keep-alive", self.config.local.learner_threads),
+            ProcessRole::Actor(_) => ("actor", PROCESS_THREADS),
         };
         let mut args: Vec<OsString> = command.split(' ').map(OsString::from).collect();
         let mut flag = |name: &str, value: &dyn AsRef<OsStr>| {
             args.extend([OsString::from(name), value.as_ref().to_owned()]);
         };
         let (local, endpoints) = (&self.config.local, &self.endpoints);
-        match part {
-            Part::ReplayServer(shard) => {
+        match role {
+            ProcessRole::ReplayServer(shard) => {
                 flag("--listen", &endpoints[shard]);
                 flag("--shard", &shard.to_string());
                 flag("--config", &self.run_dir.config());
@@ -121,23 +121,23 @@ impl Launch<'_> {
                     flag("--replay-dir", &self.run_dir.replay());
                 }
                 // The first server can also be reached from outside the run.
-                let outside = &self.outside;
+                let external = &self.external;
                 if shard == 0
-                    && let (Some(listen), Some(folder)) = (&outside.listen, &outside.tls_dir)
+                    && let (Some(listen), Some(folder)) = (&external.listen, &external.tls_dir)
                 {
                     flag("--listen", listen);
                     flag("--tls-dir", folder);
                 }
-                if shard == 0 && outside.allow_insecure {
+                if shard == 0 && external.allow_insecure {
                     args.push("--allow-insecure".into());
                 }
             }
-            Part::Learner => {
+            ProcessRole::Learner => {
                 flag("--run-dir", &self.run_dir.path());
                 flag("--device", &local.learner_device.to_string());
                 endpoints.iter().for_each(|it| flag("--connect", it));
             }
-            Part::Actor(id) => {
+            ProcessRole::Actor(id) => {
                 flag("--connect", &endpoints[id % endpoints.len()]);
                 flag("--id", &id.to_string());
                 if self.config.world.name().foreign_code().is_some() {
@@ -151,13 +151,13 @@ impl Launch<'_> {
     }
 
     /// Whether an actor has exited although frames are missing. Asks the replay server again, so that its answer is newer than the exit.
-    fn is_actor_missed(&mut self) -> bool {
+    fn is_actor_needed(&mut self) -> bool {
         let Some(poller) = &mut self.poller else {
             return false;
         };
         let actors = self.processes.iter_mut().skip(self.endpoints.len() + 1);
-        let mut ends = actors.map(ManagedProcess::end);
-        if poller.view.replay.finished || !ends.any(|it| it.is_some()) {
+        let mut exits = actors.map(ManagedProcess::exit_status);
+        if poller.view.replay.finished || !exits.any(|it| it.is_some()) {
             return false;
         }
         poller.ask_replay().is_ok() && !poller.view.replay.finished
@@ -168,25 +168,25 @@ impl Launch<'_> {
     ///
     /// # Errors
     /// A process has died that is not restarted.
-    pub(super) fn revive(&mut self) -> anyhow::Result<()> {
-        let actors_are_needed = self.is_actor_missed();
+    pub(super) fn restart_dead(&mut self) -> anyhow::Result<()> {
+        let is_actor_needed = self.is_actor_needed();
         for number in 0..self.processes.len() {
-            let part = self.part(number);
+            let role = self.role(number);
             let process = &mut self.processes[number];
-            let Some(status) = process.end() else {
+            let Some(status) = process.exit_status() else {
                 continue;
             };
-            let is_actor = matches!(part, Part::Actor(_));
-            if is_actor && is_orderly(status) && !actors_are_needed {
+            let is_actor = matches!(role, ProcessRole::Actor(_));
+            if is_actor && is_orderly_exit(status) && !is_actor_needed {
                 continue;
             }
             let (name, report) = (&self.names[number], process.exit_report());
-            let (restarts, max, with_what) = match part {
-                Part::ReplayServer(_) if self.config.local.durable => {
+            let (restarts, max, with_replay) = match role {
+                ProcessRole::ReplayServer(_) if self.config.local.durable => {
                     let kept = " with what it has kept";
                     (&mut self.server_restarts, RESTARTS_MAX, kept)
                 }
-                Part::Actor(_) if process.may_be_started_again() => {
+                ProcessRole::Actor(_) if process.is_restartable() => {
                     (&mut self.actor_restarts, ACTOR_RESTARTS_MAX, "")
                 }
                 _ => bail!("{report}"),
@@ -202,7 +202,7 @@ impl Launch<'_> {
             }
             *restarts += 1;
             self.display.screen.line(&format!(
-                "{report}\n{name} is started again{with_what} ({restarts} of {max} times in a run)"
+                "{report}\n{name} is started again{with_replay} ({restarts} of {max} times in a run)"
             ));
             session::sweep_shared_memory();
             self.processes[number] = self.start(number)?;

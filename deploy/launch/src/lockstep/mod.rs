@@ -14,9 +14,9 @@ use driml_protocol::{GracefulShutdown, Shutdown};
 use driml_settings::config::RunConfig;
 
 use crate::{
-    chosen::Which,
+    checkpoint_choice::CheckpointChoice,
     console::{self, print_wrapped},
-    evaluator::{Due, keep},
+    evaluator::{EvaluationSchedule, evaluate_and_keep},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
@@ -41,8 +41,8 @@ pub fn run(
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
     let GracefulShutdown { ending, now } = shutdown.context("listening for signals")?;
     let is_stopped = || ending.is_set();
-    exit_at_a_second(now)?;
-    let mut due = Due::new(config, run_dir)?;
+    exit_on_second_interrupt(now)?;
+    let mut schedule = EvaluationSchedule::new(config, run_dir)?;
     let events = config.local.tensorboard;
     let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed, events)?;
     let mut lockstep = match resumed {
@@ -55,31 +55,32 @@ pub fn run(
     let mut view = RunView::beginning(Plan::of(config), frames, updates);
     let mut display = Display::new(config.frames(), Instant::now(), updates);
     let screen = display.screen.clone();
-    let mut play = |updates, is_last| {
-        let Some(episodes) = due.take(updates, is_last) else {
+    let mut evaluate = |updates, is_last| {
+        let Some(episodes) = schedule.take_episodes(updates, is_last) else {
             return;
         };
-        match keep(run_dir, Which::After(updates), episodes, &is_stopped) {
-            Ok(judged) => screen.line(&judged.earned.describe()),
+        let choice = CheckpointChoice::After(updates);
+        match evaluate_and_keep(run_dir, choice, episodes, &is_stopped) {
+            Ok(ranked) => screen.line(&ranked.evaluation.describe()),
             Err(_) if is_stopped() => screen.line("an evaluation was left out"),
             Err(e) => screen.line(&format!("the run continues without an evaluation: {e:#}")),
         }
     };
-    let mut shown = Instant::now();
+    let mut shown_at = Instant::now();
     let row_frames = (config.frames() / ROWS_MIN).max(1);
-    let mut row = lockstep.replay.inserted_total() / row_frames;
+    let mut row_number = lockstep.replay.inserted_total() / row_frames;
     let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| (point.updates, point.frames));
     // The updates at the last attempt to save.
-    let mut tried = updates;
+    let mut save_tried_at = updates;
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
-    while lockstep.round()? {
+    while lockstep.run_round()? {
         let updates = lockstep.learner.updates();
-        if updates / period > tried / period {
-            tried = updates;
+        if updates / period > save_tried_at / period {
+            save_tried_at = updates;
             // A failed save does not end the training, but at the end of the run it is an error.
             if let Err(e) = lockstep.save(&folder) {
                 screen.line(&format!(
@@ -87,15 +88,15 @@ pub fn run(
                 ));
             } else {
                 saved = Some((updates, lockstep.replay.inserted_total()));
-                play(updates, false);
+                evaluate(updates, false);
             }
         }
-        let show = shown.elapsed() >= POLL;
-        if show || lockstep.replay.inserted_total() / row_frames > row {
-            row = lockstep.replay.inserted_total() / row_frames;
+        let show = shown_at.elapsed() >= POLL;
+        if show || lockstep.replay.inserted_total() / row_frames > row_number {
+            row_number = lockstep.replay.inserted_total() / row_frames;
             screen.lines(record(&mut recorder, &mut view, &mut lockstep));
             if show {
-                shown = Instant::now();
+                shown_at = Instant::now();
                 display.show(&view);
             }
         }
@@ -111,11 +112,11 @@ pub fn run(
         lockstep.save(&folder)?;
     }
     // Only after the last save: a longer run must continue from a state in which the actors have not left.
-    lockstep.end()?;
+    lockstep.finish()?;
     screen.clear();
     record(&mut recorder, &mut view, &mut lockstep);
     if outcome == Outcome::Finished {
-        play(lockstep.learner.updates(), true);
+        evaluate(lockstep.learner.updates(), true);
     }
     let missing = console::join_losses(recorder.missing());
     missing.iter().for_each(|line| console::line(line));
@@ -126,7 +127,7 @@ pub fn run(
     resume::say_next(&summary, &config.world, run_dir)
 }
 
-fn exit_at_a_second(second: Shutdown) -> anyhow::Result<()> {
+fn exit_on_second_interrupt(second: Shutdown) -> anyhow::Result<()> {
     let exit = move || {
         second.wait();
         console::line("error: stopped at once by a second interrupt: what was not saved is lost");

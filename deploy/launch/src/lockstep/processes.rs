@@ -21,14 +21,14 @@ use crate::{console, run_folder::RunFolder};
 /// The incarnation of every actor: an actor of this mode starts only once, and the number influences nothing.
 const INCARNATION: u64 = 1;
 /// The learner's number, which influences nothing either.
-const LEARNER: u64 = 1;
+const LEARNER_ID: u64 = 1;
 
-/// Version of the format of [`SavedParts`]; another version is rejected.
-const FORMAT: u32 = 5;
+/// Version of the format of [`SavedState`]; another version is rejected.
+const SAVED_STATE_FORMAT: u32 = 5;
 
 /// The saved state of a run in lockstep, without the learner.
 #[derive(Serialize, Deserialize)]
-struct SavedParts {
+struct SavedState {
     actors: Vec<CollectorState>,
     replay: Mark,
     turn: Turn,
@@ -46,9 +46,9 @@ pub(super) struct Turn {
     published: u64,
 }
 
-impl SavedParts {
+impl SavedState {
     fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
-        let mut bytes = FORMAT.to_le_bytes().to_vec();
+        let mut bytes = SAVED_STATE_FORMAT.to_le_bytes().to_vec();
         bytes.extend(codec::encode_value(self).context("writing actors and replay")?);
         Ok(bytes)
     }
@@ -60,7 +60,7 @@ impl SavedParts {
         let bytes = checkpoint::read_companion(path)?.filter(|it| !it.is_empty());
         let bytes = bytes
             .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
-        let content = bytes.strip_prefix(&FORMAT.to_le_bytes()).with_context(|| {
+        let content = bytes.strip_prefix(&SAVED_STATE_FORMAT.to_le_bytes()).with_context(|| {
             let path = path.display();
             usage!("{path} is a lockstep checkpoint of another version of driml: resume with that version")
         })?;
@@ -70,7 +70,11 @@ impl SavedParts {
 }
 
 /// Opens the replay in a run's folder; with a mark, in the state at that mark.
-fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {
+fn open_replay(
+    config: &RunConfig,
+    run_dir: &RunFolder,
+    mark: Option<Mark>,
+) -> anyhow::Result<Replay> {
     let args = PersistArgs {
         dir: run_dir.replay(),
         shard: 0,
@@ -104,7 +108,7 @@ impl Lockstep {
         let mut this = Self::in_memory(config)?;
         match this.actor_states() {
             Ok(_) => {
-                this.replay = open(config, run_dir, None)?;
+                this.replay = open_replay(config, run_dir, None)?;
                 this.join_actors()?;
             }
             Err(ActError::World(e @ EnvError::NotSaved(_))) => {
@@ -117,18 +121,18 @@ impl Lockstep {
 
     /// The components of the run in `run_dir`, in the state of its newest checkpoint.
     pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
-        let saved = SavedParts::read(run_dir)?;
+        let saved = SavedState::read(run_dir)?;
         let compute = config.local.learner_device.open(config.learner.precision)?;
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
         let learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
-        let replay = open(config, run_dir, Some(saved.replay))?;
+        let replay = open_replay(config, run_dir, Some(saved.replay))?;
         let (actors, turn) = (saved.actors, saved.turn);
         let (found, count) = (actors.len(), config.local.actors as usize);
         let resuming = "resuming the actors from the checkpoint";
         if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
             bail!("{resuming}: it holds {found} actors, and this run has {count}");
         }
-        let mut this = Self::of(config, learner, replay, turn).context(resuming)?;
+        let mut this = Self::assemble(config, learner, replay, turn).context(resuming)?;
         for (actor, state) in this.actors.iter_mut().zip(actors) {
             actor.go_on_from(state).context(resuming)?;
         }
@@ -156,13 +160,13 @@ impl Lockstep {
             acting: (header, safetensors),
             published: 0,
         };
-        let mut this = Self::of(config, learner, replay, turn)?;
+        let mut this = Self::assemble(config, learner, replay, turn)?;
         this.join_actors()?;
         Ok(this)
     }
 
     /// Assembles these components with new actors, which act with the weights of `turn`.
-    fn of(
+    fn assemble(
         config: &RunConfig,
         learner: Learner,
         replay: Replay,
@@ -171,14 +175,14 @@ impl Lockstep {
         let settings = ActorSettings::from_toml(&config.to_toml())?;
         let (header, safetensors) = &turn.acting;
         let actor = |actor| {
-            let life = Incarnation {
+            let incarnation = Incarnation {
                 actor,
                 id: INCARNATION,
                 after_updates: 0,
                 earlier_incarnations: 0,
             };
             let pool = BufferPool::new(1);
-            Collector::new(&settings, pool, life, header.version, safetensors)
+            Collector::new(&settings, pool, incarnation, header.version, safetensors)
         };
         let actors = (0..config.local.actors).map(actor);
         Ok(Self {
@@ -214,7 +218,7 @@ impl Lockstep {
             // An empty companion says that the run is in lockstep, and cannot be resumed.
             return Ok(self.learner.save_with(folder, Some(&[]))?);
         };
-        let saved = self.save_at(mark, folder);
+        let saved = self.save_with_mark(mark, folder);
         if saved.is_err() {
             self.replay.discard_mark(mark);
         }
@@ -222,9 +226,9 @@ impl Lockstep {
     }
 
     /// [`Lockstep::save`] for a run whose replay has a mark in its log.
-    fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
+    fn save_with_mark(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
         let doing = "saving the worlds for a checkpoint; at the run's start it could be done";
-        let saved = SavedParts {
+        let saved = SavedState {
             actors: self.actor_states().context(doing)?,
             replay: mark,
             turn: self.turn.clone(),
@@ -233,7 +237,7 @@ impl Lockstep {
     }
 
     /// Stores one chunk of the next actor, then does every update that it allows. Returns false once all updates are done.
-    pub(super) fn round(&mut self) -> anyhow::Result<bool> {
+    pub(super) fn run_round(&mut self) -> anyhow::Result<bool> {
         let id = self.turn.next_actor;
         self.turn.next_actor = (id + 1) % self.actors.len();
         let chunk = self.actors[id].collect(self.replay.inserted_total(), self.steps_per_chunk)?;
@@ -280,13 +284,13 @@ impl Lockstep {
             inserted: batch.header.counts.inserted,
         }]);
         let number = self.learner.updates();
-        if let Some(priorities) = batch.priority_update(LEARNER, number, &report.row_kls) {
+        if let Some(priorities) = batch.priority_update(LEARNER_ID, number, &report.row_kls) {
             let set = self.replay.set_priorities(&priorities);
             set.map_err(anyhow::Error::msg)
                 .context("the replay rejected priorities")?;
         }
         self.learner.write_status(&report, &mut self.turn.status);
-        if let Some(affinity) = self.learner.affinity_update(LEARNER) {
+        if let Some(affinity) = self.learner.affinity_update(LEARNER_ID) {
             let set = self.replay.set_affinity(&affinity);
             set.map_err(anyhow::Error::msg)?;
         }
@@ -313,12 +317,12 @@ impl Lockstep {
     }
 
     /// Publishes the last weights, and lets the actors leave.
-    pub(super) fn end(&mut self) -> anyhow::Result<()> {
+    pub(super) fn finish(&mut self) -> anyhow::Result<()> {
         if self.turn.published != self.learner.updates() {
             self.publish()?;
         }
-        for (id, (actor, unwanted)) in self.actors.iter().zip(&self.turn.unwanted).enumerate() {
-            let produced = actor.produced() - unwanted;
+        for (id, (actor, surplus)) in self.actors.iter().zip(&self.turn.unwanted).enumerate() {
+            let produced = actor.produced() - surplus;
             self.replay.leave(&Leave {
                 actor: id as u32,
                 incarnation: INCARNATION,

@@ -24,8 +24,8 @@ fn weights(config: &RunConfig) -> String {
 }
 
 fn ended(mut lockstep: Lockstep) -> String {
-    while lockstep.round().unwrap() {}
-    lockstep.end().unwrap();
+    while lockstep.run_round().unwrap() {}
+    lockstep.finish().unwrap();
     sha256(&lockstep)
 }
 
@@ -87,7 +87,7 @@ fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lo
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());
     let mut lockstep = Lockstep::begin(config, &run_dir).unwrap();
-    (0..rounds).for_each(|_| assert!(lockstep.round().unwrap()));
+    (0..rounds).for_each(|_| assert!(lockstep.run_round().unwrap()));
     lockstep.save(&run_dir.checkpoints()).unwrap();
     (folder, run_dir, lockstep)
 }
@@ -112,7 +112,7 @@ fn a_run_that_was_interrupted_computes_what_it_would_have() {
         let whole = weights(&config);
         for (rounds, lost) in [(1, 3), (14, 5)] {
             let (_folder, run_dir, mut lockstep) = begun(&config, rounds);
-            (0..lost).for_each(|_| assert!(lockstep.round().unwrap()));
+            (0..lost).for_each(|_| assert!(lockstep.run_round().unwrap()));
             drop(lockstep);
             let resumed = ended(Lockstep::resume(&config, &run_dir).unwrap());
             let what = format!("{world} {agent} {sets:?} after {rounds} rounds");
@@ -134,12 +134,12 @@ fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
     let config = config("mspacman", "driml-ada", 800, &[]);
     let whole = weights(&config);
     let (_folder, run_dir, mut lockstep) = begun(&config, 0);
-    while lockstep.round().unwrap() {
+    while lockstep.run_round().unwrap() {
         lockstep.save(&run_dir.checkpoints()).unwrap();
         drop(lockstep);
         lockstep = Lockstep::resume(&config, &run_dir).unwrap();
     }
-    lockstep.end().unwrap();
+    lockstep.finish().unwrap();
     assert_eq!(sha256(&lockstep), whole);
 }
 

@@ -5,7 +5,7 @@ use std::fs;
 use driml_protocol::Played;
 
 use super::*;
-use crate::testing::with;
+use crate::testing::make;
 
 /// A shard with `frames` frames and `ended` episodes that have ended. The server keeps the episodes after the first `let_go`, thirty
 /// per answer. The return of an episode is `first` plus its number.
@@ -30,7 +30,7 @@ const fn shard(frames: u64, let_go: u64, ended: u64, first: u64) -> Shard {
 
 impl Shard {
     fn status(&self) -> ReplayStatus {
-        with(|it: &mut ReplayStatus| {
+        make(|it: &mut ReplayStatus| {
             (it.transitions_inserted, it.episodes) = (self.frames, self.ended);
         })
     }

@@ -21,11 +21,11 @@ use crate::metrics::{cell, rounded};
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
 /// The name of a checkpoint that is about to become the best. A checkpoint with this name is left from a process that was killed.
-const NEW: &str = ".new";
+const NEW_BEST: &str = ".new";
 
 /// The return of a checkpoint over whole episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-pub struct Evaluated {
+pub struct EvaluationRow {
     /// Seconds of the run at the checkpoint, from the metrics; none without metrics.
     pub seconds: Option<f64>,
     /// Frames of the run at the checkpoint, likewise.
@@ -42,7 +42,7 @@ pub struct Evaluated {
     pub deviation: f64,
 }
 
-impl Evaluated {
+impl EvaluationRow {
     /// Reads all evaluations in a run's folder, in the order in which they were made; none without the file.
     ///
     /// # Errors
@@ -64,7 +64,7 @@ impl Evaluated {
 
     /// An evaluation of the checkpoint after `updates`. The run's time and frames at that point come from the row of metrics at or
     /// before the checkpoint, or else from the first row, which is written within about a second.
-    pub(crate) fn at(
+    pub(crate) fn new(
         folder: &RunFolder,
         updates: u64,
         episodes: u32,
@@ -94,7 +94,7 @@ impl Evaluated {
     }
 
     /// Adds the evaluation to the run's table, which is made if it does not exist.
-    pub(crate) fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
+    pub(crate) fn append_to(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
         let mut file = open_to_append(&path)?;
@@ -135,27 +135,31 @@ impl Candidate {
 
     /// Adds the evaluation to the run's table. Keeps the checkpoint if it earned more than the best before it, over at least as many
     /// episodes. Returns whether it is the best.
-    pub(crate) fn judge(&self, folder: &RunFolder, earned: &Evaluated) -> anyhow::Result<bool> {
+    pub(crate) fn keep_if_best(
+        &self,
+        folder: &RunFolder,
+        row: &EvaluationRow,
+    ) -> anyhow::Result<bool> {
         let path = folder.evaluations();
         let file = open_to_append(&path)?;
         // If several processes evaluate one run, each compares with what the others kept.
         if let Err(e) = file.lock() {
             tracing::debug!("{} cannot be locked: {e}", path.display());
         }
-        let is_best = Evaluated::best(folder)?.is_none_or(|best| {
-            best.updates == earned.updates
-                || earned.episodes >= best.episodes && earned.mean_return > best.mean_return
+        let is_best = EvaluationRow::best(folder)?.is_none_or(|best| {
+            best.updates == row.updates
+                || row.episodes >= best.episodes && row.mean_return > best.mean_return
         });
         if is_best {
-            self.replace(&folder.best())?;
+            self.replace_best(&folder.best())?;
         }
-        earned.add(folder)?;
+        row.append_to(folder)?;
         Ok(is_best)
     }
 
     /// Makes this checkpoint the only one in the folder `best`.
-    fn replace(&self, best: &Path) -> anyhow::Result<()> {
-        let (new, path) = (best.join(NEW), best.join(&self.name));
+    fn replace_best(&self, best: &Path) -> anyhow::Result<()> {
+        let (new, path) = (best.join(NEW_BEST), best.join(&self.name));
         let doing = || format!("keeping {}", path.display());
         if new.exists() {
             fs::remove_dir_all(&new).with_context(doing)?;
@@ -185,14 +189,14 @@ mod tests {
     use super::*;
 
     /// Judges a checkpoint after `updates`, which the learner deletes while it is played.
-    fn judge(folder: &RunFolder, updates: u64, mean: f64, episodes: u32) -> anyhow::Result<bool> {
+    fn keep(folder: &RunFolder, updates: u64, mean: f64, episodes: u32) -> anyhow::Result<bool> {
         let path = folder.checkpoints().join(format!("checkpoint-{updates}"));
         fs::create_dir_all(&path).unwrap();
         fs::write(path.join("weights"), updates.to_string()).unwrap();
         let candidate = Candidate::read(&path).unwrap();
         fs::remove_dir_all(path).unwrap();
-        let earned = Evaluated::at(folder, updates, episodes, (mean, 0.5));
-        candidate.judge(folder, &earned)
+        let row = EvaluationRow::new(folder, updates, episodes, (mean, 0.5));
+        candidate.keep_if_best(folder, &row)
     }
 
     #[test]
@@ -201,28 +205,28 @@ mod tests {
         let folder = RunFolder::new(root.path());
         let metrics = "seconds,frames,updates\n0.5,100,0\n1.5,300,9\n2.5,500,25\n";
         fs::write(folder.metrics(), metrics).unwrap();
-        assert_eq!(Evaluated::all(&folder).unwrap(), []);
-        let judge = |updates, mean, episodes| judge(&folder, updates, mean, episodes).unwrap();
-        assert!(judge(10, -1.0, 4));
-        assert!(judge(20, 3.0, 4));
-        assert!(!judge(30, 3.0, 4), "the first of equals stays");
-        assert!(!judge(40, 9.0, 1), "one episode is luck");
+        assert_eq!(EvaluationRow::all(&folder).unwrap(), []);
+        let keep = |updates, mean, episodes| keep(&folder, updates, mean, episodes).unwrap();
+        assert!(keep(10, -1.0, 4));
+        assert!(keep(20, 3.0, 4));
+        assert!(!keep(30, 3.0, 4), "the first of equals stays");
+        assert!(!keep(40, 9.0, 1), "one episode is luck");
         let best = driml_learner::checkpoint::list(&folder.best()).unwrap();
         assert_eq!(best.len(), 1);
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
         // The remains of a process that was killed do not count as a checkpoint.
-        fs::create_dir(folder.best().join(NEW)).unwrap();
+        fs::create_dir(folder.best().join(NEW_BEST)).unwrap();
         let again = driml_learner::checkpoint::list(&folder.best()).unwrap();
         assert_eq!(again, best);
-        let all = Evaluated::all(&folder).unwrap();
+        let all = EvaluationRow::all(&folder).unwrap();
         let at = all.iter().map(|it| (it.frames, it.updates, it.mean_return));
         let (early, late) = (Some(300), Some(500));
         let first = [(early, 10, -1.0), (early, 20, 3.0)];
         let others = [(late, 30, 3.0), (late, 40, 9.0)];
         assert!(at.eq(first.into_iter().chain(others)), "{all:?}");
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
-        let said = Evaluated::all(&folder).unwrap_err().to_string();
+        let said = EvaluationRow::all(&folder).unwrap_err().to_string();
         assert!(said.contains("is not a table of evaluations"), "{said}");
     }
 
@@ -232,26 +236,26 @@ mod tests {
         let folder = &RunFolder::new(root.path());
         std::thread::scope(|scope| {
             for updates in 1..=8 {
-                scope.spawn(move || judge(folder, updates, updates as f64, 4).unwrap());
+                scope.spawn(move || keep(folder, updates, updates as f64, 4).unwrap());
             }
         });
-        assert_eq!(Evaluated::best(folder).unwrap().unwrap().updates, 8);
+        assert_eq!(EvaluationRow::best(folder).unwrap().unwrap().updates, 8);
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
-        assert_eq!(Evaluated::all(folder).unwrap().len(), 8);
+        assert_eq!(EvaluationRow::all(folder).unwrap().len(), 8);
     }
 
     #[test]
     fn the_best_stays_until_another_has_its_place() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
-        assert!(judge(&folder, 20, 3.0, 4).unwrap());
+        assert!(keep(&folder, 20, 3.0, 4).unwrap());
         let taken = folder.best().join("checkpoint-50");
         fs::write(&taken, "").unwrap();
-        judge(&folder, 50, 9.0, 4).unwrap_err();
+        keep(&folder, 50, 9.0, 4).unwrap_err();
         fs::remove_file(taken).unwrap();
-        assert_eq!(Evaluated::best(&folder).unwrap().unwrap().updates, 20);
-        assert!(judge(&folder, 50, 9.0, 4).unwrap());
-        assert_eq!(Evaluated::best(&folder).unwrap().unwrap().updates, 50);
+        assert_eq!(EvaluationRow::best(&folder).unwrap().unwrap().updates, 20);
+        assert!(keep(&folder, 50, 9.0, 4).unwrap());
+        assert_eq!(EvaluationRow::best(&folder).unwrap().unwrap().updates, 50);
     }
 
     #[test]
@@ -260,13 +264,13 @@ mod tests {
         let folder = RunFolder::new(root.path());
         let metrics = "seconds,frames,updates\n1.0,300,120\n2.0,500,240\n";
         fs::write(folder.metrics(), metrics).unwrap();
-        let earned = Evaluated::at(&folder, 100, 1, (2.0, 0.0));
-        assert_eq!((earned.frames, earned.seconds), (Some(300), Some(1.0)));
+        let row = EvaluationRow::new(&folder, 100, 1, (2.0, 0.0));
+        assert_eq!((row.frames, row.seconds), (Some(300), Some(1.0)));
 
         fs::remove_file(folder.metrics()).unwrap();
-        let earned = Evaluated::at(&folder, 5, 1, (2.0, 0.0));
-        assert_eq!((earned.frames, earned.seconds), (None, None));
-        earned.add(&folder).unwrap();
-        assert_eq!(Evaluated::all(&folder).unwrap(), [earned]);
+        let row = EvaluationRow::new(&folder, 5, 1, (2.0, 0.0));
+        assert_eq!((row.frames, row.seconds), (None, None));
+        row.append_to(&folder).unwrap();
+        assert_eq!(EvaluationRow::all(&folder).unwrap(), [row]);
     }
 }

@@ -16,7 +16,7 @@ pub(crate) use self::{
     table::AppendLog,
 };
 pub use self::{
-    evaluations::Evaluated,
+    evaluations::EvaluationRow,
     folder::RunFolder,
     metrics::{Progress, ResumePoint, progress},
     recorder::RunRecorder,

@@ -7,7 +7,7 @@ use expect_test::expect;
 use super::*;
 use crate::{
     run_folder::{Earned, LastPlay},
-    testing::{self, with},
+    testing::{self, make},
 };
 
 fn settings() -> RunConfig {
@@ -25,7 +25,7 @@ fn open(
 
 /// A point where a run is resumed, with 16 rows per update.
 fn point(updates: u64) -> ResumePoint {
-    with(|it: &mut ResumePoint| {
+    make(|it: &mut ResumePoint| {
         (it.updates, it.rows, it.frames) = (updates, 31 * 16, 2_000);
         it.frames_max = 9_999;
     })
@@ -255,7 +255,7 @@ fn summary(replay: ReplayStatus) -> Summary {
 
 #[test]
 fn next_steps_stand_in_columns() {
-    let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = 1_280);
+    let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = 1_280);
     let earned = |mean, low, high| Earned { mean, low, high };
     let mut summary = summary(replay);
     summary.played = Some(LastPlay {

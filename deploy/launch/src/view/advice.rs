@@ -221,13 +221,13 @@ mod tests {
     use expect_test::expect;
 
     use super::*;
-    use crate::{run_view::Plan, testing::with};
+    use crate::{run_view::Plan, testing::make};
 
     /// A run whose only replay server does not answer any more; `waiting` is the state in its last answer.
     fn silent(is_gone: bool, waiting: Waiting) -> RunView {
         let mut view = RunView::new(Plan::default());
-        view.take_replay(vec![with(|it: &mut ReplayStatus| it.waiting = waiting)]);
-        view.servers = vec![with(|it: &mut ServerAnswer| {
+        view.take_replay(vec![make(|it: &mut ReplayStatus| it.waiting = waiting)]);
+        view.servers = vec![make(|it: &mut ServerAnswer| {
             it.endpoint = "tcp/host:1".into();
             (it.error, it.is_gone) = (Some("no answer".into()), is_gone);
         })];

@@ -155,7 +155,7 @@ mod tests {
     use super::*;
     use crate::{
         run_view::{Plan, Speed, Spread},
-        testing::{view, with},
+        testing::{make, view},
     };
 
     fn display() -> Display {
@@ -163,7 +163,7 @@ mod tests {
     }
 
     fn plan(frames: u64, updates: u64) -> Plan {
-        with(|it: &mut Plan| (it.frames_planned, it.updates_planned) = (frames, updates))
+        make(|it: &mut Plan| (it.frames_planned, it.updates_planned) = (frames, updates))
     }
 
     #[test]
@@ -178,7 +178,7 @@ mod tests {
             actors_waiting: 23,
             ..ReplayStatus::default()
         };
-        let learner = with(|it: &mut LearnerStatus| {
+        let learner = make(|it: &mut LearnerStatus| {
             (it.updates, it.c51_kl) = (1000, 0.1234);
             it.losses = vec![("dim_4t4".into(), 4.0)];
         });
@@ -198,8 +198,8 @@ mod tests {
     fn before_the_first_update_there_is_no_loss_and_no_time_left() {
         let mut display = display();
         let mut shown = |frames, updates| {
-            let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = frames);
-            let learner = with(|it: &mut LearnerStatus| it.updates = updates);
+            let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = frames);
+            let learner = make(|it: &mut LearnerStatus| it.updates = updates);
             let view = view(plan(8_000, 218), replay, Some(learner));
             display.show(&view);
             display.text(&view).join("\n")
@@ -219,7 +219,7 @@ mod tests {
     #[test]
     fn an_actor_that_has_gone_is_none_of_those_connected() {
         let said = [2, 1].map(|actors| {
-            waiting(&with(|it: &mut ReplayStatus| {
+            waiting(&make(|it: &mut ReplayStatus| {
                 it.waiting = Waiting::ActorsWaitForLearner;
                 (it.actors, it.actors_waiting) = (actors, 2);
             }))

@@ -15,7 +15,7 @@ use driml_settings::config::RunConfig;
 use zenoh::{Session, Wait};
 
 use crate::{
-    endpoint::NAMESPACE,
+    endpoint::DEFAULT_NAMESPACE,
     run_view::{Plan, RunView, ServerAnswer},
 };
 
@@ -157,7 +157,7 @@ impl Reached {
     /// Connects to a server that `driml train` has started at `endpoint`, of the run with this hash.
     pub fn open(name: &str, endpoint: &str, spec_hash: u64) -> anyhow::Result<Self> {
         let session = session::open(&Endpoints::to(vec![endpoint.to_owned()]))?;
-        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
+        let keys = Keys::new(DEFAULT_NAMESPACE).map_err(Usage)?;
         Ok(Self {
             name: name.to_owned(),
             endpoint: endpoint.to_owned(),

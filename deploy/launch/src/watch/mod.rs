@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use self::watched::Watched;
 use crate::{
-    chosen::config_of,
+    checkpoint_choice::read_config,
     console, resume,
     run_folder::{Outcome, Progress, RunFolder, Summary, commands, plot, progress},
     view::{Poller, PrometheusFile, json, needed, page, recovery},
@@ -235,7 +235,7 @@ impl Over {
 /// # Errors
 /// The folder has no settings: it is not a run's, or the processes of the run were started by hand.
 pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
-    let config = config_of(folder)?;
+    let config = read_config(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints());
     let endpoints = endpoints.unwrap_or_default();
     let mut lines = endpoints.lines();

@@ -9,7 +9,7 @@ use driml_protocol::{RunSpec, Waiting};
 use driml_settings::config::RunConfig;
 
 use crate::{
-    chosen::config_of,
+    checkpoint_choice::read_config,
     console,
     launcher::process_names,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table, Uncounted},
@@ -153,7 +153,7 @@ fn record(
 
 fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
     let there = match folder.config().exists() {
-        true => config_of(folder)?.run,
+        true => read_config(folder)?.run,
         false => return Ok(()),
     };
     if there.hash() == config.run.hash() {

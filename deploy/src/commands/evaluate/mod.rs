@@ -16,10 +16,10 @@ use clap::{Args, ValueEnum};
 use driml_actor::Step;
 use driml_figure::Film;
 use driml_launch::{
-    chosen::{Weights, Which},
+    checkpoint_choice::{CheckpointChoice, WeightsChoice},
     console::{self, Screen, print},
-    evaluate::{EPSILON, Levels, Player, Who, levels},
-    evaluator::{Judged, keep},
+    evaluate::{EPSILON, Levels, Player, PolicyKind, world_with_levels},
+    evaluator::{RankedEvaluation, evaluate_and_keep},
     metrics::rounded,
     pretrained,
     run_folder::{RunFolder, write_whole},
@@ -55,10 +55,10 @@ pub(crate) struct EvaluateArgs {
     pub(crate) epsilon: Option<f64>,
     /// Checkpoint to play: a number of updates, or "best" for the best of evaluations.csv [default: newest]
     #[arg(long, value_name = "UPDATES")]
-    pub(crate) checkpoint: Option<Which>,
+    pub(crate) checkpoint: Option<CheckpointChoice>,
     /// Weights to play [default: average]
     #[arg(long, value_enum)]
-    pub(crate) weights: Option<Weights>,
+    pub(crate) weights: Option<WeightsChoice>,
     /// Write the weights as f16, with the run's settings, into this file, and play nothing
     #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["episodes", "levels", "seed", "epsilon", "keep", "exact", "returns", "json", "record"])]
     pub(crate) export: Option<PathBuf>,
@@ -97,7 +97,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let folder = folder.expect("clap asks for one of the two");
     let pretrained = pretrained::find(folder)?;
     let folder = RunFolder::new(folder);
-    let which = args.checkpoint.unwrap_or_default();
+    let choice = args.checkpoint.unwrap_or_default();
     if pretrained.is_some() && (args.checkpoint.is_some() || args.weights.is_some() || args.keep) {
         bail!(usage!(
             "{} is a single network: --checkpoint, --weights and --keep are for the folder of a run",
@@ -108,21 +108,21 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         let shutdown = Shutdown::on_signals(args.exit_with_parent);
         let shutdown = shutdown.context("listening for signals")?;
         let episodes = args.episodes;
-        let play = move || keep(&folder, which, episodes, &|| false);
-        let judged = shutdown.unless_set("evaluation", play);
-        let judged = judged.context("starting a thread")?.ok_or(Interrupted)??;
-        let earned = judged.earned.describe();
-        return print(&format!("{earned}{}\n", compare_with_best(&judged)));
+        let play = move || evaluate_and_keep(&folder, choice, episodes, &|| false);
+        let ranked = shutdown.unless_set("evaluation", play);
+        let ranked = ranked.context("starting a thread")?.ok_or(Interrupted)??;
+        let evaluation = ranked.evaluation.describe();
+        return print(&format!("{evaluation}{}\n", compare_with_best(&ranked)));
     }
     let mut player = match pretrained {
         Some(player) => player,
-        None => Player::load_at(&folder, which, args.weights.unwrap_or_default())?,
+        None => Player::load(&folder, choice, args.weights.unwrap_or_default())?,
     };
     if let Some(path) = &args.export {
         return export(&player, path);
     }
     if args.exact {
-        player = player.exact();
+        player = player.with_f32();
     }
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::line)?;
@@ -133,7 +133,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         anyhow::Ok((path, file))
     });
     let table = table.transpose()?;
-    let world = levels(&player.config.world, args.levels)?;
+    let world = world_with_levels(&player.config.world, args.levels)?;
     let shutdown = Shutdown::on_signals(None).context("listening for signals")?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
@@ -158,7 +158,10 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     ))?;
     let episodes = args.episodes as usize;
     let mut played: Vec<PolicyReturns<'_>> = Vec::new();
-    for (who, name) in [(Who::Agent, &*spec.agent), (Who::Random, "random")] {
+    for (policy, name) in [
+        (PolicyKind::Agent, &*spec.agent),
+        (PolicyKind::Random, "random"),
+    ] {
         let mut screen = Screen::new(episodes as u64, TEMPLATE);
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
@@ -168,7 +171,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
                 false => ControlFlow::Continue(()),
             }
         };
-        let returns = player.play_watched(who, &world, episodes, args.seed, watch);
+        let returns = player.play(policy, &world, episodes, args.seed, watch);
         screen.clear();
         let returns = returns?;
         if shutdown.is_set() {
@@ -209,10 +212,10 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
 }
 
 /// Returns how the checkpoint compares with the run's best one, as the end of a sentence.
-fn compare_with_best(judged: &Judged) -> String {
-    match &judged.best_before {
-        _ if judged.is_best => ", the most so far".into(),
-        Some(best) if best.episodes > judged.earned.episodes => format!(
+fn compare_with_best(ranked: &RankedEvaluation) -> String {
+    match &ranked.best_before {
+        _ if ranked.is_best => ", the most so far".into(),
+        Some(best) if best.episodes > ranked.evaluation.episodes => format!(
             "; the best stays: it was played for {} episodes, and fewer do not compare",
             best.episodes
         ),

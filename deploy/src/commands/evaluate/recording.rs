@@ -130,7 +130,7 @@ impl Recording {
                 None => self.shots.len(),
             };
             let states = &step.states[..step.states.len() / played * num_states];
-            seen = Some(viewer.look(states)?);
+            seen = Some(viewer.compute(states)?);
         }
         for (i, (shot, frame)) in self.shots.iter_mut().zip(frames).enumerate() {
             if !shot.is_over(self.episodes_max) {

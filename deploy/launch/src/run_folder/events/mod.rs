@@ -160,7 +160,7 @@ fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::with;
+    use crate::testing::make;
 
     #[test]
     fn counts_are_those_since_the_last_histogram() {
@@ -173,7 +173,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let mut events = Events::create(&folder, 0).unwrap();
-        let replay = with(|it: &mut ReplayStatus| {
+        let replay = make(|it: &mut ReplayStatus| {
             (it.transitions_inserted, it.k_histogram) = (70, vec![0, 4, 1]);
         });
         let points = [("return/mean_return".to_owned(), 1.5)];

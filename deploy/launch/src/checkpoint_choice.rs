@@ -13,7 +13,7 @@ use crate::run_folder::RunFolder;
 
 /// Which checkpoint of a run to use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Which {
+pub enum CheckpointChoice {
     /// The checkpoint with the most updates.
     #[default]
     Newest,
@@ -25,7 +25,7 @@ pub enum Which {
 
 /// Which weights of a checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum Weights {
+pub enum WeightsChoice {
     /// Averaged weights if the run has them (learner.update.average_tau), else online weights
     #[default]
     Average,
@@ -33,7 +33,7 @@ pub enum Weights {
     Online,
 }
 
-impl FromStr for Which {
+impl FromStr for CheckpointChoice {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -53,7 +53,7 @@ impl FromStr for Which {
 }
 
 /// Reads the settings of the run in `folder`.
-pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
+pub fn read_config(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     let path = folder.config();
     let text = std::fs::read_to_string(&path).map_err(|e| {
         usage!(
@@ -65,24 +65,27 @@ pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     Ok(RunConfig::parse(&path.display().to_string(), &text)?)
 }
 
-pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
+pub(crate) fn checkpoint_path(
+    folder: &RunFolder,
+    choice: CheckpointChoice,
+) -> anyhow::Result<PathBuf> {
     let run = folder.display();
-    let place = match which {
-        Which::Best => folder.best(),
-        Which::Newest | Which::After(_) => folder.checkpoints(),
+    let place = match choice {
+        CheckpointChoice::Best => folder.best(),
+        CheckpointChoice::Newest | CheckpointChoice::After(_) => folder.checkpoints(),
     };
     let mut all = checkpoint::list(&place)?;
     let known: Vec<_> = all.iter().map(|(updates, _)| updates.to_string()).collect();
-    let chosen = match which {
-        Which::After(wanted) => all.into_iter().find(|(updates, _)| *updates == wanted),
-        Which::Newest | Which::Best => all.pop(),
+    let chosen = match choice {
+        CheckpointChoice::After(wanted) => all.into_iter().find(|(updates, _)| *updates == wanted),
+        CheckpointChoice::Newest | CheckpointChoice::Best => all.pop(),
     };
-    chosen.map(|(_, path)| path).with_context(|| match which {
-        Which::Best => usage!(
+    chosen.map(|(_, path)| path).with_context(|| match choice {
+        CheckpointChoice::Best => usage!(
             "{run} has no best checkpoint: none was evaluated. Train with --eval-interval UPDATES, or evaluate one \
              with `driml evaluate {run} --checkpoint UPDATES --keep`"
         ),
-        Which::After(wanted) if !known.is_empty() => usage!(
+        CheckpointChoice::After(wanted) if !known.is_empty() => usage!(
             "{run} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
             known.join(", ")
         ),
