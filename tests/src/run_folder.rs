@@ -93,7 +93,7 @@ impl RunFolder {
     #[track_caller]
     pub fn column(&self, name: &str) -> Vec<String> {
         let table = self.table("metrics.csv");
-        let at = table.place(name);
+        let at = table.column_index(name);
         let at = at.unwrap_or_else(|| panic!("{name} is not in {:?}", table.header));
         table.rows.iter().map(|row| row[at].to_owned()).collect()
     }

@@ -11,7 +11,7 @@ use driml_launch::{
     console::{self, aligned},
     managed_process::ManagedProcess,
     run_folder::{RunFolder, Summary},
-    view::{Poller, Reached},
+    view::{Poller, ServerConnection},
 };
 use driml_machine::units::format_number;
 use driml_protocol::{LearnerStatus, ReplayStatus};
@@ -190,7 +190,7 @@ impl Run {
         let run_dir = folder.path().join("run").display().to_string();
         let args = [&["local", "--no-play", "--run-dir", &*run_dir][..], flags].concat();
         let launcher = subprocess::start("launcher", &args, &endpoint, sets, folder.path())?;
-        let reached = Reached::open("replay-server", &endpoint, config.run.hash())?;
+        let reached = ServerConnection::open("replay-server", &endpoint, config.run.hash())?;
         Ok(Self {
             poller: Poller::new(&config, vec![reached]),
             launcher,
@@ -203,8 +203,8 @@ impl Run {
         if self.launcher.exit_status().is_some() {
             bail!("{}", self.launcher.exit_report());
         }
-        let answers = self.poller.ask_replay();
-        if answers.and_then(|()| self.poller.ask_learner()).is_err() {
+        let answers = self.poller.poll_replay();
+        if answers.and_then(|()| self.poller.poll_learner()).is_err() {
             return Ok(None);
         }
         Ok(Some(StatusSample {

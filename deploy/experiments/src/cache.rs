@@ -11,7 +11,7 @@ use anyhow::{Context, bail, ensure};
 use driml_figure::{Figure, Look};
 use driml_launch::{
     console::{self, print},
-    run_folder::write_whole,
+    run_folder::write_atomically,
 };
 use driml_machine::{
     error::{Interrupted, usage},
@@ -93,7 +93,7 @@ impl Session {
                 folder.display()
             )),
             Err(_) if report_only => {}
-            Err(_) => write_whole(&path, settings.as_bytes())?,
+            Err(_) => write_atomically(&path, settings.as_bytes())?,
         }
         let shutdown = GracefulShutdown::on_repeated_signals(None);
         let shutdown = shutdown.context("listening for interrupts")?;
@@ -134,7 +134,7 @@ impl Session {
 
     fn write<T: Serialize>(&self, key: &str, kept: &Kept<T>) -> anyhow::Result<()> {
         let text = serde_json::to_vec(kept).context("keeping a piece")?;
-        write_whole(&self.piece_path(key), &text)
+        write_atomically(&self.piece_path(key), &text)
     }
 
     fn piece_path(&self, key: &str) -> PathBuf {
@@ -268,7 +268,7 @@ impl Session {
         let values = context! { missing => self.missing, ..values };
         let text = page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
-        write_whole(&path, text.as_bytes())?;
+        write_atomically(&path, text.as_bytes())?;
         print(&format!("{}{}\n", summary(&text), path.display()))?;
         self.check_made()
     }

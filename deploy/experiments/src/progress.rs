@@ -7,7 +7,7 @@ use driml_launch::console::Screen;
 use driml_machine::{error::Interrupted, units::rough_duration};
 use driml_protocol::GracefulShutdown;
 
-const TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
+const PROGRESS_TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
 
 /// Counts units of work, such as updates.
 #[derive(Debug)]
@@ -30,7 +30,7 @@ impl Progress {
             found: 0,
             started: Instant::now(),
             what: String::new(),
-            screen: Screen::new(total, TEMPLATE),
+            screen: Screen::new(total, PROGRESS_TEMPLATE),
             shutdown,
         }
     }
@@ -117,6 +117,6 @@ mod tests {
         assert_eq!(progress.seconds_left(5.0), None);
         progress.advance(10).unwrap();
         assert_eq!(progress.seconds_left(5.0), Some(25.0));
-        assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
+        assert!(indicatif::ProgressStyle::with_template(PROGRESS_TEMPLATE).is_ok());
     }
 }

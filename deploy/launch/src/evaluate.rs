@@ -83,8 +83,7 @@ impl Player {
     ) -> anyhow::Result<Self> {
         let (model, update) = (&config.model, &config.learner.update);
         let hash = config.run.hash();
-        let loaded = checkpoint::load(checkpoint, model, update, &Compute::CPU, hash)?;
-        let mut agent = loaded.agent;
+        let mut agent = checkpoint::load(checkpoint, model, update, &Compute::CPU, hash)?.agent;
         let is_averaged = weights == WeightsChoice::Average && agent.copy_average_to_online()?;
         Ok(Self {
             network: agent.online().clone(),

@@ -10,7 +10,7 @@ use crate::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice},
     console,
     evaluate::{Levels, Player, PolicyKind, stop_when, world_with_levels},
-    run_folder::{Earned, LastPlay, RunFolder, Summary},
+    run_folder::{LastPlay, ReturnInterval, RunFolder, Summary},
 };
 
 /// Episodes played at once, one per environment. A batch counts as a whole, so that long episodes are not left out.
@@ -76,8 +76,8 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
     Ok(Some(LastPlay {
         weights: player.weights_name().into(),
         episodes: agent.len() as u64,
-        agent: Earned::of(&agent),
-        random: Earned::of(&random),
+        agent: ReturnInterval::new(&agent),
+        random: ReturnInterval::new(&random),
     }))
 }
 
@@ -95,8 +95,8 @@ mod tests {
         let mut config = config("smoke", "chain", "c51", &[]);
         assert!(!config.local.play, "a test run is not played");
         config.local.play = true;
-        let view = RunView::new(Plan::of(&config));
-        let mut summary = Summary::of(Outcome::Finished, &view, 2.0, ResumePoint::default());
+        let view = RunView::new(Plan::new(&config));
+        let mut summary = Summary::new(Outcome::Finished, &view, 2.0, ResumePoint::default());
         let before = summary.clone();
         let folder = RunFolder::new("no-such-run");
         play(&mut summary, &config, &folder, &|| false);

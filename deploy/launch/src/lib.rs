@@ -4,13 +4,13 @@
 //! them in this process and in a fixed order. [`run_folder::RunFolder`] knows the names of a run's files:
 //!
 //! ```
-//! use driml_launch::run_folder::{RunFolder, Summary, progress};
+//! use driml_launch::run_folder::{RunFolder, Summary, read_progress};
 //!
 //! let folder = RunFolder::new("runs/chain-c51-seed1");
 //! assert!(folder.metrics().ends_with("chain-c51-seed1/metrics.csv"));
 //! if Summary::is_finished(&folder) {
 //!     println!("{}", Summary::read(&folder)?.describe(&folder));
-//! } else if let Some(so_far) = progress(&folder) {
+//! } else if let Some(so_far) = read_progress(&folder) {
 //!     println!("{} frames, {} episodes", so_far.frames, so_far.episodes);
 //! }
 //! # Ok::<(), anyhow::Error>(())

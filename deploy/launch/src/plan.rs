@@ -55,8 +55,7 @@ pub fn describe(
         true => " and about as much of disk, in the run folder",
         false => "",
     };
-    let done = resume_point.updates as f64 / updates.max(1) as f64;
-    let left = (1.0 - done).max(0.0);
+    let left = (1.0 - resume_point.updates as f64 / updates.max(1) as f64).max(0.0);
     let time = about(estimate(config, machine.cores).mul_f64(left));
     let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);

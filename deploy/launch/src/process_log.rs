@@ -91,8 +91,8 @@ impl ProcessLog {
     }
 
     /// How many lines could not be written, and why; none if all were written.
-    pub(crate) fn missing(&self) -> Option<String> {
-        lock(&self.kept).file.missing()
+    pub(crate) fn loss_message(&self) -> Option<String> {
+        lock(&self.kept).file.loss_message()
     }
 
     /// Waits until everything that the process wrote is in the log. The process must have ended, and no other process may hold the
@@ -124,8 +124,7 @@ impl Kept {
 /// Whether a log line is a warning or an error: the level is the second word, after the time. The `error:` line with which a process
 /// ends does not count, as the exit report contains it.
 fn is_warning(line: &str) -> bool {
-    let level = line.split_whitespace().nth(1);
-    matches!(level, Some("WARN" | "ERROR"))
+    matches!(line.split_whitespace().nth(1), Some("WARN" | "ERROR"))
 }
 
 #[cfg(test)]
@@ -157,7 +156,7 @@ mod tests {
         assert_eq!(std::fs::read_to_string(&log.path).unwrap(), lines);
         let said = log.last_words();
         assert!(said.starts_with("; its last lines:\n  line 2\n") && said.ends_with("line 9"));
-        assert_eq!(log.missing(), None);
+        assert_eq!(log.loss_message(), None);
         for line in ["error: it failed. Its last words:", "no", "more"] {
             lock(&log.kept).add(line.into());
         }

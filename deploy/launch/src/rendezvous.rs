@@ -97,8 +97,7 @@ fn sweep(place: &Path) {
     let entries = fs::read_dir(place).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
         let is_ours = |it: fs::Metadata| it.is_dir() && it.uid() == geteuid().as_raw();
-        let is_ours = entry.metadata().is_ok_and(is_ours);
-        if is_ours && is_free(&entry.path()) == Some(true) {
+        if entry.metadata().is_ok_and(is_ours) && is_free(&entry.path()) == Some(true) {
             let removed = fs::remove_dir_all(entry.path());
             tracing::debug!("removing {}: {removed:?}", entry.path().display());
         }

@@ -35,7 +35,7 @@ pub struct Plan {
 
 impl Plan {
     /// The plan of a run with these settings.
-    pub fn of(config: &RunConfig) -> Self {
+    pub fn new(config: &RunConfig) -> Self {
         let is_common = config.actor.epsilon_ladder.is_none();
         Self {
             world: config.run.world.clone(),
@@ -86,7 +86,7 @@ impl Spread {
 
 impl Episodes {
     /// `count` episodes, of which `newest` holds the newest returns.
-    pub(crate) fn of<'a>(count: u64, newest: impl ExactSizeIterator<Item = &'a f64>) -> Self {
+    pub(crate) fn new<'a>(count: u64, newest: impl ExactSizeIterator<Item = &'a f64>) -> Self {
         let of = newest.len();
         let sum: f64 = newest.sum();
         Self {
@@ -167,7 +167,7 @@ pub struct RunView {
     pub replay: ReplayStatus,
     /// The learner's last status.
     pub learner: LearnerStatus,
-    pub(crate) learner_answers: bool,
+    pub(crate) is_learner_answering: bool,
     /// For how long at least one replay server has not answered, and for how long the learner has not.
     pub(crate) replay_silence: Silence,
     pub(crate) learner_silence: Silence,
@@ -194,7 +194,7 @@ impl RunView {
     }
 
     /// The view of a run that begins now with these counts.
-    pub(crate) fn beginning(plan: Plan, frames: u64, updates: u64) -> Self {
+    pub(crate) fn starting_at(plan: Plan, frames: u64, updates: u64) -> Self {
         let mut this = Self::new(plan);
         this.after_updates = Some(updates);
         this.learner.updates = updates;
@@ -204,8 +204,8 @@ impl RunView {
     }
 
     /// Stores the learner's status; none if it does not answer.
-    pub(crate) fn take_learner(&mut self, learner: Option<LearnerStatus>) {
-        self.learner_answers = learner.is_some();
+    pub(crate) fn set_learner(&mut self, learner: Option<LearnerStatus>) {
+        self.is_learner_answering = learner.is_some();
         if let Some(learner) = learner {
             self.learner = learner;
             self.learner_silence.answered();
@@ -217,16 +217,15 @@ impl RunView {
             self.learner_silence.unanswered();
         }
         // A resumed run has the updates of its checkpoint even before its learner has answered.
-        let before = self.after_updates.unwrap_or(0);
-        self.learner.updates = self.learner.updates.max(before);
+        self.learner.updates = self.learner.updates.max(self.after_updates.unwrap_or(0));
     }
 
-    /// Stores the counts of all replay servers. Call this after [`Self::take_learner`], as it also samples the updates.
-    pub(crate) fn take_replay(&mut self, shards: Vec<ReplayStatus>) {
+    /// Stores the counts of all replay servers. Call this after [`Self::set_learner`], as it also samples the updates.
+    pub(crate) fn set_replay(&mut self, shards: Vec<ReplayStatus>) {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
         self.replay_silence.answered();
-        self.episodes = Episodes::of(self.replay.episodes, self.replay.returns.newest.iter());
+        self.episodes = Episodes::new(self.replay.episodes, self.replay.returns.newest.iter());
         self.k = Spread::of_k(&self.replay);
         (self.recorded_s, self.rss_mib) = (None, Vec::new());
         let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
@@ -241,52 +240,51 @@ impl RunView {
     }
 
     /// Whether all replay servers answered the last request.
-    pub(crate) fn is_answered(&self) -> bool {
+    pub(crate) fn servers_answered(&self) -> bool {
         self.servers.iter().all(|it| it.replay.is_some())
     }
 
     /// Whether all replay servers have ended; the counts are then those of their last answers.
-    pub(crate) fn is_gone(&self) -> bool {
+    pub(crate) fn servers_ended(&self) -> bool {
         self.servers.iter().all(|it| it.is_gone)
     }
 
     /// Whether everything is learned and saved.
     pub(crate) fn is_finished(&self) -> bool {
-        self.replay.learner_finished || self.learner_status().is_some() && self.is_learned()
+        self.replay.learner_finished || self.learner_status().is_some() && self.is_all_learned()
     }
 
     /// Whether, by the last answers, no more rows will be sampled and the learner has saved. That the learner has saved is not
     /// enough, as a learner that was stopped early has saved too.
-    pub(crate) fn is_learned(&self) -> bool {
+    pub(crate) fn is_all_learned(&self) -> bool {
         self.replay.waiting == Waiting::Finished && self.learner.finished
     }
 
     /// Whether everything is learned and saved, or the replay servers have ended after all rows were sampled.
     pub(crate) fn is_over(&self) -> bool {
-        self.is_finished() || self.is_gone() && self.replay.waiting == Waiting::Finished
+        self.is_finished() || self.servers_ended() && self.replay.waiting == Waiting::Finished
     }
 
     /// Seconds since the run began, by the clocks of its replay servers.
-    pub(crate) fn up_s(&self) -> Option<f64> {
+    pub(crate) fn uptime_s(&self) -> Option<f64> {
         let processes = self.servers.iter().filter_map(|it| it.processes.as_ref());
         processes.map(|it| it.up_s).reduce(f64::max)
     }
 
     /// The learner's status if it answers, or its last status if no process is left to ask.
     pub(crate) fn learner_status(&self) -> Option<&LearnerStatus> {
-        let is_known = self.learner_answers || self.is_learner_known && self.is_gone();
+        let is_known = self.is_learner_answering || self.is_learner_known && self.servers_ended();
         is_known.then_some(&self.learner)
     }
 
     /// Seconds since the run began. In a recorded run, the time between an interruption and the resume does not count.
     pub(crate) fn seconds(&self) -> Option<f64> {
-        self.recorded_s.or_else(|| self.up_s())
+        self.recorded_s.or_else(|| self.uptime_s())
     }
 
     /// The probability with which all actors act at random; none if they differ in it.
     pub(crate) fn epsilon(&self) -> Option<f64> {
-        let schedule = self.plan.epsilon?;
-        Some(schedule.epsilon(self.replay.transitions_inserted))
+        Some(self.plan.epsilon?.epsilon(self.replay.transitions_inserted))
     }
 
     /// The learner's status for the metrics. In a recorded run this is its last status, even if it does not answer.
@@ -308,13 +306,11 @@ mod tests {
     fn updates_are_those_of_the_batches_that_each_part_of_a_run_had() {
         let mut config = config("smoke", "chain", "c51", &["learner.batch_size=32"]);
         assert_eq!(updates_served(&config, 96_000), 3_000);
-        let (transitions, rows, updates) = (9_000, 64_000, 1_000);
-        let since = RatioStart {
-            transitions,
-            rows,
-            updates,
-        };
-        config.replay.since = Some(since);
+        config.replay.since = Some(RatioStart {
+            transitions: 9_000,
+            rows: 64_000,
+            updates: 1_000,
+        });
         for (rows, updates) in [(64_000, 1_000), (96_000, 2_000), (96_031, 2_000)] {
             assert_eq!(updates_served(&config, rows), updates);
         }
@@ -323,13 +319,13 @@ mod tests {
     #[test]
     fn a_learner_that_ended_before_all_is_sampled_has_not_learned_it() {
         let mut view = RunView::new(Plan::default());
-        view.take_learner(Some(make(|it: &mut LearnerStatus| it.finished = true)));
-        for (waiting, is_learned) in [(Waiting::Neither, false), (Waiting::Finished, true)] {
-            view.take_replay(vec![make(|it: &mut ReplayStatus| {
+        view.set_learner(Some(make(|it: &mut LearnerStatus| it.finished = true)));
+        for (waiting, is_all_learned) in [(Waiting::Neither, false), (Waiting::Finished, true)] {
+            view.set_replay(vec![make(|it: &mut ReplayStatus| {
                 (it.finished, it.waiting) = (true, waiting);
             })]);
-            let found = (view.is_learned(), view.is_finished());
-            assert_eq!(found, (is_learned, is_learned), "{waiting}");
+            let found = (view.is_all_learned(), view.is_finished());
+            assert_eq!(found, (is_all_learned, is_all_learned), "{waiting}");
         }
     }
 
@@ -338,13 +334,13 @@ mod tests {
         let learner = |updates| make(|it: &mut LearnerStatus| it.updates = updates);
         let mut view = RunView::new(Plan::default());
         for answer in [None, Some(learner(5_000)), Some(learner(5_000))] {
-            view.take_learner(answer);
-            view.take_replay(vec![ReplayStatus::default()]);
+            view.set_learner(answer);
+            view.set_replay(vec![ReplayStatus::default()]);
         }
         assert_eq!(view.speed.updates, 0.0);
 
-        let mut resumed = RunView::beginning(Plan::default(), 0, 70);
-        resumed.take_learner(None);
+        let mut resumed = RunView::starting_at(Plan::default(), 0, 70);
+        resumed.set_learner(None);
         assert_eq!(resumed.learner.updates, 70, "before it has answered");
     }
 

@@ -29,8 +29,8 @@ pub(crate) fn make<T: Default>(set: impl FnOnce(&mut T)) -> T {
 /// The view of a run with one replay server, after these answers.
 pub(crate) fn view(plan: Plan, replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
     let mut view = RunView::new(plan);
-    view.take_learner(learner);
-    view.take_replay(vec![replay]);
+    view.set_learner(learner);
+    view.set_replay(vec![replay]);
     view
 }
 

@@ -36,7 +36,7 @@ pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
                 env: Some(world.to_string()),
                 ..args.settings.clone()
             };
-            Inspection::of(&resolve(&flags, &machine)?.0)
+            Inspection::new(&resolve(&flags, &machine)?.0)
         };
         let inspections: anyhow::Result<Vec<_>> = WorldName::all().map(of_world).collect();
         let inspections = inspections?;
@@ -49,7 +49,7 @@ pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
         Some(folder) => read_config(&RunFolder::new(folder))?,
         None => resolve(&args.settings, &machine)?.0,
     };
-    let inspection = Inspection::of(&config)?;
+    let inspection = Inspection::new(&config)?;
     match args.json {
         true => print(&(serde_json::to_string_pretty(&inspection)? + "\n")),
         false => print(&inspection.describe()),

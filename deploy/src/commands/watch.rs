@@ -7,7 +7,7 @@ use driml_launch::{
     endpoint::{DEFAULT_NAMESPACE, check_connect_endpoints},
     run_folder::RunFolder,
     view::Poller,
-    watch::{self, Asked, WatchFlags, endpoints_of},
+    watch::{self, OrUnreachable, WatchFlags, read_endpoints},
 };
 use driml_protocol::tls::Role;
 
@@ -58,33 +58,33 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
     match args.selection.open()? {
         Ok(mut poller) => {
             let folder = args.selection.folder();
-            watch::look(&mut poller, folder.as_ref(), args.watch, args.json)
+            watch::print_status(&mut poller, folder.as_ref(), args.watch, args.json)
         }
-        Err(over) => over.print(args.json),
+        Err(unreachable) => unreachable.print(args.json),
     }
 }
 
 impl RunSelection {
     /// Opens a connection to the run, or returns the run's state if it cannot be asked.
-    fn open(&self) -> anyhow::Result<Asked<Poller>> {
+    fn open(&self) -> anyhow::Result<OrUnreachable<Poller>> {
         check_connect_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
         let endpoints = match self.endpoints()? {
             Ok(endpoints) => endpoints,
-            Err(over) => return Ok(Err(over)),
+            Err(unreachable) => return Ok(Err(unreachable)),
         };
         let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
         // The run may have ended meanwhile.
         if opened.is_err()
-            && let Err(over) = self.endpoints()?
+            && let Err(unreachable) = self.endpoints()?
         {
-            return Ok(Err(over));
+            return Ok(Err(unreachable));
         }
         opened.map(Ok)
     }
 
-    fn endpoints(&self) -> anyhow::Result<Asked<Vec<String>>> {
-        let of_folder = self.folder().map(|it| endpoints_of(&it));
+    fn endpoints(&self) -> anyhow::Result<OrUnreachable<Vec<String>>> {
+        let of_folder = self.folder().map(|it| read_endpoints(&it));
         of_folder.unwrap_or_else(|| Ok(Ok(self.connect.clone())))
     }
 

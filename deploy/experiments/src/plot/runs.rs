@@ -45,7 +45,7 @@ impl Run {
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
         let columns = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
         ensure!(
-            columns.place("frames").is_some(),
+            columns.column_index("frames").is_some(),
             usage!(
                 "{} has no column \"frames\": it is not a run's",
                 path.display()
@@ -95,8 +95,8 @@ impl Run {
 
     /// Returns the table that has the column, and its file; the metrics if neither table has the column.
     fn table(&self, column: &str) -> (&Table, PathBuf) {
-        let in_metrics = self.columns.place(column).is_some();
-        if !in_metrics && self.evaluations.place(column).is_some() {
+        let in_metrics = self.columns.column_index(column).is_some();
+        if !in_metrics && self.evaluations.column_index(column).is_some() {
             (&self.evaluations, self.folder.evaluations())
         } else {
             (&self.columns, self.folder.metrics())
@@ -105,11 +105,11 @@ impl Run {
 
     /// Returns the index of a numeric column.
     fn place(&self, table: &Table, column: &str) -> Result<usize, Usage> {
-        let place = table.place(column);
+        let place = table.column_index(column);
         place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
             let numbers = || {
                 let more = self.evaluations.header.iter();
-                let more = more.filter(|name| self.columns.place(name).is_none());
+                let more = more.filter(|name| self.columns.column_index(name).is_none());
                 let all = self.columns.header.iter().chain(more);
                 all.map(String::as_str).filter(|name| !WORDS.contains(name))
             };
@@ -124,7 +124,7 @@ impl Run {
 
     /// Returns the columns of auxiliary losses: the columns between the C51 loss and the total loss.
     pub(super) fn auxiliary_losses(&self) -> &[String] {
-        let ends = [C51_LOSS, TOTAL_LOSS].map(|name| self.columns.place(name));
+        let ends = [C51_LOSS, TOTAL_LOSS].map(|name| self.columns.column_index(name));
         match ends {
             [Some(first), Some(last)] if first < last => &self.columns.header[first + 1..last],
             _ => &[],
@@ -134,7 +134,7 @@ impl Run {
     /// Whether the column exists and has a value.
     pub(crate) fn has_values(&self, column: &str) -> bool {
         let (table, _) = self.table(column);
-        let place = table.place(column);
+        let place = table.column_index(column);
         place.is_some_and(|place| table.rows.iter().any(|row| !row[place].is_empty()))
     }
 }

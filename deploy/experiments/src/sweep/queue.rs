@@ -14,7 +14,7 @@ use anyhow::Context;
 use driml_launch::{
     managed_process::{ask_to_stop, exit_with_parent_flags},
     resume::{self, Found},
-    run_folder::{Progress as RunProgress, progress as how_far},
+    run_folder::{Progress as RunProgress, read_progress},
 };
 use driml_machine::{
     error::{EXIT_USAGE, usage},
@@ -176,7 +176,7 @@ impl Queue {
     /// Returns the units that the plan's run has done, and whether the run has all its episodes.
     fn done(&self, plan: &PlannedRun) -> (u64, bool) {
         let folder = self.runs.folder(plan);
-        let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
+        let RunProgress { frames, episodes } = read_progress(&folder).unwrap_or_default();
         let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
         let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
         let share = of_episodes.max(share(frames, plan.frames)).min(1.0);

@@ -7,7 +7,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far, write_whole};
+use driml_launch::run_folder::{Outcome, RunFolder, Summary, read_progress, write_atomically};
 
 use super::plan::{FinishedRun, PlannedRun};
 use crate::cache::RUNS;
@@ -33,7 +33,7 @@ impl Runs {
             return None;
         }
         let folder = self.folder(plan);
-        how_far(&folder)?;
+        read_progress(&folder)?;
         let summary = Summary::read(&folder).ok()?;
         let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
         let is_good = match summary.outcome {
@@ -77,8 +77,8 @@ impl Runs {
             false => format!("{before}+{commit}"),
         };
         let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
-        write_whole(&self.beside(plan, "call.json"), &call)?;
-        write_whole(&self.beside(plan, "commit"), commits.as_bytes())
+        write_atomically(&self.beside(plan, "call.json"), &call)?;
+        write_atomically(&self.beside(plan, "commit"), commits.as_bytes())
     }
 
     /// Returns the end of the output of the run's process.
@@ -135,7 +135,7 @@ pub(super) mod tests {
             ..Call::default()
         };
         let config = call.config().unwrap();
-        let mut view = RunView::new(Plan::of(&config));
+        let mut view = RunView::new(Plan::new(&config));
         let mut recorder = RunRecorder::open(folder, &config, Vec::new(), None, false).unwrap();
         recorder.record(&mut view, &[]);
         let summary = recorder.summarise(Outcome::Finished, &mut view);

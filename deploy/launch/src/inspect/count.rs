@@ -14,8 +14,8 @@ use serde::Serialize;
 pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
      a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
 /// Positives of a row with everything on: those of the agent with the most, cpc.
-const EVERY_POSITIVES: usize = 5;
-pub(super) const BATCH: &str = "a batch";
+const EVERYTHING_POSITIVES: usize = 5;
+pub(super) const BATCH_NAME: &str = "a batch";
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Line {
@@ -28,7 +28,7 @@ pub(crate) struct Line {
 
 type Counts = Vec<(String, u64)>;
 
-pub(super) struct Counted<'a> {
+pub(super) struct CostCounter<'a> {
     config: &'a RunConfig,
     model: ModelConfig,
     shape: UpdateShape,
@@ -36,8 +36,8 @@ pub(super) struct Counted<'a> {
     broadcast: usize,
 }
 
-impl<'a> Counted<'a> {
-    pub(super) fn of(config: &'a RunConfig) -> driml_model::Result<Self> {
+impl<'a> CostCounter<'a> {
+    pub(super) fn new(config: &'a RunConfig) -> driml_model::Result<Self> {
         Ok(Self {
             config,
             model: config.model.clone(),
@@ -65,7 +65,7 @@ impl<'a> Counted<'a> {
             frame_channels: frame.channels as u32 * config.run.frame_stack,
             frame_stack: 1,
             horizon: Horizon::All {
-                k_max: EVERY_POSITIVES as u32,
+                k_max: EVERYTHING_POSITIVES as u32,
             },
             ..config.run.clone()
         };
@@ -75,7 +75,7 @@ impl<'a> Counted<'a> {
             double_dqn: true,
             passes: Passes {
                 keys: 1,
-                ..Passes::for_pairs(Lambda::ONES, EVERY_POSITIVES, true)
+                ..Passes::for_pairs(Lambda::ONES, EVERYTHING_POSITIVES, true)
             },
         };
         Ok(Self {
@@ -114,7 +114,7 @@ impl<'a> Counted<'a> {
 
     pub(super) fn update_flops(&self) -> Counts {
         let cost = UpdateCost::compute(&self.model, &self.shape);
-        named([
+        to_counts([
             ("s_t, torso", cost.online),
             ("s_t, C51 head", cost.head),
             ("s_{t+n}, target network", cost.target),
@@ -148,10 +148,10 @@ impl<'a> Counted<'a> {
             ..run.clone()
         });
         let transition = (run.frame_bytes() + TRANSITION_BYTES) as u64;
-        named([
+        to_counts([
             ("a transition in a chunk", transition),
             ("a transition in the replay", replay_bytes_each(run)),
-            (BATCH, batch),
+            (BATCH_NAME, batch),
             ("  s_t and s_{t+n}", first_states),
             ("  s_{t+k}", all_states - first_states),
             ("  numbers", batch - all_states),
@@ -185,6 +185,6 @@ fn by_unit(units: &[String], count: impl Fn(&str) -> u64) -> Counts {
     units.iter().map(|it| (it.clone(), count(it))).collect()
 }
 
-fn named<const N: usize>(counts: [(&str, u64); N]) -> Counts {
+fn to_counts<const N: usize>(counts: [(&str, u64); N]) -> Counts {
     counts.map(|(what, n)| (what.to_owned(), n)).into()
 }

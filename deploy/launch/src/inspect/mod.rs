@@ -9,7 +9,7 @@ use indicatif::HumanCount;
 use serde::Serialize;
 
 use crate::console::aligned;
-use count::{Counted, EVERYTHING, Line};
+use count::{CostCounter, EVERYTHING, Line};
 
 /// Width of the names in characters; a longer name pushes its row to the right.
 const WHAT_COLUMNS: usize = 26;
@@ -34,13 +34,13 @@ pub struct Inspection {
 
 impl Inspection {
     /// Counts for the settings of a run.
-    pub fn of(config: &RunConfig) -> anyhow::Result<Self> {
-        let counted = Counted::of(config)
-            .and_then(|is| Ok([is, Counted::with_everything_on(config)?]))
+    pub fn new(config: &RunConfig) -> anyhow::Result<Self> {
+        let counters = CostCounter::new(config)
+            .and_then(|is| Ok([is, CostCounter::with_everything_on(config)?]))
             .context("computing the size of the weights")?;
-        let units = counted[1].units();
-        let lines = |count: &dyn Fn(&Counted<'_>) -> Vec<(String, u64)>| -> Vec<Line> {
-            let [is, all] = counted.each_ref().map(count);
+        let units = counters[1].units();
+        let lines = |count: &dyn Fn(&CostCounter<'_>) -> Vec<(String, u64)>| -> Vec<Line> {
+            let [is, all] = counters.each_ref().map(count);
             let line = |((what, is), (_, everything))| Line {
                 what,
                 is,
@@ -69,7 +69,7 @@ impl Inspection {
             ("holds and sends: bytes", &self.bytes, false),
         ] {
             text += &format!("\n{}", row(heading, "is", "everything"));
-            let sum = is_summed.then(|| sum("all", lines));
+            let sum = is_summed.then(|| sum_line("all", lines));
             for line in lines.iter().chain(&sum) {
                 let [is, all] = [line.is, line.everything].map(|n| HumanCount(n).to_string());
                 text += &row(&line.what, &is, &all);
@@ -84,7 +84,7 @@ pub fn describe_worlds(inspections: &[Inspection]) -> String {
     let headings = "world,parameters,FLOPs an update,FLOPs a decision,bytes a batch";
     let mut rows = vec![headings.split(',').map(String::from).collect()];
     for it in inspections {
-        let batch = it.bytes.iter().find(|it| it.what == count::BATCH);
+        let batch = it.bytes.iter().find(|it| it.what == count::BATCH_NAME);
         let batch = batch.map_or(&[][..], std::slice::from_ref);
         let counts = [
             &it.parameters[..],
@@ -92,7 +92,7 @@ pub fn describe_worlds(inspections: &[Inspection]) -> String {
             &it.decision_flops,
             batch,
         ];
-        let sums = counts.map(|lines| sum("", lines));
+        let sums = counts.map(|lines| sum_line("", lines));
         let cells = sums.map(|it| format!("{} ({})", HumanCount(it.is), HumanCount(it.everything)));
         rows.push([vec![it.world.clone()], cells.into()].concat());
     }
@@ -100,7 +100,7 @@ pub fn describe_worlds(inspections: &[Inspection]) -> String {
     format!("{table}\nin brackets: {EVERYTHING}\n")
 }
 
-fn sum(what: &str, lines: &[Line]) -> Line {
+fn sum_line(what: &str, lines: &[Line]) -> Line {
     Line {
         what: what.to_owned(),
         is: lines.iter().map(|line| line.is).sum(),

@@ -14,7 +14,8 @@ fn find<'a>(lines: &'a [Line], what: &str) -> &'a Line {
 
 #[test]
 fn the_paper_s_agent_is_described_in_a_table_and_in_a_line_of_sums() {
-    let inspection = Inspection::of(&config("paper", "procgen:bigfish", "driml-ada", &[])).unwrap();
+    let inspection =
+        Inspection::new(&config("paper", "procgen:bigfish", "driml-ada", &[])).unwrap();
     expect![[r#"
         driml-ada on procgen:bigfish
 
@@ -89,7 +90,7 @@ fn what_is_counted_is_what_is_built() {
     for world in ["procgen:bigfish", "mspacman", "ising", "chain"] {
         for agent in AGENTS.iter().map(|agent| agent.name) {
             let config = config("smoke", world, agent, &small);
-            let inspection = Inspection::of(&config).unwrap();
+            let inspection = Inspection::new(&config).unwrap();
             let settings = LearnerConfig::from_toml(&config.to_toml()).unwrap();
             let mut learner = Learner::new(settings, &Compute::CPU).unwrap();
             let networks = learner.agent();
@@ -142,9 +143,8 @@ fn no_agent_has_more_than_everything() {
         for agent in AGENTS.iter().map(|agent| agent.name) {
             let double = ["learner.update.double_dqn=true"];
             let sets = if agent == "c51" { &double[..] } else { &[] };
-            let it = Inspection::of(&config("paper", world, agent, sets)).unwrap();
-            let tables = [it.parameters, it.update_flops, it.decision_flops, it.bytes];
-            for line in tables.concat() {
+            let it = Inspection::new(&config("paper", world, agent, sets)).unwrap();
+            for line in [it.parameters, it.update_flops, it.decision_flops, it.bytes].concat() {
                 assert!(line.is <= line.everything, "{agent} on {world}: {line:?}");
             }
         }

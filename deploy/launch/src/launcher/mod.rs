@@ -25,9 +25,9 @@ use crate::{
     open_files,
     rendezvous::Rendezvous,
     resume,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_atomically},
     run_view::{Plan, RunView, updates_served},
-    view::{Display, Poller, Reached},
+    view::{Display, Poller, ServerConnection},
 };
 
 const POLL: Duration = Duration::from_secs(1);
@@ -75,9 +75,9 @@ pub fn run(
     if let (Some(listen), None) = (&external.listen, &external.tls_dir) {
         endpoints[0].clone_from(listen);
     }
-    write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
+    write_atomically(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let rendezvous_path = rendezvous.path().as_os_str().as_encoded_bytes();
-    write_whole(&run_dir.rendezvous(), rendezvous_path)?;
+    write_atomically(&run_dir.rendezvous(), rendezvous_path)?;
     let display = Display::new(config.frames(), Instant::now(), resume_point.updates);
     // Frees the shared memory that killed processes left behind.
     session::sweep_shared_memory();
@@ -163,7 +163,7 @@ impl Launch<'_> {
             if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
-            let connection = Reached::open(name, endpoint, hash);
+            let connection = ServerConnection::open(name, endpoint, hash);
             if connection.is_err() {
                 // If a server died meanwhile, its exit report says more than the connection error.
                 check_alive()?;
@@ -172,7 +172,7 @@ impl Launch<'_> {
         }
         let mut poller = Poller::new(self.config, connections);
         let point = &self.resume_point;
-        poller.view = RunView::beginning(poller.view.plan, point.frames, point.updates);
+        poller.view = RunView::starting_at(poller.view.plan, point.frames, point.updates);
         self.poller = Some(poller);
 
         self.start_up_to(self.names.len())?;
@@ -186,11 +186,11 @@ impl Launch<'_> {
             if self.shutdown.ending.wait_timeout(POLL) {
                 return Ok(Outcome::Interrupted);
             }
-            self.run_dir.check_whole()?;
+            self.run_dir.check_intact()?;
             self.restart_dead()?;
             let poller = self.poller.as_mut();
             let poller = poller.expect("it was set before the run is watched");
-            poller.ask();
+            poller.poll();
             let view = &poller.view;
             for (name, silence) in [
                 ("replay server", view.replay_silence),
@@ -205,17 +205,17 @@ impl Launch<'_> {
             }
             let processes = self.processes.iter_mut();
             let rss: Vec<_> = processes.map(ManagedProcess::rss_mib).collect();
-            if view.is_answered() {
-                let ask = |shard, since| poller.episodes(shard, since, true);
-                let mut warnings = self.recorder.record_episodes(view, ask);
+            if view.servers_answered() {
+                let fetch = |shard, since| poller.fetch_episodes(shard, since, true);
+                let mut warnings = self.recorder.record_episodes(view, fetch);
                 warnings.extend(self.recorder.record(&mut poller.view, &rss));
                 self.display.screen.lines(warnings);
             }
-            self.recorder.complete(&mut poller.view);
+            self.recorder.fill_totals(&mut poller.view);
             let view = &poller.view;
             self.display.show(view);
             self.evaluator.poll(&self.display.screen);
-            if view.is_learned() {
+            if view.is_all_learned() {
                 return Ok(Outcome::Finished);
             }
             let counts = (view.replay.transitions_inserted, view.learner.updates);
@@ -264,11 +264,11 @@ impl Launch<'_> {
         let learner = self.processes.iter_mut().skip(shards).take(1);
         let mut others = stop_processes(learner, true, LEARNER_DRAIN_MAX, &abort);
         if let Some(poller) = &mut self.poller {
-            if let Err(e) = poller.ask_replay() {
+            if let Err(e) = poller.poll_replay() {
                 tracing::debug!("the replay server's last answer: {e:#}");
             }
-            let ask = |shard, since| poller.episodes(shard, since, true);
-            self.recorder.record_episodes(&poller.view, ask);
+            let fetch = |shard, since| poller.fetch_episodes(shard, since, true);
+            self.recorder.record_episodes(&poller.view, fetch);
             // Closed before the replay server, which is the session's router: otherwise it would try to reconnect.
             poller.close();
         }
@@ -277,11 +277,11 @@ impl Launch<'_> {
         // By the last answers, all transitions are stored and learned from, and the result is saved.
         let is_learned = |Poller { view, .. }: &Poller| {
             let served = updates_served(self.config, view.replay.rows_sampled);
-            view.is_learned() && view.learner.updates >= served
+            view.is_all_learned() && view.learner.updates >= served
         };
         let is_complete = finished || self.poller.as_ref().is_some_and(is_learned);
         let result = match watched {
-            _ if is_complete => self.run_dir.check_whole().map(|()| Outcome::Finished),
+            _ if is_complete => self.run_dir.check_intact().map(|()| Outcome::Finished),
             _ if abort() => Err(anyhow::anyhow!(
                 "stopped at once by a second interrupt: what was not saved is lost"
             )),
@@ -289,7 +289,7 @@ impl Launch<'_> {
                 let others = others.join("; ");
                 Err(anyhow::anyhow!("at the end of the run, {others}"))
             }
-            Ok(outcome) => self.run_dir.check_whole().map(|()| outcome),
+            Ok(outcome) => self.run_dir.check_intact().map(|()| outcome),
             Err(e) => Err(e),
         };
         // Transitions that an actor could not deliver count as lost and are not an error: what was learned is saved.
@@ -313,13 +313,13 @@ impl Launch<'_> {
             return;
         }
         // Ask once before the signal: a learner that has finished may exit right after it.
-        if let Err(e) = poller.ask_learner() {
+        if let Err(e) = poller.poll_learner() {
             tracing::debug!("a question before the last: {e:#}");
         }
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
         while Instant::now() <= deadline && !abort() {
-            if let Err(e) = poller.ask_learner() {
+            if let Err(e) = poller.poll_learner() {
                 tracing::debug!("a last question: {e:#}");
                 return;
             }
@@ -337,7 +337,7 @@ impl Launch<'_> {
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
         let updates = self.resume_point.updates;
-        let no_view = &mut RunView::beginning(Plan::of(self.config), 0, updates);
+        let no_view = &mut RunView::starting_at(Plan::new(self.config), 0, updates);
         let view = match &mut self.poller {
             None => no_view,
             Some(poller) => {
@@ -345,8 +345,8 @@ impl Launch<'_> {
                 &mut poller.view
             }
         };
-        let logs = self.processes.iter().filter_map(|it| it.log.missing());
-        let missing = console::join_losses(self.recorder.missing().into_iter().chain(logs));
+        let logs = self.processes.iter().filter_map(|it| it.log.loss_message());
+        let missing = console::join_losses(self.recorder.loss_messages().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
         let mut summary = self.recorder.summarise(outcome, view);
         summary.replay_servers_restarted = servers_before + self.server_restarts;

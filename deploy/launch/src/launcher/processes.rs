@@ -160,7 +160,7 @@ impl Launch<'_> {
         if poller.view.replay.finished || !exits.any(|it| it.is_some()) {
             return false;
         }
-        poller.ask_replay().is_ok() && !poller.view.replay.finished
+        poller.poll_replay().is_ok() && !poller.view.replay.finished
     }
 
     /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. Transitions that an actor had

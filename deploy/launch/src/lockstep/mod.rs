@@ -49,10 +49,9 @@ pub fn run(
         Some(_) => Lockstep::resume(config, run_dir)?,
         None => Lockstep::begin(config, run_dir)?,
     };
-    let ResumePoint {
-        frames, updates, ..
-    } = resumed.unwrap_or_default();
-    let mut view = RunView::beginning(Plan::of(config), frames, updates);
+    let point = resumed.unwrap_or_default();
+    let (frames, updates) = (point.frames, point.updates);
+    let mut view = RunView::starting_at(Plan::new(config), frames, updates);
     let mut display = Display::new(config.frames(), Instant::now(), updates);
     let screen = display.screen.clone();
     let mut evaluate = |updates, is_last| {
@@ -118,9 +117,9 @@ pub fn run(
     if outcome == Outcome::Finished {
         evaluate(lockstep.learner.updates(), true);
     }
-    let missing = console::join_losses(recorder.missing());
+    let missing = console::join_losses(recorder.loss_messages());
     missing.iter().for_each(|line| console::line(line));
-    run_dir.check_whole()?;
+    run_dir.check_intact()?;
     let summary = recorder.summarise(outcome, &mut view);
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
@@ -142,10 +141,10 @@ fn exit_on_second_interrupt(second: Shutdown) -> anyhow::Result<()> {
 fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockstep) -> Vec<String> {
     let status = lockstep.replay.status();
     let ended = status.episodes;
-    view.take_learner(Some(lockstep.turn.status.clone()));
-    view.take_replay(vec![status]);
-    let ask = |_, since| Some(lockstep.replay.episodes_since(since));
-    let mut warnings = recorder.record_episodes(view, ask);
+    view.set_learner(Some(lockstep.turn.status.clone()));
+    view.set_replay(vec![status]);
+    let fetch = |_, since| Some(lockstep.replay.episodes_since(since));
+    let mut warnings = recorder.record_episodes(view, fetch);
     warnings.extend(recorder.record(view, &[]));
     lockstep.replay.set_recorded_episodes(ended);
     warnings

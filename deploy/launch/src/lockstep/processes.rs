@@ -10,7 +10,7 @@ use driml_envs::EnvError;
 use driml_learner::{BatchPart, Learner, LearnerConfig, checkpoint};
 use driml_machine::error::usage;
 use driml_protocol::{
-    ActorJoin, Batch, BufferPool, InsertReply, LearnerStatus, Leave, Weights, WeightsHeader, codec,
+    ActorJoin, Batch, BufferPool, InsertReply, LearnerStatus, Leave, WeightsHeader, codec,
 };
 use driml_replay_server::{Mark, NotReady, PersistArgs, Replay};
 use driml_settings::config::RunConfig;
@@ -143,21 +143,17 @@ impl Lockstep {
     pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
         let replay = Replay::new(&config.run, &config.replay, config.learner.batch_size)?;
         let compute = config.local.learner_device.open(config.learner.precision)?;
-        let settings = LearnerConfig::from_toml(&config.to_toml())?;
-        let mut learner = Learner::new(settings, &compute)?;
-        let Weights {
-            header,
-            safetensors,
-        } = learner.export_weights()?;
+        let mut learner = Learner::new(LearnerConfig::from_toml(&config.to_toml())?, &compute)?;
+        let weights = learner.export_weights()?;
         let turn = Turn {
             next_actor: 0,
             unwanted: vec![0; config.local.actors as usize],
             status: LearnerStatus {
-                weights_version: header.version,
-                weights_sha256: header.sha256_hex(),
+                weights_version: weights.header.version,
+                weights_sha256: weights.header.sha256_hex(),
                 ..LearnerStatus::default()
             },
-            acting: (header, safetensors),
+            acting: (weights.header, weights.safetensors),
             published: 0,
         };
         let mut this = Self::assemble(config, learner, replay, turn)?;
@@ -301,18 +297,15 @@ impl Lockstep {
     }
 
     fn publish(&mut self) -> anyhow::Result<()> {
-        let Weights {
-            header,
-            safetensors,
-        } = self.learner.export_weights()?;
+        let weights = self.learner.export_weights()?;
         for actor in &mut self.actors {
-            actor.set_weights(header.version, &safetensors)?;
+            actor.set_weights(weights.header.version, &weights.safetensors)?;
         }
         let turn = &mut self.turn;
         turn.published = self.learner.updates();
-        turn.status.weights_version = header.version;
-        turn.status.weights_sha256 = header.sha256_hex();
-        turn.acting = (header, safetensors);
+        turn.status.weights_version = weights.header.version;
+        turn.status.weights_sha256 = weights.header.sha256_hex();
+        turn.acting = (weights.header, weights.safetensors);
         Ok(())
     }
 

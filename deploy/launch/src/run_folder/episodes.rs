@@ -21,7 +21,7 @@ use crate::{
 };
 
 /// Maximum number of requests to one shard per update; the next update requests the remaining episodes.
-const ASKS_MAX: usize = 16;
+const REQUESTS_MAX: usize = 16;
 
 const HEADER: &str = "seconds,frames,episode,actor,env,return,length";
 
@@ -39,9 +39,9 @@ struct Row {
 pub(super) struct TrainingEpisodes {
     table: AppendLog,
     /// The newest returns, oldest first.
-    newest: VecDeque<f64>,
+    newest_returns: VecDeque<f64>,
     /// The number of the newest episode.
-    pub(super) episode: u64,
+    pub(super) newest: u64,
     frames: u64,
     frames_at_status: Option<u64>,
     /// How many episodes of each shard were received or counted as lost.
@@ -50,7 +50,7 @@ pub(super) struct TrainingEpisodes {
     folder: RunFolder,
     /// The rows at the start, and how many of the first episodes the shards do not know. The shards' first status shows how many of
     /// the rows stay, and clears this field. None if the shards know none of the rows.
-    known: Option<(Table, u64)>,
+    rows_at_start: Option<(Table, u64)>,
 }
 
 impl TrainingEpisodes {
@@ -62,33 +62,33 @@ impl TrainingEpisodes {
         unknown: Option<u64>,
     ) -> anyhow::Result<Self> {
         let Some(frames_max) = frames_max else {
-            return Self::begin(folder, Table::default(), unknown);
+            return Self::create(folder, Table::default(), unknown);
         };
         let path = folder.episodes();
         let mut rows = Table::read(&path)?;
         // A replay that was kept reports the run's frames once it answers; the rows are cut then.
-        rows.keep(&path, |row: Row| {
+        rows.keep_rows(&path, |row: Row| {
             unknown.is_some() || row.frames <= frames_max
         })?;
-        Self::begin(folder, rows, unknown)
+        Self::create(folder, rows, unknown)
     }
 
-    fn begin(folder: &RunFolder, mut rows: Table, unknown: Option<u64>) -> anyhow::Result<Self> {
-        let known: Vec<Row> = rows.all().unwrap_or_default();
+    fn create(folder: &RunFolder, mut rows: Table, unknown: Option<u64>) -> anyhow::Result<Self> {
+        let known: Vec<Row> = rows.parse_rows().unwrap_or_default();
         rows.header = HEADER.split(',').map(String::from).collect();
-        let table = AppendLog::create(&folder.episodes(), &rows.text())?;
+        let table = AppendLog::create(&folder.episodes(), &rows.to_csv())?;
         let mut returns: Vec<_> = known.iter().filter_map(|it| it.episode_return).collect();
         let newest = returns.split_off(returns.len().saturating_sub(RETURNS_OF));
         let last = known.last();
         Ok(Self {
             table,
-            newest: newest.into(),
-            episode: last.map_or(0, |it| it.episode),
+            newest_returns: newest.into(),
+            newest: last.map_or(0, |it| it.episode),
             frames: last.map_or(0, |it| it.frames),
             frames_at_status: None,
             received: Vec::new(),
             lost: 0,
-            known: unknown.map(|unknown| (rows, unknown)),
+            rows_at_start: unknown.map(|unknown| (rows, unknown)),
             folder: folder.clone(),
         })
     }
@@ -98,7 +98,7 @@ impl TrainingEpisodes {
     pub(super) fn update(
         &mut self,
         shards: &[ReplayStatus],
-        ask: impl Fn(usize, u64) -> Option<EpisodesReply>,
+        fetch: impl Fn(usize, u64) -> Option<EpisodesReply>,
         seconds: Option<f64>,
     ) -> Vec<String> {
         if shards.is_empty() {
@@ -107,10 +107,10 @@ impl TrainingEpisodes {
         }
         let frames: u64 = shards.iter().map(|it| it.transitions_inserted).sum();
         let mut warnings = Vec::new();
-        if let Some((mut rows, unknown)) = self.known.take() {
-            let cut = self.cut(&mut rows, frames);
+        if let Some((mut rows, unknown)) = self.rows_at_start.take() {
+            let cut = self.set_aside_after(&mut rows, frames);
             warnings.extend(cut.err().map(|e| format!("{e:#}")));
-            self.take_as_received(shards, &rows, unknown);
+            self.set_received(shards, &rows, unknown);
         }
         // The new episodes ended after the last status; a shard may report fewer frames, as its count of the other shards is older.
         let received = self.frames_at_status.replace(frames);
@@ -126,13 +126,13 @@ impl TrainingEpisodes {
             if status.episodes < received {
                 received = 0;
             }
-            for _ in 0..ASKS_MAX {
+            for _ in 0..REQUESTS_MAX {
                 if received >= status.episodes {
                     break;
                 }
                 let is_newer =
                     |it: &EpisodesReply| it.ended >= status.episodes && it.before >= received;
-                let Some(reply) = ask(shard, received).filter(is_newer) else {
+                let Some(reply) = fetch(shard, received).filter(is_newer) else {
                     break;
                 };
                 let missing = reply.before - received;
@@ -141,13 +141,13 @@ impl TrainingEpisodes {
                         format!("{missing} episodes have no row in episodes.csv: the replay server keeps no more between two looks")
                     }));
                     self.lost += missing;
-                    self.episode += missing;
+                    self.newest += missing;
                 }
                 // An episode that ended after the status is taken in the next update.
                 let wanted = status.episodes.saturating_sub(reply.before) as usize;
                 let ended = reply.episodes.iter().take(wanted);
                 let all = reply.before + ended.len() as u64;
-                rows.extend(ended.map(|it| csv_row(self.take(it, seconds))));
+                rows.extend(ended.map(|it| csv_row(self.add_episode(it, seconds))));
                 received = all.max(received + 1);
             }
             self.received[shard] = received;
@@ -158,46 +158,45 @@ impl TrainingEpisodes {
     }
 
     /// Sets aside the episodes that ended after `frames_max` frames: the run does that part again.
-    fn cut(&mut self, rows: &mut Table, frames_max: u64) -> anyhow::Result<()> {
-        if rows.keep(&self.folder.episodes(), |row: Row| row.frames <= frames_max)? {
-            *self = Self::begin(&self.folder, rows.clone(), None)?;
+    fn set_aside_after(&mut self, rows: &mut Table, frames_max: u64) -> anyhow::Result<()> {
+        if rows.keep_rows(&self.folder.episodes(), |row: Row| row.frames <= frames_max)? {
+            *self = Self::create(&self.folder, rows.clone(), None)?;
         }
         Ok(())
     }
 
     /// Notes how many of each shard's episodes were received before this process started. Those that were not are the newest episodes
     /// of shards that count more episodes than they have rows. The first `unknown` episodes do not count.
-    fn take_as_received(&mut self, shards: &[ReplayStatus], rows: &Table, unknown: u64) {
-        let mut of_shards = vec![0; shards.len()];
-        for row in rows.all::<Row>().unwrap_or_default() {
-            let shard = row.actor as usize % shards.len();
-            of_shards[shard] += u64::from(row.episode > unknown);
+    fn set_received(&mut self, shards: &[ReplayStatus], rows: &Table, unknown: u64) {
+        let mut rows_of_shards = vec![0; shards.len()];
+        for row in rows.parse_rows::<Row>().unwrap_or_default() {
+            rows_of_shards[row.actor as usize % shards.len()] += u64::from(row.episode > unknown);
         }
-        let mut left: u64 = shards.iter().map(|it| it.episodes).sum();
-        left = left.saturating_sub(self.episode.saturating_sub(unknown));
-        let received = shards.iter().zip(of_shards).map(|(status, rows)| {
-            let here = left.min(status.episodes.saturating_sub(rows));
-            left -= here;
+        let mut unreceived: u64 = shards.iter().map(|it| it.episodes).sum();
+        unreceived = unreceived.saturating_sub(self.newest.saturating_sub(unknown));
+        let received = shards.iter().zip(rows_of_shards).map(|(status, rows)| {
+            let here = unreceived.min(status.episodes.saturating_sub(rows));
+            unreceived -= here;
             status.episodes - here
         });
         self.received = received.collect();
     }
 
-    fn take(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; 7] {
-        self.episode += 1;
+    fn add_episode(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; 7] {
+        self.newest += 1;
         self.frames = self.frames.max(ended.frames);
         let played = ended.played;
         let episode_return = played.map(|it| rounded(it.episode_return));
         if let Some(newest) = episode_return {
-            if self.newest.len() == RETURNS_OF {
-                self.newest.pop_front();
+            if self.newest_returns.len() == RETURNS_OF {
+                self.newest_returns.pop_front();
             }
-            self.newest.push_back(newest);
+            self.newest_returns.push_back(newest);
         }
         [
             cell(seconds.map(|it| format!("{it:.3}"))),
             self.frames.to_string(),
-            self.episode.to_string(),
+            self.newest.to_string(),
             ended.actor.to_string(),
             ended.env.to_string(),
             cell(episode_return),
@@ -207,17 +206,17 @@ impl TrainingEpisodes {
 
     /// The episodes so far: `count`, or the newest number if that is higher, as a kept replay counts none before it answers.
     pub(super) fn so_far(&self, count: u64) -> Episodes {
-        Episodes::of(count.max(self.episode), self.newest.iter())
+        Episodes::new(count.max(self.newest), self.newest_returns.iter())
     }
 
-    pub(super) fn missing(&self) -> Vec<String> {
+    pub(super) fn loss_messages(&self) -> Vec<String> {
         let lost = (self.lost > 0).then(|| {
             format!(
                 "{} episodes have no row in episodes.csv: more ended between two looks than the replay server keeps",
                 self.lost
             )
         });
-        self.table.missing().into_iter().chain(lost).collect()
+        self.table.loss_message().into_iter().chain(lost).collect()
     }
 }
 

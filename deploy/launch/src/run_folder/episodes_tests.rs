@@ -65,8 +65,8 @@ fn begun() -> (tempfile::TempDir, RunFolder, TrainingEpisodes) {
 
 fn update(episodes: &mut TrainingEpisodes, shards: &[Shard]) -> Vec<String> {
     let statuses: Vec<_> = shards.iter().map(Shard::status).collect();
-    let ask = |shard: usize, since| Some(shards[shard].reply(since));
-    episodes.update(&statuses, ask, Some(1.5))
+    let fetch = |shard: usize, since| Some(shards[shard].reply(since));
+    episodes.update(&statuses, fetch, Some(1.5))
 }
 
 fn rows(folder: &RunFolder) -> Vec<String> {
@@ -97,7 +97,7 @@ fn every_episode_is_taken_once_from_every_shard() {
     ];
     assert_eq!(rows(&folder), expected);
     assert_eq!(mean(&episodes), (Some(53.0 / 4.0), 4));
-    assert!(episodes.missing().is_empty());
+    assert!(episodes.loss_messages().is_empty());
 }
 
 #[test]
@@ -106,7 +106,7 @@ fn what_the_server_has_let_go_is_counted_and_said() {
     update(&mut episodes, &[shard(10, 0, 5, 0)]);
     let said = update(&mut episodes, &[shard(90, 155, 255, 0)]);
     let why = "150 episodes have no row in episodes.csv";
-    for said in [&said[0], &episodes.missing()[0]] {
+    for said in [&said[0], &episodes.loss_messages()[0]] {
         assert!(said.starts_with(why), "{said}");
     }
     assert_eq!(mean(&episodes), (Some((155.0 + 254.0) / 2.0), 100));
@@ -121,17 +121,17 @@ fn what_the_server_has_let_go_is_counted_and_said() {
 fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
     let (_root, folder, mut episodes) = begun();
     let shard = shard(10, 0, 1, 0);
-    let ask = |_, since| {
+    let fetch = |_, since| {
         let mut reply = shard.reply(since);
         reply.episodes[0].played = None;
         Some(reply)
     };
-    episodes.update(&[shard.status()], ask, None);
+    episodes.update(&[shard.status()], fetch, None);
     assert_eq!(rows(&folder), [",10,1,4,2,,"]);
     assert_eq!(mean(&episodes), (None, 0));
     drop(episodes);
     let episodes = TrainingEpisodes::open(&folder, Some(10), Some(0)).unwrap();
-    assert_eq!((mean(&episodes), episodes.episode), ((None, 0), 1));
+    assert_eq!((mean(&episodes), episodes.newest), ((None, 0), 1));
 }
 
 #[test]
@@ -142,8 +142,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     // Episodes after the checkpoint do not count, nor does a row that was cut off.
     update(&mut episodes, &[shard(3_000, 70, 90, 0)]);
     let path = folder.episodes();
-    let text = fs::read_to_string(&path).unwrap();
-    fs::write(&path, text + "1.5,3000,91").unwrap();
+    fs::write(&path, fs::read_to_string(&path).unwrap() + "1.5,3000,91").unwrap();
 
     let mut episodes = TrainingEpisodes::open(&folder, Some(2_500), None).unwrap();
     assert_eq!(mean(&episodes), (Some(34.5), 70));

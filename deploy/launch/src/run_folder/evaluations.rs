@@ -50,7 +50,7 @@ impl EvaluationRow {
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
         let name = path.display();
-        let rows = Table::read(&path)?.all();
+        let rows = Table::read(&path)?.parse_rows();
         rows.with_context(|| usage!("{name} is not a table of evaluations: move it away"))
     }
 

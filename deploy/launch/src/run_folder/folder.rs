@@ -16,9 +16,9 @@ use driml_protocol::lock_file;
 use driml_settings::config::RunConfig;
 use nix::unistd::{AccessFlags, access};
 
-use super::table::{Table, write_whole};
+use super::table::{Table, write_atomically};
 
-pub(super) const EVENTS: &str = "events.out.tfevents.";
+pub(super) const EVENTS_PREFIX: &str = "events.out.tfevents.";
 
 /// Makes a method for each file and folder of a run, which returns its path.
 macro_rules! paths {
@@ -125,14 +125,14 @@ impl RunFolder {
             let frames = Table::read(path).ok().and_then(|it| it.last("frames"));
             frames.is_some_and(|frames: u64| frames > 0)
         };
-        let is_made = |it: &fs::DirEntry| {
+        let is_run_file = |it: &fs::DirEntry| {
             tables.iter().chain(&others).any(|made| *made == it.path())
-                || it.file_name().to_string_lossy().starts_with(EVENTS)
+                || it.file_name().to_string_lossy().starts_with(EVENTS_PREFIX)
         };
         let saved = checkpoint::list(&self.checkpoints());
         let entries: Vec<_> = entries.flatten().collect();
         entries.is_empty()
-            || entries.iter().all(is_made)
+            || entries.iter().all(is_run_file)
                 && self.config().exists()
                 && !tables.iter().any(has_frames)
                 && saved.is_ok_and(|all| all.is_empty())
@@ -140,19 +140,19 @@ impl RunFolder {
 
     /// Rejects a folder into which nothing could be written, before the folder is made.
     fn check_writable(&self) -> Result<(), Usage> {
-        let whole = std::path::absolute(&self.path).unwrap_or_else(|_| self.path.clone());
-        let Some(there) = whole.ancestors().find(|it| it.exists()) else {
+        let absolute = std::path::absolute(&self.path).unwrap_or_else(|_| self.path.clone());
+        let Some(existing) = absolute.ancestors().find(|it| it.exists()) else {
             return Ok(());
         };
-        let why = match access(there, AccessFlags::W_OK | AccessFlags::X_OK) {
-            _ if !there.is_dir() => "is not a folder".to_owned(),
+        let why = match access(existing, AccessFlags::W_OK | AccessFlags::X_OK) {
+            _ if !existing.is_dir() => "is not a folder".to_owned(),
             Err(e) => format!("cannot be written: {}", e.desc()),
             Ok(()) => return Ok(()),
         };
         Err(usage!(
             "the run folder {} cannot be made: {} {why}; choose another --run-dir",
             self.display(),
-            there.display()
+            existing.display()
         ))
     }
 
@@ -176,15 +176,15 @@ impl RunFolder {
         file.is_ok_and(|file| matches!(lock_file::try_lock(&file), Ok(false)))
     }
 
-    pub(crate) fn check_whole(&self) -> anyhow::Result<()> {
+    pub(crate) fn check_intact(&self) -> anyhow::Result<()> {
         // A run in lockstep has no logs.
         let files = [self.config(), self.metrics(), self.episodes(), self.logs()];
-        let gone = files.iter().filter(|it| !it.exists());
-        let gone: Vec<_> = gone.map(|it| it.display().to_string()).collect();
+        let missing = files.iter().filter(|it| !it.exists());
+        let missing: Vec<_> = missing.map(|it| it.display().to_string()).collect();
         anyhow::ensure!(
             files[..3].iter().all(|it| it.exists()),
             "the run folder was removed or moved during the run; missing: {}",
-            gone.join(", ")
+            missing.join(", ")
         );
         Ok(())
     }
@@ -192,7 +192,7 @@ impl RunFolder {
     pub(super) fn write_config(&self, config: &RunConfig) -> anyhow::Result<()> {
         let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
         let text = head.to_owned() + &config.to_toml();
-        write_whole(&self.config(), text.as_bytes())
+        write_atomically(&self.config(), text.as_bytes())
     }
 }
 

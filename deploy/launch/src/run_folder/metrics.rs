@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     folder::RunFolder,
-    table::{Table, read_json, write_whole},
+    table::{Table, read_json, write_atomically},
 };
 use crate::run_view::Spread;
 
@@ -24,7 +24,7 @@ pub struct ResumePoint {
     pub(crate) rows: u64,
     /// Frames of the run at the checkpoint.
     pub(crate) frames: u64,
-    /// Whether the replay was kept; it then counts everything that [`Uncounted`] does not.
+    /// Whether the replay was kept; it then counts everything that [`BeforeReplay`] does not.
     pub(crate) replay_is_kept: bool,
     /// Updates after which the replay began to count, if it was not kept.
     pub(crate) after_updates: u64,
@@ -34,7 +34,7 @@ pub struct ResumePoint {
 
 /// What a run had done before its replay began to count: up to the last resume without a replay, or nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Uncounted {
+pub(crate) struct BeforeReplay {
     /// Updates at which the replay began to count; they identify the replay.
     pub(crate) after_updates: u64,
     pub(crate) rows: u64,
@@ -45,7 +45,7 @@ pub(crate) struct Uncounted {
     pub(crate) seconds: f64,
 }
 
-impl Uncounted {
+impl BeforeReplay {
     pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
         let path = folder.resumed();
         match path.exists() {
@@ -55,12 +55,12 @@ impl Uncounted {
     }
 
     pub(crate) fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
-        write_whole(&folder.resumed(), &serde_json::to_vec(self)?)
+        write_atomically(&folder.resumed(), &serde_json::to_vec(self)?)
     }
 }
 
 /// The last row lies within this many bytes at the end of the file.
-const LAST_ROW_BYTES: u64 = 1 << 16;
+const LAST_ROW_BYTES_MAX: u64 = 1 << 16;
 
 /// The columns that decide whether a resumed run keeps a row.
 #[derive(Deserialize)]
@@ -76,21 +76,21 @@ pub(super) fn rows_up_to(
     header: Vec<String>,
     resume_point: ResumePoint,
 ) -> anyhow::Result<(Table, f64)> {
-    let mut found = Table::read(path)?;
-    let seconds = found.rows.iter();
-    let seconds = seconds.filter_map(|row| found.value::<f64>(row, "seconds"));
+    let mut table = Table::read(path)?;
+    let seconds = table.rows.iter();
+    let seconds = seconds.filter_map(|row| table.value::<f64>(row, "seconds"));
     let seconds = seconds.fold(0.0, f64::max);
-    found.keep(path, |it: Counts| {
+    table.keep_rows(path, |it: Counts| {
         // Actors run ahead: without the limit on frames, a run that now ends sooner would keep rows from after its end. A replay that
         // is filled anew counts from the checkpoint's frames.
         let is_counted = resume_point.replay_is_kept || it.frames <= resume_point.frames;
         let is_before = it.updates <= resume_point.updates && it.frames <= resume_point.frames_max;
         is_before && is_counted
     })?;
-    let places: Vec<_> = header.iter().map(|name| found.place(name)).collect();
-    let rows = found.rows.iter().map(|row| {
+    let columns: Vec<_> = header.iter().map(|name| table.column_index(name)).collect();
+    let rows = table.rows.iter().map(|row| {
         let cell = |place: &Option<usize>| place.and_then(|at| row.get(at)).unwrap_or("");
-        places.iter().map(cell).collect()
+        columns.iter().map(cell).collect()
     });
     let rows = rows.collect();
     Ok((Table { header, rows }, seconds))
@@ -106,12 +106,12 @@ pub struct Progress {
 }
 
 /// The progress of the run in `folder`; none before its first row of metrics. Reads only the file's first line and its end.
-pub fn progress(folder: &RunFolder) -> Option<Progress> {
+pub fn read_progress(folder: &RunFolder) -> Option<Progress> {
     let mut file = File::open(folder.metrics()).ok()?;
     let mut header = String::new();
     BufReader::new(&file).read_line(&mut header).ok()?;
     let length = file.metadata().ok()?.len();
-    let start = length.saturating_sub(LAST_ROW_BYTES);
+    let start = length.saturating_sub(LAST_ROW_BYTES_MAX);
     file.seek(SeekFrom::Start(start)).ok()?;
     let mut end = Vec::new();
     file.read_to_end(&mut end).ok()?;
@@ -136,9 +136,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let write = |text: &str| fs::write(folder.metrics(), text).unwrap();
-        assert_eq!(progress(&folder), None);
+        assert_eq!(read_progress(&folder), None);
         write("seconds,frames,updates,a,b,c,episodes\n");
-        assert_eq!(progress(&folder), None);
+        assert_eq!(read_progress(&folder), None);
         let found = Progress {
             frames: 200,
             episodes: 7,
@@ -150,7 +150,7 @@ mod tests {
             write(&format!(
                 "seconds,frames,updates,episodes{names}\n1,200,3,7{memory}\n2,30"
             ));
-            assert_eq!(progress(&folder), Some(found));
+            assert_eq!(read_progress(&folder), Some(found));
         }
     }
 }

@@ -9,17 +9,17 @@ mod recorder;
 mod summary;
 mod table;
 
-pub(crate) use self::metrics::Uncounted;
+pub(crate) use self::metrics::BeforeReplay;
 pub(crate) use self::{
     evaluations::Candidate,
-    summary::{Earned, LastPlay, commands, plot},
+    summary::{LastPlay, ReturnInterval, format_commands, plot_command},
     table::AppendLog,
 };
 pub use self::{
     evaluations::EvaluationRow,
     folder::RunFolder,
-    metrics::{Progress, ResumePoint, progress},
+    metrics::{Progress, ResumePoint, read_progress},
     recorder::RunRecorder,
     summary::{Outcome, Summary},
-    table::{Table, write_whole},
+    table::{Table, write_atomically},
 };

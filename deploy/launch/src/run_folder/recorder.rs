@@ -14,7 +14,7 @@ use super::{
     episodes::TrainingEpisodes,
     events::Events,
     folder::RunFolder,
-    metrics::{ResumePoint, Uncounted, rows_up_to},
+    metrics::{BeforeReplay, ResumePoint, rows_up_to},
     summary::{Outcome, Summary},
     table::{AppendLog, Table, csv_row},
 };
@@ -31,12 +31,12 @@ pub struct RunRecorder {
     resume_point: ResumePoint,
     /// Seconds that the run took before it was resumed.
     seconds_before: f64,
-    uncounted: Uncounted,
+    before_replay: BeforeReplay,
     metrics: AppendLog,
     events: Option<Events>,
     episodes: TrainingEpisodes,
     /// Whether the next episodes to arrive ended before the run was watched, at unknown times.
-    is_late: bool,
+    are_times_unknown: bool,
     /// Resident memory of each process by name, MiB: now, and the highest so far.
     rss_mib: Vec<(String, Option<f64>)>,
     rss_max: Vec<Option<f64>>,
@@ -61,7 +61,7 @@ impl RunRecorder {
         let lock = folder.lock()?;
         let header = header(config, &processes);
         let resume_point = resumed.unwrap_or_default();
-        let earlier = Uncounted::read(folder);
+        let earlier = BeforeReplay::read(folder);
         let summarised = Summary::read(folder).map_or(0.0, |it| it.wall_seconds);
         let noted = earlier.as_ref().map_or(0.0, |it| it.seconds);
         let seconds_before = noted.max(summarised);
@@ -83,27 +83,27 @@ impl RunRecorder {
             folder.write_config(config)?;
         }
         Summary::remove(folder)?;
-        let mut uncounted = kept.unwrap_or_else(|| Uncounted {
+        let mut before_replay = kept.unwrap_or_else(|| BeforeReplay {
             after_updates: resume_point.after_updates,
             rows: resume_point.rows,
-            episodes: rows.last("episodes").unwrap_or(0).max(episodes.episode),
+            episodes: rows.last("episodes").unwrap_or(0).max(episodes.newest),
             k: (rows.last("mean_k").zip(rows.last("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
             seconds: 0.0,
         });
-        uncounted.seconds = seconds;
+        before_replay.seconds = seconds;
         if resumed.is_some() {
-            uncounted.write(folder)?;
+            before_replay.write(folder)?;
         }
         let events = events.then(|| Events::create(folder, resume_point.frames));
         Ok(Self {
             _lock: lock,
             resume_point,
             seconds_before: seconds,
-            uncounted,
-            metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
+            before_replay,
+            metrics: AppendLog::create(&folder.metrics(), &rows.to_csv())?,
             events: events.transpose()?,
             episodes,
-            is_late: false,
+            are_times_unknown: false,
             rss_max: vec![None; processes.len()],
             rss_mib: processes.into_iter().map(|name| (name, None)).collect(),
             started: Instant::now(),
@@ -111,19 +111,19 @@ impl RunRecorder {
     }
 
     /// Notes that the run took at least this many seconds before this recorder started.
-    pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
-        self.is_late = true;
+    pub(crate) fn raise_seconds_before(&mut self, seconds: f64) {
+        self.are_times_unknown = true;
         self.seconds_before = self.seconds_before.max(seconds);
     }
 
     /// k over all rows of the run, including those before a resume.
-    fn k(&self, replay: &ReplayStatus) -> Option<Spread> {
+    fn k_spread(&self, replay: &ReplayStatus) -> Option<Spread> {
         let since = Spread::of_k(replay);
-        let (Some(before), Some(since)) = (self.uncounted.k, since) else {
-            return since.or(self.uncounted.k);
+        let (Some(before), Some(since)) = (self.before_replay.k, since) else {
+            return since.or(self.before_replay.k);
         };
-        let rows = replay.rows_sampled.max(self.uncounted.rows).max(1);
-        let share = self.uncounted.rows as f64 / rows as f64;
+        let rows = replay.rows_sampled.max(self.before_replay.rows).max(1);
+        let share = self.before_replay.rows as f64 / rows as f64;
         let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
         let square = |it: Spread| it.mean * it.mean + it.sd * it.sd;
         let mean = mixed(before.mean, since.mean);
@@ -133,10 +133,10 @@ impl RunRecorder {
     }
 
     /// Fills the numbers of the whole run into a view, including those from before a resume.
-    pub(crate) fn complete(&self, view: &mut RunView) {
+    pub(crate) fn fill_totals(&self, view: &mut RunView) {
         view.recorded_s = Some(self.seconds());
-        view.episodes = self.episodes(&view.replay);
-        view.k = self.k(&view.replay);
+        view.episodes = self.total_episodes(&view.replay);
+        view.k = self.k_spread(&view.replay);
         view.rss_mib.clone_from(&self.rss_mib);
     }
 
@@ -149,16 +149,16 @@ impl RunRecorder {
     pub(crate) fn record_episodes(
         &mut self,
         view: &RunView,
-        ask: impl Fn(usize, u64) -> Option<EpisodesReply>,
+        fetch: impl Fn(usize, u64) -> Option<EpisodesReply>,
     ) -> Vec<String> {
-        let seconds = (!std::mem::take(&mut self.is_late)).then(|| self.seconds());
-        self.episodes.update(&view.shards, ask, seconds)
+        let seconds = (!std::mem::take(&mut self.are_times_unknown)).then(|| self.seconds());
+        self.episodes.update(&view.shards, fetch, seconds)
     }
 
     /// Adds a row of metrics for the state of the run; a resumed run adds rows once it has passed its resume point.
     /// `rss_mib` is in the order of the processes given at the start, none for a process that has ended.
     ///
-    /// A full disk does not end the run: a warning is returned the first time, and [`Self::missing`] reports at the end what
+    /// A full disk does not end the run: a warning is returned the first time, and [`Self::loss_messages`] reports at the end what
     /// was lost.
     pub fn record(&mut self, view: &mut RunView, rss_mib: &[Option<f64>]) -> Vec<String> {
         let known = rss_mib.iter().copied().chain(std::iter::repeat(None));
@@ -166,7 +166,7 @@ impl RunRecorder {
             *rss = now;
             *max = now.into_iter().chain(*max).reduce(f64::max);
         }
-        self.complete(view);
+        self.fill_totals(view);
         let (frames, updates) = (view.replay.transitions_inserted, view.learner.updates);
         let before = &self.resume_point;
         if before.updates > 0 && (updates <= before.updates || frames < before.frames) {
@@ -180,32 +180,32 @@ impl RunRecorder {
     }
 
     /// Messages about rows that could not be written so far.
-    pub fn missing(&self) -> Vec<String> {
-        let events = self.events.as_ref().and_then(|it| it.file.missing());
-        let mut missing = self.episodes.missing();
-        missing.extend([self.metrics.missing(), events].into_iter().flatten());
+    pub fn loss_messages(&self) -> Vec<String> {
+        let events = self.events.as_ref().and_then(|it| it.file.loss_message());
+        let mut missing = self.episodes.loss_messages();
+        missing.extend([self.metrics.loss_message(), events].into_iter().flatten());
         missing
     }
 
-    pub(crate) fn episodes(&self, replay: &ReplayStatus) -> Episodes {
+    pub(crate) fn total_episodes(&self, replay: &ReplayStatus) -> Episodes {
         self.episodes
-            .so_far(self.uncounted.episodes + replay.episodes)
+            .so_far(self.before_replay.episodes + replay.episodes)
     }
 
     /// The summary of the run, which ended with `outcome`.
     pub fn summarise(&self, outcome: Outcome, view: &mut RunView) -> Summary {
-        self.complete(view);
+        self.fill_totals(view);
         let rss = self.rss_mib.iter().zip(&self.rss_max);
         let rss = rss.map(|((name, _), mib)| (name.clone(), mib.map(f64::round)));
         Summary {
             rss_mib_max: rss.collect(),
-            ..Summary::of(outcome, view, self.seconds(), self.resume_point)
+            ..Summary::new(outcome, view, self.seconds(), self.resume_point)
         }
     }
 }
 
 fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
-    let mut nothing = RunView::new(Plan::of(config));
+    let mut nothing = RunView::new(Plan::new(config));
     nothing.rss_mib = processes.iter().map(|it| (it.clone(), None)).collect();
     cells(&nothing).into_iter().map(|(name, _)| name).collect()
 }

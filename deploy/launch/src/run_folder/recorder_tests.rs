@@ -6,7 +6,7 @@ use expect_test::expect;
 
 use super::*;
 use crate::{
-    run_folder::{Earned, LastPlay},
+    run_folder::{LastPlay, ReturnInterval},
     testing::{self, make},
 };
 
@@ -39,7 +39,7 @@ fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
     };
     let plan = Plan {
         epsilon: Some(epsilon),
-        ..Plan::of(&settings())
+        ..Plan::new(&settings())
     };
     testing::view(plan, replay, Some(learner))
 }
@@ -89,7 +89,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     };
     said.extend(recorder.record_episodes(&all, |_, _| Some(ended.clone())));
     said.extend(recorder.record(&mut all, &[Some(12.34), None]));
-    said.extend(recorder.missing());
+    said.extend(recorder.loss_messages());
     assert!(said.is_empty(), "{said:?}");
     let summary = recorder.summarise(Outcome::Finished, &mut all);
     summary.write(&run).unwrap();
@@ -168,8 +168,9 @@ fn a_resumed_run_continues_in_its_metrics() {
         ..point(updates)
     };
     let recorder = open(&run, &processes, Some(kept(62, 9_999))).unwrap();
-    assert_eq!(recorder.episodes(&resumed.replay).count, 7 + 2);
-    assert_eq!(recorder.k(&resumed.replay).map(|it| it.mean), Some(1.75));
+    assert_eq!(recorder.total_episodes(&resumed.replay).count, 7 + 2);
+    let mean_k = recorder.k_spread(&resumed.replay).unwrap().mean;
+    assert_eq!(mean_k, 1.75);
     let read = |frames_max| {
         let header = Table::read(&path).unwrap().header;
         rows_up_to(&path, header, kept(99, frames_max)).unwrap().0
@@ -212,7 +213,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         let rows_of_metrics = (rows("metrics.csv"), rows("metrics.aside-1.csv"));
         assert_eq!(rows_of_metrics, (kept, kept / 2), "{what}");
         let nothing = ReplayStatus::default();
-        assert_eq!(recorder.episodes(&nothing).count, 2, "{what}");
+        assert_eq!(recorder.total_episodes(&nothing).count, 2, "{what}");
         let mut view = view(nothing, LearnerStatus::default());
         let summary = recorder.summarise(Outcome::Finished, &mut view);
         let took = summary.wall_seconds;
@@ -243,20 +244,20 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
         let recorder = open(&run, &[], Some(point)).unwrap();
         let rows = Table::read(&run.metrics()).unwrap().rows;
         assert_eq!(rows.len(), kept, "{metrics}");
-        let episodes = recorder.episodes(&ReplayStatus::default()).count;
+        let episodes = recorder.total_episodes(&ReplayStatus::default()).count;
         assert_eq!(episodes, 2 * kept as u64, "{metrics}");
     }
 }
 
 fn summary(replay: ReplayStatus) -> Summary {
     let view = view(replay, LearnerStatus::default());
-    Summary::of(Outcome::Finished, &view, 2.0, ResumePoint::default())
+    Summary::new(Outcome::Finished, &view, 2.0, ResumePoint::default())
 }
 
 #[test]
 fn next_steps_stand_in_columns() {
     let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = 1_280);
-    let earned = |mean, low, high| Earned { mean, low, high };
+    let earned = |mean, low, high| ReturnInterval { mean, low, high };
     let mut summary = summary(replay);
     summary.played = Some(LastPlay {
         weights: "averaged".into(),
@@ -283,12 +284,13 @@ fn a_time_that_cannot_be_is_described_as_none() {
             wall_seconds,
             ..summary(ReplayStatus::default())
         };
-        assert!(summary.counts().contains(" in 0 s ("), "{wall_seconds}");
+        let said = summary.describe_counts();
+        assert!(said.contains(" in 0 s ("), "{wall_seconds}");
     }
 }
 
 #[test]
 fn a_run_without_an_episode_has_no_mean_return() {
     expect!["finished: 0 frames and 0 updates in 2 s (0 frames/s, 0.00 updates/s), replay ratio -, no episode ended"]
-        .assert_eq(&summary(ReplayStatus::default()).counts());
+        .assert_eq(&summary(ReplayStatus::default()).describe_counts());
 }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     folder::RunFolder,
     metrics::ResumePoint,
-    table::{read_json, write_whole},
+    table::{read_json, write_atomically},
 };
 use crate::{
     console::aligned,
@@ -33,15 +33,15 @@ pub enum Outcome {
 
 /// The mean undiscounted return of whole episodes, and its 95% confidence interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Earned {
+pub(crate) struct ReturnInterval {
     pub(crate) mean: f64,
     pub(crate) low: f64,
     pub(crate) high: f64,
 }
 
-impl Earned {
+impl ReturnInterval {
     /// The mean of at least one return, and its interval; for a single return, both ends are that return.
-    pub(crate) fn of(returns: &[f64]) -> Self {
+    pub(crate) fn new(returns: &[f64]) -> Self {
         let (mean, _) = mean_and_deviation(returns);
         let ends = interval(returns).and_then(|it| it.ends);
         let (low, high) = ends.unwrap_or((mean, mean));
@@ -56,15 +56,15 @@ pub(crate) struct LastPlay {
     pub(crate) weights: String,
     pub(crate) episodes: u64,
     #[serde(flatten)]
-    pub(crate) agent: Earned,
-    pub(crate) random: Earned,
+    pub(crate) agent: ReturnInterval,
+    pub(crate) random: ReturnInterval,
 }
 
 impl LastPlay {
     fn describe(&self) -> String {
-        let Earned { mean, low, high } = self.agent;
+        let ReturnInterval { mean, low, high } = self.agent;
         let agent = format!("{mean:.2}, 95% interval {low:.2} to {high:.2}");
-        let Earned { mean, low, high } = self.random;
+        let ReturnInterval { mean, low, high } = self.random;
         let random = format!("{mean:.2} ({low:.2} to {high:.2})");
         let (weights, episodes) = (&self.weights, self.episodes);
         format!(
@@ -125,7 +125,7 @@ pub struct Summary {
 
 impl Summary {
     /// The summary of a run that took `wall_seconds`. A resumed run without any progress still has the counts of `before`.
-    pub(crate) fn of(
+    pub(crate) fn new(
         outcome: Outcome,
         view: &RunView,
         wall_seconds: f64,
@@ -165,7 +165,7 @@ impl Summary {
     pub fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let mut text = serde_json::to_vec_pretty(self).context("writing the summary")?;
         text.push(b'\n');
-        write_whole(&folder.summary(), &text)
+        write_atomically(&folder.summary(), &text)
     }
 
     /// Reads the summary of the run in `folder`.
@@ -195,27 +195,27 @@ impl Summary {
         let film = "films it, and plays a random policy beside it";
         let mut next = vec![
             (format!("evaluate {run} --record play.gif"), film),
-            plot(run_dir),
+            plot_command(run_dir),
         ];
         if is_resumable {
             next.push((format!("train --resume {run} --frames {more}"), "trains on"));
         }
-        self.earned() + &commands(&next)
+        self.describe_returns() + &format_commands(&next)
     }
 
     /// Describes how the run ended, and the returns of its weights.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
-        let (counts, earned) = (self.counts(), self.earned());
+        let (counts, earned) = (self.describe_counts(), self.describe_returns());
         format!("{counts}\n{earned}{}\n", run_dir.display())
     }
 
-    fn earned(&self) -> String {
+    fn describe_returns(&self) -> String {
         let played = self.played.as_ref();
         played.map(LastPlay::describe).unwrap_or_default()
     }
 
     /// How the run ended and what it counted, in one line.
-    pub(crate) fn counts(&self) -> String {
+    pub(crate) fn describe_counts(&self) -> String {
         let (of, episodes) = (self.mean_return_of, self.episodes);
         let returns = match self.mean_return {
             None => "no episode ended".into(),
@@ -241,13 +241,13 @@ impl Summary {
 }
 
 /// The command that draws a run's curves, and which curves these are.
-pub(crate) fn plot(run_dir: &RunFolder) -> (String, &'static str) {
+pub(crate) fn plot_command(run_dir: &RunFolder) -> (String, &'static str) {
     let command = format!("plot {} --out plot.png", run_dir.quoted());
     (command, "return, losses, k and speed")
 }
 
 /// Formats commands, and what each does, in columns.
-pub(crate) fn commands(commands: &[(String, &str)]) -> String {
+pub(crate) fn format_commands(commands: &[(String, &str)]) -> String {
     let row =
         |(command, what): &(String, &str)| vec![format!("  driml {command}"), format!(" {what}")];
     aligned(&commands.iter().map(row).collect::<Vec<_>>(), &[])

@@ -23,7 +23,7 @@ use crate::console;
 const WAITING_MAX: usize = 100_000;
 
 /// Writes a file whole or not at all.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     atomic_write::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
 
@@ -63,13 +63,13 @@ impl Table {
     }
 
     /// The index of the column `name`; none if the table does not have it.
-    pub fn place(&self, name: &str) -> Option<usize> {
+    pub fn column_index(&self, name: &str) -> Option<usize> {
         self.header.iter().position(|it| it == name)
     }
 
     /// The value of `row` in the column `name`; none if the cell is empty, or of another type.
     pub fn value<T: FromStr>(&self, row: &StringRecord, name: &str) -> Option<T> {
-        row.get(self.place(name)?)?.parse().ok()
+        row.get(self.column_index(name)?)?.parse().ok()
     }
 
     /// The value of the last row in the column `name`.
@@ -77,13 +77,13 @@ impl Table {
         self.value(self.rows.last()?, name)
     }
 
-    pub(super) fn text(&self) -> Vec<u8> {
+    pub(super) fn to_csv(&self) -> Vec<u8> {
         let rows = self.rows.iter().flat_map(csv_row);
         csv_row(&self.header).into_iter().chain(rows).collect()
     }
 
     /// The rows as `T`, whose fields have the names of the columns; none if a row does not fit.
-    pub(super) fn all<T: DeserializeOwned>(&self) -> Option<Vec<T>> {
+    pub(super) fn parse_rows<T: DeserializeOwned>(&self) -> Option<Vec<T>> {
         let header = StringRecord::from(&self.header[..]);
         let rows = self.rows.iter();
         rows.map(|row| row.deserialize(Some(&header)).ok())
@@ -92,7 +92,7 @@ impl Table {
 
     /// Keeps the rows for which `is_kept` returns true. The others are written into a new file beside `path`, which a printed line
     /// names. Returns whether there were any others.
-    pub(super) fn keep<T: DeserializeOwned>(
+    pub(super) fn keep_rows<T: DeserializeOwned>(
         &mut self,
         path: &Path,
         is_kept: impl Fn(T) -> bool,
@@ -121,14 +121,14 @@ impl Table {
         }
         let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
         let free = (1..).map(free).find(|it| !it.exists());
-        let beside = free.context("no name is free beside the table")?;
-        write_whole(&beside, &aside.text())?;
+        let aside_path = free.context("no name is free beside the table")?;
+        write_atomically(&aside_path, &aside.to_csv())?;
         let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
         console::line(&format!(
             "{} rows of {} are past the point where the run is resumed; they are now in {}",
             aside.rows.len(),
             name(path),
-            name(&beside)
+            name(&aside_path)
         ));
         Ok(true)
     }
@@ -144,13 +144,13 @@ pub(crate) struct AppendLog {
     waiting: VecDeque<Vec<u8>>,
     waiting_max: usize,
     lost: u64,
-    failed: Option<io::Error>,
+    error: Option<io::Error>,
 }
 
 impl AppendLog {
     /// Creates a table anew, which begins with the bytes `first`.
     pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
-        write_whole(path, first)?;
+        write_atomically(path, first)?;
         let name = path.file_name().unwrap_or_default();
         Self::open(path, name.to_string_lossy().into(), "rows", WAITING_MAX)
     }
@@ -169,23 +169,23 @@ impl AppendLog {
             waiting: VecDeque::new(),
             waiting_max,
             lost: 0,
-            failed: None,
+            error: None,
         })
     }
 
     /// Adds rows after those that wait, in one write. Returns a warning the first time that rows have to wait.
     pub(crate) fn add(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
         self.waiting.extend(rows);
-        let more = self.waiting.len().saturating_sub(self.waiting_max);
-        self.waiting.drain(..more);
-        self.lost += more as u64;
+        let excess = self.waiting.len().saturating_sub(self.waiting_max);
+        self.waiting.drain(..excess);
+        self.lost += excess as u64;
         let error = self.write().err()?;
         let (name, unit) = (&self.name, self.unit);
-        let said = self.failed.is_none().then(|| {
+        let warning = self.error.is_none().then(|| {
             format!("{name} cannot be written: {error}; its {unit} wait in memory until it can be")
         });
-        self.failed.get_or_insert(error);
-        said
+        self.error.get_or_insert(error);
+        warning
     }
 
     /// Writes all waiting rows, or none.
@@ -196,9 +196,9 @@ impl AppendLog {
     }
 
     /// How many rows are not in the file, and why; none if all are in it.
-    pub(crate) fn missing(&self) -> Option<String> {
+    pub(crate) fn loss_message(&self) -> Option<String> {
         let rows = self.lost + self.waiting.len() as u64;
-        let error = self.failed.as_ref().filter(|_| rows > 0)?;
+        let error = self.error.as_ref().filter(|_| rows > 0)?;
         let (name, unit) = (&self.name, self.unit);
         Some(format!("{rows} {unit} of {name} are lost: {error}"))
     }
@@ -254,11 +254,11 @@ mod tests {
         let path = folder.path().join("x.csv");
         let mut table = Table::parse(b"a,b\n1,2\n3,\"4, of five\"\n5,6\n").unwrap();
         let is_kept = |row: BTreeMap<String, String>| row["a"] != "3";
-        table.keep(&path, is_kept).unwrap();
-        assert_eq!(table.text(), b"a,b\n1,2\n5,6\n");
-        let beside = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
-        assert_eq!(beside, b"a,b\n3,\"4, of five\"\n");
-        let log = AppendLog::create(&path, &table.text()).unwrap();
+        table.keep_rows(&path, is_kept).unwrap();
+        assert_eq!(table.to_csv(), b"a,b\n1,2\n5,6\n");
+        let aside_path = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
+        assert_eq!(aside_path, b"a,b\n3,\"4, of five\"\n");
+        let log = AppendLog::create(&path, &table.to_csv()).unwrap();
         assert_eq!((log.name.as_str(), log.unit), ("x.csv", "rows"));
     }
 
@@ -278,7 +278,7 @@ mod tests {
             let wait = format!("; its {unit} wait in memory until it can be");
             assert!(said.starts_with(&why) && said.ends_with(&wait), "{said}");
             assert_eq!(log.add(row(2)), None, "it is logged once");
-            let missing = log.missing().unwrap();
+            let missing = log.loss_message().unwrap();
             let why = format!("2 {unit} of {name} are lost: No space left");
             assert!(missing.starts_with(&why), "{missing}");
 
@@ -289,7 +289,7 @@ mod tests {
             assert_eq!(log.add(row(3)), None);
             let kept: String = (1 + lost..=3).map(text).collect();
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("a\n{kept}"));
-            assert_eq!((log.lost, log.missing().is_some()), (lost, lost > 0));
+            assert_eq!((log.lost, log.loss_message().is_some()), (lost, lost > 0));
         }
     }
 }

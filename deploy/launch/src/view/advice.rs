@@ -17,44 +17,44 @@ const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
 
 /// Each replay server that answered, with its status.
-fn statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
+fn server_statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
     answered.filter_map(|server| Some((server, server.processes.as_ref()?)))
 }
 
 /// The status of the learner and of all actors, each with the endpoint of the server that it is connected to.
 fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
-    statuses(view)
+    server_statuses(view)
         .flat_map(|(server, account)| account.processes.iter().map(|it| (&*server.endpoint, it)))
 }
 
 /// Which side waits at the rate limiter, and for how long.
-pub(super) fn waits(view: &RunView) -> Vec<String> {
+pub(super) fn limiter_waits(view: &RunView) -> Vec<String> {
     let limiter = |(_, account): (_, &ProcessesStatus)| match account.waiting {
         Waiting::Neither => None,
         Waiting::Finished => Some(account.waiting.to_string()),
-        waiting => Some(format!("{waiting} ({})", seconds(account.waiting_s))),
+        waiting => Some(format!("{waiting} ({})", format_s(account.waiting_s))),
     };
-    let mut waits: Vec<_> = statuses(view).filter_map(limiter).collect();
+    let mut waits: Vec<_> = server_statuses(view).filter_map(limiter).collect();
     waits.dedup();
     waits
 }
 
 /// What is missing and what to do about it, the most important first.
-pub(crate) fn needed(view: &RunView) -> Vec<String> {
+pub(crate) fn actions_needed(view: &RunView) -> Vec<String> {
     let servers = view.servers.iter().filter(|_| !view.is_over());
-    let mut needed: Vec<_> = servers.filter_map(of_server).collect();
-    needed.extend(statuses(view).filter_map(of_disk));
-    if !view.is_over() && statuses(view).next().is_some() {
-        needed.extend(of_learner(view));
+    let mut needed: Vec<_> = servers.filter_map(server_action).collect();
+    needed.extend(server_statuses(view).filter_map(disk_action));
+    if !view.is_over() && server_statuses(view).next().is_some() {
+        needed.extend(learner_action(view));
         if !view.replay.finished {
-            needed.extend(of_actors(view));
+            needed.extend(actor_actions(view));
         }
     }
     needed
 }
 
-fn of_server(server: &ServerAnswer) -> Option<String> {
+fn server_action(server: &ServerAnswer) -> Option<String> {
     let endpoint = &server.endpoint;
     Some(if server.is_another_run {
         format!("{endpoint} now serves a run with other settings: connect again")
@@ -72,28 +72,28 @@ fn of_server(server: &ServerAnswer) -> Option<String> {
     })
 }
 
-fn of_disk((server, account): (&ServerAnswer, &ProcessesStatus)) -> Option<String> {
+fn disk_action((server, account): (&ServerAnswer, &ProcessesStatus)) -> Option<String> {
     let log = account.log.as_ref()?;
     let (since, why) = log.refused.as_ref()?;
     Some(format!(
         "the disk of the replay server on {} has rejected its replay for {} ({why}): make room for {}, or make it writable; the run then \
          continues",
         server.endpoint,
-        seconds(*since),
+        format_s(*since),
         log.folder
     ))
 }
 
-fn of_learner(view: &RunView) -> Option<String> {
+fn learner_action(view: &RunView) -> Option<String> {
     let connect = |it: &ServerAnswer| format!(" --connect {}", it.endpoint);
     let connects: String = view.servers.iter().map(connect).collect();
-    let tls = certificates(&view.servers[0].endpoint);
+    let tls = tls_flag(&view.servers[0].endpoint);
     let command = format!("`driml learner{connects}{tls} --run-dir DIR`");
     match processes(view).find(|(_, process)| process.who == ProcessName::Learner) {
         None => Some(format!("no learner has joined: start {command}")),
         Some((_, learner)) if !learner.connected => Some(format!(
             "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: {command}",
-            seconds(learner.since_s)
+            format_s(learner.since_s)
         )),
         Some(_) if view.learner_status().is_none() => Some(
             "the learner is connected but does not respond: its process may be suspended, or the machine overloaded".into(),
@@ -102,7 +102,7 @@ fn of_learner(view: &RunView) -> Option<String> {
     }
 }
 
-fn of_actors(view: &RunView) -> Vec<String> {
+fn actor_actions(view: &RunView) -> Vec<String> {
     let is_actor = |(_, process): &(_, &ProcessStatus)| process.who != ProcessName::Learner;
     let actors: Vec<_> = processes(view).filter(is_actor).collect();
     if !actors.iter().any(|(_, process)| process.connected) {
@@ -111,30 +111,30 @@ fn of_actors(view: &RunView) -> Vec<String> {
             true => "no actor has joined",
             false => "all actors have disconnected",
         };
-        let flags = certificates(endpoint);
+        let flags = tls_flag(endpoint);
         return vec![format!(
             "{what}: start `driml actor --connect {endpoint}{flags} --id N`, each with another number"
         )];
     }
-    let of_actor = |(endpoint, process): &(&str, &ProcessStatus)| {
+    let actor_action = |(endpoint, process): &(&str, &ProcessStatus)| {
         let ProcessName::Actor(id) = process.who else {
             return None;
         };
         if !process.connected {
-            let (since, tls) = (seconds(process.since_s), certificates(endpoint));
+            let (since, tls) = (format_s(process.since_s), tls_flag(endpoint));
             return Some(format!(
                 "actor-{id} disconnected {since} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{tls} --id {id}`"
             ));
         }
-        let silent = seconds(silent_for(process)?);
+        let silent = format_s(silent_s(process)?);
         Some(format!(
             "actor-{id} is connected but has sent nothing for {silent}: its process may be suspended"
         ))
     };
-    actors.iter().filter_map(of_actor).collect()
+    actors.iter().filter_map(actor_action).collect()
 }
 
-fn certificates(endpoint: &str) -> &'static str {
+fn tls_flag(endpoint: &str) -> &'static str {
     match session::is_quic(endpoint) {
         true => " --tls-dir DIR",
         false => "",
@@ -143,25 +143,27 @@ fn certificates(endpoint: &str) -> &'static str {
 
 /// The notes below the live lines: which processes do not respond, and for how long.
 pub(super) fn notes(view: &RunView) -> Vec<String> {
-    if view.is_learned() {
+    if view.is_all_learned() {
         return vec!["all frames and updates are done: the processes exit".into()];
     }
-    let recovering = view.recovering().map(|(it, how)| recovery(&it.name, how));
+    let recovering = view
+        .recovering()
+        .map(|(it, how)| describe_recovery(&it.name, how));
     let recovering: Vec<_> = recovering.collect();
     if !recovering.is_empty() {
         return recovering;
     }
     // No other process can be asked while the replay server does not answer.
-    if let Some(replay) = silence("replay server", view.replay_silence) {
+    if let Some(replay) = silence_note("replay server", view.replay_silence) {
         return vec![replay];
     }
-    let is_known = statuses(view).next().is_some();
+    let is_known = server_statuses(view).next().is_some();
     let has_joined =
         |learner| processes(view).any(|it| (it.1.who == ProcessName::Learner) == learner);
     let learner = match view.learner.finished {
         true => None,
         false if is_known && !has_joined(true) => Some("no learner has joined yet".to_owned()),
-        false => silence("learner", view.learner_silence),
+        false => silence_note("learner", view.learner_silence),
     };
     let actor = (is_known && !has_joined(false)).then(|| "no actor has joined yet".to_owned());
     let mut notes: Vec<_> = learner.into_iter().chain(actor).collect();
@@ -169,18 +171,18 @@ pub(super) fn notes(view: &RunView) -> Vec<String> {
     notes
 }
 
-pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
+pub(crate) fn describe_recovery(server: &str, progress: RecoveryProgress) -> String {
     format!("{server}: reads its replay back from disk, {progress}")
 }
 
 /// A note on a process that has not answered for `SILENT_MAX`; none before that.
-fn silence(process: &str, silence: Silence) -> Option<String> {
+fn silence_note(process: &str, silence: Silence) -> Option<String> {
     let silent = silence.length();
     (silent >= SILENT_MAX).then(|| format!("{process}: no answer for {}", duration(silent)))
 }
 
 /// For how many seconds a connected process has been silent; none up to `UNRESPONSIVE_S`, or while it is held at the rate limiter.
-fn silent_for(process: &ProcessStatus) -> Option<f64> {
+fn silent_s(process: &ProcessStatus) -> Option<f64> {
     let silent = process.last_seen_s.unwrap_or(process.since_s);
     let doing = process.doing.as_ref();
     let says = doing.map_or(f64::INFINITY, |(_, _, said)| *said);
@@ -196,11 +198,11 @@ fn unresponsive_actors(view: &RunView) -> Vec<String> {
     let words = |process: &ProcessStatus| {
         let (how, since_s) = match process.connected {
             _ if process.who == ProcessName::Learner => return None,
-            true => ("no answer", silent_for(process)?),
+            true => ("no answer", silent_s(process)?),
             false if view.replay.finished => return None,
             false => ("gone", process.since_s),
         };
-        Some(format!("{}: {how} for {}", process.who, seconds(since_s)))
+        Some(format!("{}: {how} for {}", process.who, format_s(since_s)))
     };
     let mut words: Vec<_> = processes(view).filter_map(|it| words(it.1)).collect();
     let more = words.len().saturating_sub(NAMED_MAX);
@@ -211,7 +213,7 @@ fn unresponsive_actors(view: &RunView) -> Vec<String> {
     words
 }
 
-pub(super) fn seconds(seconds: f64) -> String {
+pub(super) fn format_s(seconds: f64) -> String {
     duration(Duration::try_from_secs_f64(seconds).unwrap_or_default())
 }
 
@@ -226,7 +228,7 @@ mod tests {
     /// A run whose only replay server does not answer any more; `waiting` is the state in its last answer.
     fn silent(is_gone: bool, waiting: Waiting) -> RunView {
         let mut view = RunView::new(Plan::default());
-        view.take_replay(vec![make(|it: &mut ReplayStatus| it.waiting = waiting)]);
+        view.set_replay(vec![make(|it: &mut ReplayStatus| it.waiting = waiting)]);
         view.servers = vec![make(|it: &mut ServerAnswer| {
             it.endpoint = "tcp/host:1".into();
             (it.error, it.is_gone) = (Some("no answer".into()), is_gone);
@@ -241,7 +243,7 @@ mod tests {
             (true, Waiting::Neither),
             (true, Waiting::Finished),
         ]
-        .map(|(is_gone, waiting)| needed(&silent(is_gone, waiting)).join("; "));
+        .map(|(is_gone, waiting)| actions_needed(&silent(is_gone, waiting)).join("; "));
         expect![[r#"
             the replay server on tcp/host:1 does not answer (no answer): its process may be suspended, or its machine unreachable
             the replay server on tcp/host:1 has exited: restart it unless the run is complete

@@ -9,14 +9,14 @@ use std::{
 use driml_protocol::{LearnerStatus, ProcessStatus, ReplayStatus, atomic_write};
 use serde::Serialize;
 
-use super::advice::{needed, waits};
+use super::advice::{actions_needed, limiter_waits};
 use crate::{
     metrics::{self, COLUMNS, Member, Value},
     run_view::{Plan, RunView, ServerAnswer},
 };
 
 #[derive(Serialize)]
-struct Answer<'a> {
+struct RunJson<'a> {
     #[serde(flatten)]
     plan: &'a Plan,
     healthy: bool,
@@ -32,9 +32,9 @@ struct Answer<'a> {
     actions_needed: Vec<String>,
 }
 
-pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
-    let actions_needed = needed(view);
-    let answer = Answer {
+pub(crate) fn run_json(view: &RunView) -> serde_json::Result<String> {
+    let actions_needed = actions_needed(view);
+    let answer = RunJson {
         plan: &view.plan,
         healthy: actions_needed.is_empty(),
         finished: view.is_finished(),
@@ -42,7 +42,7 @@ pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
         servers: &view.servers,
         replay: &view.replay,
         learner: view.learner_status(),
-        waiting_for: waits(view),
+        waiting_for: limiter_waits(view),
         actions_needed,
     };
     Ok(serde_json::to_string(&answer)? + "\n")
@@ -64,16 +64,16 @@ impl PrometheusFile {
 
     /// Writes the file, whole or not at all. Returns a warning the first time that it cannot be written.
     pub(crate) fn write(&mut self, view: &RunView) -> Option<String> {
-        let failed = atomic_write::write(&self.path, prometheus(view).as_bytes()).err()?;
+        let failed = atomic_write::write(&self.path, prometheus_text(view).as_bytes()).err()?;
         (!std::mem::replace(&mut self.has_warned, true))
             .then(|| format!("{} cannot be written: {failed}", self.path.display()))
     }
 }
 
 /// The text of the file. Labels on each line distinguish the runs of one machine.
-fn prometheus(view: &RunView) -> String {
+fn prometheus_text(view: &RunView) -> String {
     let (plan, endpoints) = (&view.plan, view.servers.iter().map(|it| &*it.endpoint));
-    let mut page = Page {
+    let mut page = PrometheusText {
         text: String::new(),
         labels: format!(
             "world=\"{}\",agent=\"{}\",seed=\"{}\",endpoint=\"{}\"",
@@ -83,34 +83,34 @@ fn prometheus(view: &RunView) -> String {
             escaped(&endpoints.collect::<Vec<_>>().join(" "))
         ),
     };
-    let up = view.is_answered().into();
-    page.gauge("up", "Whether all replay servers of the run answered.", up);
+    let up = view.servers_answered().into();
+    page.add_gauge("up", "Whether all replay servers of the run answered.", up);
     // The counts of only some servers are not those of the run.
-    if view.is_answered() {
-        page.columns(view);
-        page.processes(view);
+    if view.servers_answered() {
+        page.add_columns(view);
+        page.add_processes(view);
         let planned = [plan.frames_planned, plan.updates_planned].map(|it| it as f64);
-        page.gauge("frames_planned", "Frames of the whole run.", planned[0]);
-        page.gauge("updates_planned", "Updates of the whole run.", planned[1]);
-        let is_so = [view.is_finished(), needed(view).is_empty()].map(f64::from);
+        page.add_gauge("frames_planned", "Frames of the whole run.", planned[0]);
+        page.add_gauge("updates_planned", "Updates of the whole run.", planned[1]);
+        let flags = [view.is_finished(), actions_needed(view).is_empty()].map(f64::from);
         let [finished, healthy] = [
             "Whether everything is learned and saved.",
             "Whether no process of the run is missing.",
         ];
-        page.gauge("finished", finished, is_so[0]);
-        page.gauge("healthy", healthy, is_so[1]);
+        page.add_gauge("finished", finished, flags[0]);
+        page.add_gauge("healthy", healthy, flags[1]);
     }
     page.text
 }
 
-struct Page {
+struct PrometheusText {
     text: String,
     labels: String,
 }
 
-impl Page {
+impl PrometheusText {
     /// Adds a metric: its head, and a sample for each member that has a value; nothing if none has. `label` distinguishes members.
-    fn metric(&mut self, kind: &str, name: &str, help: &str, label: &str, members: &[Member]) {
+    fn add_metric(&mut self, kind: &str, name: &str, help: &str, label: &str, members: &[Member]) {
         let members = members.iter();
         let known = members.filter_map(|(member, value)| Some((member, (*value)?)));
         for (nth, (member, value)) in known.enumerate() {
@@ -125,11 +125,11 @@ impl Page {
         }
     }
 
-    fn gauge(&mut self, name: &str, help: &str, value: f64) {
-        self.metric("gauge", name, help, "", &[(String::new(), Some(value))]);
+    fn add_gauge(&mut self, name: &str, help: &str, value: f64) {
+        self.add_metric("gauge", name, help, "", &[(String::new(), Some(value))]);
     }
 
-    fn columns(&mut self, view: &RunView) {
+    fn add_columns(&mut self, view: &RunView) {
         for column in COLUMNS {
             let (kind, label, ending) = match column.value {
                 Value::Counter(_) => ("counter", "", "_total"),
@@ -137,11 +137,11 @@ impl Page {
                 Value::Gauge(_) | Value::Words(_) => ("gauge", "", ""),
             };
             let name = format!("{}{ending}", column.name);
-            self.metric(kind, &name, column.help, label, &column.members(view));
+            self.add_metric(kind, &name, column.help, label, &column.members(view));
         }
     }
 
-    fn processes(&mut self, view: &RunView) {
+    fn add_processes(&mut self, view: &RunView) {
         let statuses = view.servers.iter().filter_map(|it| it.processes.as_ref());
         // With several shards, each server reports the learner.
         let mut seen = BTreeSet::new();
@@ -149,7 +149,7 @@ impl Page {
         let processes: Vec<_> = processes.filter(|it| seen.insert(it.who)).collect();
         let mut each = |kind, name, help, value: fn(&ProcessStatus) -> Option<f64>| {
             let members = processes.iter().map(|it| (it.who.to_string(), value(it)));
-            self.metric(kind, name, help, "process", &members.collect::<Vec<_>>());
+            self.add_metric(kind, name, help, "process", &members.collect::<Vec<_>>());
         };
         let connected = "Whether a process that has joined the run is connected.";
         each("gauge", "process_connected", connected, |it| {

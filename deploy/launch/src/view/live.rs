@@ -15,7 +15,7 @@ use crate::{
 /// How long updates must run before the rates are steady enough to estimate the time left.
 const STEADY_MIN: Duration = Duration::from_secs(5);
 /// The template of the progress display: a bar, then two lines of numbers.
-pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
+pub const PROGRESS_TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
 
 /// The display name of an auxiliary loss: `DIM 4t4` of `dim_4t4`.
 pub fn loss_title(name: &str) -> String {
@@ -26,7 +26,7 @@ pub fn loss_title(name: &str) -> String {
 }
 
 /// The progress and the speed of a run; unknown frames and updates are shown as question marks.
-pub(super) fn progress(view: &RunView, frames: Option<u64>, updates: Option<u64>) -> String {
+pub(super) fn progress_text(view: &RunView, frames: Option<u64>, updates: Option<u64>) -> String {
     // The last round may exceed the plan.
     let count = |count: Option<u64>, planned| match count {
         None => format!("?/{planned}"),
@@ -39,11 +39,11 @@ pub(super) fn progress(view: &RunView, frames: Option<u64>, updates: Option<u64>
         view.speed.frames,
         count(updates, view.plan.updates_planned),
         view.speed.updates,
-        number(view.replay.replay_ratio()),
+        two_decimals(view.replay.replay_ratio()),
     )
 }
 
-fn number(value: Option<f64>) -> String {
+fn two_decimals(value: Option<f64>) -> String {
     value.map_or("-".into(), |value| format!("{value:.2}"))
 }
 
@@ -52,7 +52,7 @@ pub(crate) struct Display {
     pub(crate) screen: Screen,
     /// Updates at the start of the display, and when the first update beyond them was seen.
     updates_before: u64,
-    learns_since: Option<Instant>,
+    learning_since: Option<Instant>,
     /// When the run began; a terminal's bar has a separate clock.
     pub(crate) began: Instant,
 }
@@ -61,9 +61,9 @@ impl Display {
     /// The display of a run of `frames` frames that began at `began` and has done `updates_before` updates.
     pub(crate) fn new(frames: u64, began: Instant, updates_before: u64) -> Self {
         Self {
-            screen: Screen::new(frames, TEMPLATE),
+            screen: Screen::new(frames, PROGRESS_TEMPLATE),
             updates_before,
-            learns_since: None,
+            learning_since: None,
             began,
         }
     }
@@ -71,9 +71,9 @@ impl Display {
     /// Shows the state of the run, and notes below it, such as which process does not answer.
     pub(crate) fn show(&mut self, view: &RunView) {
         if view.learner.updates > self.updates_before {
-            self.learns_since.get_or_insert_with(Instant::now);
+            self.learning_since.get_or_insert_with(Instant::now);
         }
-        let mut texts = self.text(view).to_vec();
+        let mut texts = self.lines(view).to_vec();
         let notes = notes(view);
         if !notes.is_empty() {
             texts.push(notes.join("; "));
@@ -82,15 +82,15 @@ impl Display {
         let position = frames.min(view.plan.frames_planned);
         self.screen.show(position, |is_bar| match is_bar {
             true => console::wrapped(&texts.join("\n"), "  ", 0),
-            false => plain(self.began.elapsed(), &texts),
+            false => plain_line(self.began.elapsed(), &texts),
         });
     }
 
-    fn text(&self, view: &RunView) -> [String; 2] {
+    fn lines(&self, view: &RunView) -> [String; 2] {
         let (plan, speed, learner) = (&view.plan, view.speed, &view.learner);
         let (frames, updates) = (view.replay.transitions_inserted, learner.updates);
         // Before the first update there are no losses.
-        let losses = self.learns_since.map(|_| {
+        let losses = self.learning_since.map(|_| {
             let others = learner.losses.iter();
             let others = others.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
             format!("  C51 {:.3}{}", learner.c51_kl, others.collect::<String>())
@@ -98,20 +98,20 @@ impl Display {
         let losses = losses.unwrap_or_default();
         let k = view.k.map(|k| format!("  mean k {:.2}", k.mean));
         let is_steady = |since: &Instant| since.elapsed() >= STEADY_MIN;
-        let left = self.learns_since.filter(is_steady).and_then(|_| {
+        let left = self.learning_since.filter(is_steady).and_then(|_| {
             let frames = plan.frames_planned.saturating_sub(frames);
             let updates = plan.updates_planned.saturating_sub(updates);
             time_left((frames, speed.frames), (updates, speed.updates))
         });
         let episodes = view.episodes;
         [
-            progress(view, Some(frames), Some(updates)),
+            progress_text(view, Some(frames), Some(updates)),
             format!(
                 "return {} ({} episodes){losses}{}  {}{}",
-                number(episodes.mean_return),
+                two_decimals(episodes.mean_return),
                 episodes.count,
                 k.unwrap_or_default(),
-                waiting(&view.replay),
+                waiting_text(&view.replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
             ),
         ]
@@ -119,11 +119,11 @@ impl Display {
 }
 
 /// The line of a display without a terminal, `elapsed` after the run began.
-fn plain(elapsed: Duration, texts: &[String]) -> String {
+fn plain_line(elapsed: Duration, texts: &[String]) -> String {
     format!("{}  {}", duration(elapsed), texts.join("  "))
 }
 
-fn waiting(replay: &ReplayStatus) -> String {
+fn waiting_text(replay: &ReplayStatus) -> String {
     match (replay.waiting, replay.actors_waiting) {
         (Waiting::ActorsWaitForLearner, waiting @ 1..) if waiting <= replay.actors => {
             format!("{waiting} of {} actors wait for learner", replay.actors)
@@ -143,8 +143,7 @@ fn time_left(frames: (u64, f64), updates: (u64, f64)) -> Option<Duration> {
         _ if rate > 0.0 => Some(left as f64 / rate),
         _ => None,
     };
-    let longer = seconds(frames)?.max(seconds(updates)?);
-    Duration::try_from_secs_f64(longer).ok()
+    Duration::try_from_secs_f64(seconds(frames)?.max(seconds(updates)?)).ok()
 }
 
 #[cfg(test)]
@@ -187,11 +186,11 @@ mod tests {
         let (mean, sd, frames, updates) = (2.25, 1.0, 160.0, 5.0);
         view.k = Some(Spread { mean, sd });
         view.speed = Speed { frames, updates };
-        display.learns_since = Instant::now().checked_sub(STEADY_MIN);
+        display.learning_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
             return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
-        .assert_eq(&display.text(&view).join("\n"));
+        .assert_eq(&display.lines(&view).join("\n"));
     }
 
     #[test]
@@ -202,7 +201,7 @@ mod tests {
             let learner = make(|it: &mut LearnerStatus| it.updates = updates);
             let view = view(plan(8_000, 218), replay, Some(learner));
             display.show(&view);
-            display.text(&view).join("\n")
+            display.lines(&view).join("\n")
         };
         expect![[r#"
             frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -
@@ -219,7 +218,7 @@ mod tests {
     #[test]
     fn an_actor_that_has_gone_is_none_of_those_connected() {
         let said = [2, 1].map(|actors| {
-            waiting(&make(|it: &mut ReplayStatus| {
+            waiting_text(&make(|it: &mut ReplayStatus| {
                 it.waiting = Waiting::ActorsWaitForLearner;
                 (it.actors, it.actors_waiting) = (actors, 2);
             }))
@@ -234,8 +233,8 @@ mod tests {
     #[test]
     fn a_plain_line_begins_with_the_time() {
         let texts = ["frames 1/2", "return 3"].map(str::to_owned);
-        let said = plain(Duration::from_secs(83), &texts);
+        let said = plain_line(Duration::from_secs(83), &texts);
         assert_eq!(said, "1 min 23 s  frames 1/2  return 3");
-        assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
+        assert!(indicatif::ProgressStyle::with_template(PROGRESS_TEMPLATE).is_ok());
     }
 }

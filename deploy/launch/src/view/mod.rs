@@ -7,12 +7,12 @@ mod page;
 mod poll;
 
 pub(crate) use self::{
-    advice::{needed, recovery},
-    export::{PrometheusFile, json},
+    advice::{actions_needed, describe_recovery},
+    export::{PrometheusFile, run_json},
     live::Display,
-    page::page,
+    page::status_page,
 };
 pub use self::{
-    live::{TEMPLATE, loss_title},
-    poll::{Poller, Reached},
+    live::{PROGRESS_TEMPLATE, loss_title},
+    poll::{Poller, ServerConnection},
 };

@@ -3,8 +3,8 @@
 use driml_protocol::{LogStatus, ProcessStatus, Waiting, Warning};
 
 use super::{
-    advice::{needed, seconds, waits},
-    live::progress,
+    advice::{actions_needed, format_s, limiter_waits},
+    live::progress_text,
 };
 use crate::{
     console::aligned,
@@ -17,16 +17,16 @@ const ACTORS_MAX: usize = 64;
 /// From this age on, in seconds, the page shows how old a process's own report is.
 const REPORT_AGE_MAX: f64 = 10.0;
 
-pub(crate) fn page(view: &RunView) -> String {
+pub(crate) fn status_page(view: &RunView) -> String {
     let (replay, plan) = (&view.replay, &view.plan);
-    let is_known = view.is_answered() || view.is_gone();
+    let is_known = view.servers_answered() || view.servers_ended();
     let frames = is_known.then_some(replay.transitions_inserted);
     let updates = view.learner_status().map(|it| it.updates);
     let mut page = format!(
         "{}, {}: {} of {}\n",
         plan.world,
         plan.agent,
-        progress(view, frames, updates),
+        progress_text(view, frames, updates),
         plan.replay_ratio_planned
     );
     let counts = [
@@ -37,7 +37,7 @@ pub(crate) fn page(view: &RunView) -> String {
         ("messages refused", replay.messages_refused),
     ];
     page += &counts.map(|(what, n)| format!("{what} {n}")).join("  ");
-    let mut waits = waits(view);
+    let mut waits = limiter_waits(view);
     if waits.is_empty() {
         waits.push(Waiting::Neither.to_string());
     }
@@ -53,11 +53,11 @@ pub(crate) fn page(view: &RunView) -> String {
         };
         let log = account.log.as_ref();
         notes.extend(log.map(|log| log_line(server, log, view.servers.len())));
-        notes.extend(warning("replay-server", account.last_warning.as_ref()));
+        notes.extend(warning_note("replay-server", account.last_warning.as_ref()));
         for process in account.processes.iter().take(ACTORS_MAX + 1) {
             rows.push(process_row(process));
             let who = process.who.to_string();
-            notes.extend(warning(&who, process.last_warning.as_ref()));
+            notes.extend(warning_note(&who, process.last_warning.as_ref()));
         }
         if let more @ 1.. = account.processes.len().saturating_sub(ACTORS_MAX + 1) {
             rows.push(vec![format!("and {more} more actors")]);
@@ -68,7 +68,7 @@ pub(crate) fn page(view: &RunView) -> String {
         page += &format!("\n{note}\n");
     }
     page.push('\n');
-    let needed = needed(view);
+    let needed = actions_needed(view);
     page += match needed.is_empty() {
         _ if view.is_finished() => "the run is over: everything is learned and saved\n",
         _ if view.is_over() => "the run is over: all frames were stored and sampled\n",
@@ -81,9 +81,9 @@ pub(crate) fn page(view: &RunView) -> String {
     page
 }
 
-fn warning(who: &str, warning: Option<&Warning>) -> Option<String> {
+fn warning_note(who: &str, warning: Option<&Warning>) -> Option<String> {
     let warning = warning?;
-    let age = seconds(warning.age_s);
+    let age = format_s(warning.age_s);
     Some(format!("{who} warned {age} ago: {}", warning.text))
 }
 
@@ -97,13 +97,13 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
     let at_most = |max| format!(" of at most {:.1}", mib(max));
     let most = log.bytes_max.map(at_most).unwrap_or_default();
     let bytes = mib(log.bytes);
-    let flushed = seconds(log.flushed_s);
+    let flushed = format_s(log.flushed_s);
     let mut line = format!(
         "{name}: {bytes:.1} MiB{most} in {}, flushed {flushed} ago",
         log.folder
     );
     if let Some((since, why)) = &log.refused {
-        let since = seconds(*since);
+        let since = format_s(*since);
         let lost = match log.unwritten_bytes {
             0 => "nothing is lost".to_owned(),
             bytes => format!(
@@ -139,23 +139,23 @@ fn server_row(server: &ServerAnswer, of: usize) -> Vec<String> {
         account.requests_waiting
     );
     let weights = account.weights_age_s.map_or("none yet".into(), |age| {
-        format!("{}, {} old", account.weights_version, seconds(age))
+        format!("{}, {} old", account.weights_version, format_s(age))
     });
-    let state = format!("up for {}", seconds(account.up_s));
+    let state = format!("up for {}", format_s(account.up_s));
     vec![name, state, does, String::new(), String::new(), weights]
 }
 
 fn process_row(process: &ProcessStatus) -> Vec<String> {
     let state = match process.connected {
-        true => format!("there for {}", seconds(process.since_s)),
-        false => format!("GONE for {}", seconds(process.since_s)),
+        true => format!("there for {}", format_s(process.since_s)),
+        false => format!("GONE for {}", format_s(process.since_s)),
     };
-    let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", seconds(age)));
+    let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", format_s(age)));
     let doing = process.doing.as_ref();
     let doing = doing.map_or("-".into(), |(doing, since, said)| {
-        let since = seconds(*since);
+        let since = format_s(*since);
         match *said > REPORT_AGE_MAX {
-            true => format!("{doing} ({since}, reported {} ago)", seconds(*said)),
+            true => format!("{doing} ({since}, reported {} ago)", format_s(*said)),
             false => format!("{doing} ({since})"),
         }
     });
@@ -165,7 +165,7 @@ fn process_row(process: &ProcessStatus) -> Vec<String> {
         state,
         doing,
         ago(process.last_seen_s),
-        process.held_s.map_or("-".into(), seconds),
+        process.held_s.map_or("-".into(), format_s),
         version.unwrap_or_else(|| "-".into()),
         process.lives.to_string(),
     ]

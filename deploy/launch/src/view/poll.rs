@@ -24,7 +24,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 
 /// A replay server to which the poller is connected.
 #[derive(Debug)]
-pub struct Reached {
+pub struct ServerConnection {
     name: String,
     endpoint: String,
     /// The client of this server; the poller closes its session.
@@ -37,14 +37,14 @@ pub struct Poller {
     pub config: RunConfig,
     /// The state of the run, by the answers of its processes.
     pub view: RunView,
-    servers: Vec<Reached>,
+    servers: Vec<ServerConnection>,
 }
 
 impl Poller {
     /// A poller for the run with these settings, connected to its replay servers already, one per shard.
-    pub fn new(config: &RunConfig, servers: Vec<Reached>) -> Self {
+    pub fn new(config: &RunConfig, servers: Vec<ServerConnection>) -> Self {
         Self {
-            view: RunView::new(Plan::of(config)),
+            view: RunView::new(Plan::new(config)),
             config: config.clone(),
             servers,
         }
@@ -63,11 +63,11 @@ impl Poller {
         let mut servers = Vec::new();
         let mut config: Option<RunConfig> = None;
         for endpoint in endpoints {
-            let reached = Endpoints::to(vec![endpoint.clone()]);
+            let server = Endpoints::to(vec![endpoint.clone()]);
             // An observer does not wait for a server that does not listen yet.
             reach::look(endpoint)?;
-            let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
-            let served = settings(&session, &keys, endpoint, namespace)?;
+            let session = session::open_as(&server, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
+            let served = fetch_settings(&session, &keys, endpoint, namespace)?;
             let hash = served.run.hash();
             if config.get_or_insert(served).run.hash() != hash {
                 bail!(usage!(
@@ -75,7 +75,7 @@ impl Poller {
                     endpoints[0]
                 ));
             }
-            servers.push(Reached {
+            servers.push(ServerConnection {
                 name: endpoint.clone(),
                 endpoint: endpoint.clone(),
                 client: RunClient::new(session, keys.clone(), hash),
@@ -85,8 +85,8 @@ impl Poller {
     }
 
     /// Polls all processes. The view names those that do not answer.
-    pub fn ask(&mut self) -> &RunView {
-        let servers: Vec<_> = self.servers.iter().map(Reached::ask).collect();
+    pub fn poll(&mut self) -> &RunView {
+        let servers: Vec<_> = self.servers.iter().map(ServerConnection::poll).collect();
         // The learner is asked through the first server.
         let first = self.servers.first();
         let first = first.filter(|_| servers[0].replay.is_some());
@@ -96,11 +96,10 @@ impl Poller {
             let known = run_info.ok().filter(|it| it.has_learner);
             view.after_updates = known.map(|it| it.after_updates);
         }
-        let learner = first.and_then(|it| it.client.fetch(ANSWER_MAX).ok());
-        view.take_learner(learner);
+        view.set_learner(first.and_then(|it| it.client.fetch(ANSWER_MAX).ok()));
         let shards: Option<Vec<_>> = servers.iter().map(|it| it.replay.clone()).collect();
         match shards {
-            Some(shards) => view.take_replay(shards),
+            Some(shards) => view.set_replay(shards),
             None => _ = view.replay_silence.unanswered(),
         }
         view.servers = servers;
@@ -113,25 +112,25 @@ impl Poller {
     }
 
     /// Asks only the replay servers, for their counts.
-    pub fn ask_replay(&mut self) -> anyhow::Result<()> {
+    pub fn poll_replay(&mut self) -> anyhow::Result<()> {
         let answers = self.servers.iter().map(|it| it.client.fetch(ANSWER_MAX));
         let shards = answers.collect::<Result<Vec<ReplayStatus>, _>>()?;
-        self.view.take_replay(shards);
+        self.view.set_replay(shards);
         Ok(())
     }
 
     /// Asks only the learner.
-    pub fn ask_learner(&mut self) -> anyhow::Result<()> {
+    pub fn poll_learner(&mut self) -> anyhow::Result<()> {
         let first = self.servers.first();
         let first = first.context("a run has at least one replay server")?;
         let learner: LearnerStatus = first.client.fetch(ANSWER_MAX)?;
-        self.view.take_learner(Some(learner));
+        self.view.set_learner(Some(learner));
         Ok(())
     }
 
     /// Requests the episodes of a shard that ended after the first `since`, as the launcher or as another observer. None if the shard
     /// does not answer.
-    pub(crate) fn episodes(
+    pub(crate) fn fetch_episodes(
         &self,
         shard: usize,
         since: u64,
@@ -153,7 +152,7 @@ impl Poller {
     }
 }
 
-impl Reached {
+impl ServerConnection {
     /// Connects to a server that `driml train` has started at `endpoint`, of the run with this hash.
     pub fn open(name: &str, endpoint: &str, spec_hash: u64) -> anyhow::Result<Self> {
         let session = session::open(&Endpoints::to(vec![endpoint.to_owned()]))?;
@@ -165,7 +164,7 @@ impl Reached {
         })
     }
 
-    fn ask(&self) -> ServerAnswer {
+    fn poll(&self) -> ServerAnswer {
         let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
         let answers =
             replay.and_then(|it| Ok((it, self.client.fetch::<ProcessesStatus>(ANSWER_MAX)?)));
@@ -193,7 +192,7 @@ impl Reached {
 }
 
 /// The settings that a replay server reports, also while it reads its replay back from disk.
-fn settings(
+fn fetch_settings(
     session: &Session,
     keys: &Keys,
     endpoint: &str,

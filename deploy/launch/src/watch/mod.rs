@@ -11,12 +11,14 @@ use driml_machine::error::{Interrupted, usage};
 use driml_protocol::{LogLimiter, Shutdown, atomic_write, reach};
 use serde::Serialize;
 
-use self::watched::Watched;
+use self::watched::WatchedRun;
 use crate::{
     checkpoint_choice::read_config,
     console, resume,
-    run_folder::{Outcome, Progress, RunFolder, Summary, commands, plot, progress},
-    view::{Poller, PrometheusFile, json, needed, page, recovery},
+    run_folder::{
+        Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_progress,
+    },
+    view::{Poller, PrometheusFile, actions_needed, describe_recovery, run_json, status_page},
 };
 
 /// What `driml watch` does with a run.
@@ -41,68 +43,68 @@ pub struct WatchFlags {
 }
 
 /// A connection to a run, or the run's state if no process of it can be asked.
-pub type Asked<T> = Result<T, Box<Over>>;
+pub type OrUnreachable<T> = Result<T, Box<UnreachableRun>>;
 
 const POLL: Duration = Duration::from_secs(1);
 /// The time between polls once all frames are stored: shorter, as the learner may exit soon after its last status.
 const LAST_POLL: Duration = Duration::from_millis(200);
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Polls a run and prints a page or a JSON object: once, or with `again` until the run is over or Ctrl-C. If no process can be asked
+/// Polls a run and prints a page or a JSON object: once, or with `repeat` until the run is over or Ctrl-C. If no process can be asked
 /// any more, the run's `folder`, if it is known, tells how the run ended.
 ///
 /// # Errors
 /// [`Interrupted`] if Ctrl-C came before the first page.
-pub fn look(
+pub fn print_status(
     poller: &mut Poller,
     folder: Option<&RunFolder>,
-    again: bool,
+    repeat: bool,
     as_json: bool,
 ) -> anyhow::Result<()> {
     let interrupted = Shutdown::on_signals(None)?;
     // The first poll starts the speed, which counts what happens until the next.
-    poller.ask();
+    poller.poll();
     if interrupted.wait_timeout(POLL) {
         return Err(Interrupted.into());
     }
     loop {
-        let view = poller.ask();
-        if let Some(folder) = folder.filter(|_| view.is_gone())
-            && let Err(over) = endpoints_of(folder)?
+        let view = poller.poll();
+        if let Some(folder) = folder.filter(|_| view.servers_ended())
+            && let Err(unreachable) = read_endpoints(folder)?
         {
-            return over.print(as_json);
+            return unreachable.print(as_json);
         }
         let is_read = match as_json {
-            true => console::print_unless_closed(&json(view)?)?,
-            false if again => console::print_page(&page(view))?,
-            false => console::print_unless_closed(&page(view))?,
+            true => console::print_unless_closed(&run_json(view)?)?,
+            false if repeat => console::print_page(&status_page(view))?,
+            false => console::print_unless_closed(&status_page(view))?,
         };
-        if !again || !is_read || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
+        if !repeat || !is_read || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
             return Ok(());
         }
     }
 }
 
-/// Watches a run that was `opened`: shows and records it until it is over, or, with `--once`, prints one page for scripts and monitors.
+/// Watches a run that was `found`: shows and records it until it is over, or, with `--once`, prints one page for scripts and monitors.
 /// The file for Prometheus tells whether the run answers.
 ///
 /// # Errors
 /// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
 /// that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
-pub fn run(opened: anyhow::Result<Asked<Poller>>, flags: &WatchFlags) -> anyhow::Result<()> {
-    if !matches!(opened, Ok(Ok(_)))
+pub fn run(found: anyhow::Result<OrUnreachable<Poller>>, flags: &WatchFlags) -> anyhow::Result<()> {
+    if !matches!(found, Ok(Ok(_)))
         && let Some(path) = &flags.prometheus
     {
         let written = atomic_write::write(path, b"# TYPE driml_up gauge\ndriml_up 0\n");
         written.with_context(|| format!("writing {}", path.display()))?;
     }
-    match opened? {
-        Ok(poller) if flags.once => once(poller, flags),
+    match found? {
+        Ok(poller) if flags.once => check_once(poller, flags),
         Ok(poller) => watch(poller, flags),
-        Err(over) => {
-            over.print(flags.json)?;
+        Err(unreachable) => {
+            unreachable.print(flags.json)?;
             ensure!(
-                over.is_well || !flags.once,
+                unreachable.is_well || !flags.once,
                 "the run needs attention: it is not finished and no process of it runs"
             );
             Ok(())
@@ -110,17 +112,16 @@ pub fn run(opened: anyhow::Result<Asked<Poller>>, flags: &WatchFlags) -> anyhow:
     }
 }
 
-fn once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
-    look(&mut poller, None, false, flags.json)?;
+fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
+    print_status(&mut poller, None, false, flags.json)?;
     poller.close();
     if let Some(path) = &flags.prometheus
         && let Some(failed) = PrometheusFile::new(path).write(&poller.view)
     {
         bail!("{failed}");
     }
-    let needed = needed(&poller.view);
-    let all = needed.join("; ");
-    ensure!(needed.is_empty(), "the run needs attention: {all}");
+    let needed = actions_needed(&poller.view).join("; ");
+    ensure!(needed.is_empty(), "the run needs attention: {needed}");
     Ok(())
 }
 
@@ -129,19 +130,19 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let mut said = LogLimiter::default();
     loop {
-        let view = poller.ask();
-        if view.is_answered() && view.after_updates.is_some() {
+        let view = poller.poll();
+        if view.servers_answered() && view.after_updates.is_some() {
             return Ok(());
         }
         let is_another_run = view.servers.iter().any(|it| it.is_another_run);
         if is_another_run || view.replay_silence.length() > silent_max {
-            bail!("{}", needed(view).join("; "));
+            bail!("{}", actions_needed(view).join("; "));
         }
         if said.due().is_some() {
             for (server, progress) in view.recovering() {
-                console::line(&recovery(&server.name, progress));
+                console::line(&describe_recovery(&server.name, progress));
             }
-            if view.is_answered() {
+            if view.servers_answered() {
                 console::line("no learner has joined the run yet: waiting for it");
             }
         }
@@ -155,7 +156,7 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
 fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
-    poller.ask();
+    poller.poll();
     let mut file = flags.prometheus.as_deref().map(PrometheusFile::new);
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
         bail!(usage!("--prometheus: {failed}"));
@@ -166,9 +167,9 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
         // Before that, it is not known what the run has done so far.
         wait_until_known(&mut poller, &interrupted)?;
     }
-    let mut watched = Watched::new(&poller, folder.as_ref(), flags.tensorboard)?;
+    let mut watched = WatchedRun::new(&poller, folder.as_ref(), flags.tensorboard)?;
     let ended = loop {
-        match watched.take(&mut poller) {
+        match watched.show_and_record(&mut poller) {
             Ok(false) => {}
             Ok(true) => break Ok(Outcome::Finished),
             Err(e) => break Err(e),
@@ -180,14 +181,14 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
         if interrupted.wait_timeout(pause) {
             break Ok(Outcome::Interrupted);
         }
-        poller.ask();
+        poller.poll();
         if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
             watched.display.screen.line(&failed);
         }
     };
     poller.close();
     let outcome = *ended.as_ref().unwrap_or(&Outcome::Failed);
-    let summary = watched.conclude(&mut poller.view, outcome);
+    let summary = watched.finish(&mut poller.view, outcome);
     if ended? == Outcome::Interrupted {
         console::line("the run continues without being watched");
         return Err(Interrupted.into());
@@ -196,15 +197,15 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
         Some(folder) => {
             console::print(&summary.describe(folder))?;
             summary.write(folder)?;
-            console::print(&commands(&[plot(folder)]))
+            console::print(&format_commands(&[plot_command(folder)]))
         }
-        None => console::print(&format!("{}\n", summary.counts())),
+        None => console::print(&format!("{}\n", summary.describe_counts())),
     }
 }
 
 /// The state of a run of which no process can be asked.
 #[derive(Serialize)]
-pub struct Over {
+pub struct UnreachableRun {
     /// Whether the run is complete and its processes have ended.
     finished: bool,
     message: String,
@@ -217,7 +218,7 @@ pub struct Over {
     is_well: bool,
 }
 
-impl Over {
+impl UnreachableRun {
     /// Prints the state, as one line of JSON or as text for a person.
     ///
     /// # Errors
@@ -234,7 +235,7 @@ impl Over {
 ///
 /// # Errors
 /// The folder has no settings: it is not a run's, or the processes of the run were started by hand.
-pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
+pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<String>>> {
     let config = read_config(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints());
     let endpoints = endpoints.unwrap_or_default();
@@ -246,8 +247,8 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
     // A running launcher holds the lock, and so does a run in lockstep.
     let is_locked = folder.is_locked();
     let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
-    let so_far = progress(folder).map_or("nothing".into(), counts);
-    let mut over = Box::new(Over {
+    let so_far = read_progress(folder).map_or("nothing".into(), counts);
+    let mut state = Box::new(UnreachableRun {
         finished: !is_locked && Summary::is_finished(folder),
         message: "the run is over".into(),
         summary: Summary::read(folder).ok(),
@@ -255,30 +256,30 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Asked<Vec<String>>> {
         is_well: true,
     });
     if is_locked && endpoints.is_empty() {
-        over.message = format!(
+        state.message = format!(
             "one process writes {run}, in lockstep or as `driml watch`, and cannot be asked: so far {so_far}, in metrics.csv"
         );
     } else if is_locked {
-        let frames = progress(folder).map_or(0, |it| it.frames);
+        let frames = read_progress(folder).map_or(0, |it| it.frames);
         let how = match frames >= config.frames() {
             true => "is stopping: all frames are stored and its replay server has exited",
             false => "is starting or stopping: no replay server listens",
         };
-        over.message =
+        state.message =
             format!("the run in {run} {how}. Its launcher still runs; retry in a moment");
-    } else if let Some(summary) = over.summary.as_ref().filter(|_| over.finished) {
-        over.details = summary.describe(folder);
+    } else if let Some(summary) = state.summary.as_ref().filter(|_| state.finished) {
+        state.details = summary.describe(folder);
     } else {
         let next = match resume::is_resumable(&config.world, folder) {
             true => format!("`driml train --resume {}` resumes it", folder.quoted()),
             false => "it has no checkpoint to resume from".into(),
         };
-        over.is_well = false;
-        over.message = format!(
+        state.is_well = false;
+        state.message = format!(
             "no process runs in {run}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT"
         );
     }
-    Ok(Err(over))
+    Ok(Err(state))
 }
 
 #[cfg(test)]
@@ -298,9 +299,9 @@ mod tests {
         let socket = root.path().join("s");
         let endpoint = format!("unixsock-stream/{}", socket.display());
         std::fs::write(folder.endpoints(), &endpoint).unwrap();
-        let found = || match endpoints_of(&folder).unwrap() {
+        let found = || match read_endpoints(&folder).unwrap() {
             Ok(endpoints) => endpoints.join(" "),
-            Err(over) => over.message,
+            Err(unreachable) => unreachable.message,
         };
         let listener = UnixListener::bind(&socket).unwrap();
         assert_eq!(found(), endpoint);

@@ -12,23 +12,23 @@ use crate::{
     checkpoint_choice::read_config,
     console,
     launcher::process_names,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table, Uncounted},
+    run_folder::{BeforeReplay, Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table},
     run_view::{RunView, updates_served},
     view::{Display, Poller},
 };
 
 /// How long replay servers may be silent before they count as ended, once they have reported that everything is sampled.
-const FAREWELL_MAX: Duration = Duration::from_secs(5);
+const EXIT_SILENCE_MAX: Duration = Duration::from_secs(5);
 /// Longest time of a run that is shown, seconds: ten years.
-const UP_MAX: f64 = 315_360_000.0;
+const UPTIME_MAX_S: f64 = 315_360_000.0;
 
-pub(super) struct Watched {
+pub(super) struct WatchedRun {
     /// Shows the run from its beginning, as far as that is known.
     pub(super) display: Display,
     recorder: Option<RunRecorder>,
 }
 
-impl Watched {
+impl WatchedRun {
     /// Starts to watch a run that was polled once, recorded in `folder` if there is one, with TensorBoard's `events` on request.
     pub(super) fn new(
         poller: &Poller,
@@ -36,9 +36,9 @@ impl Watched {
         events: bool,
     ) -> anyhow::Result<Self> {
         let (config, view) = (&poller.config, &poller.view);
-        let recorder = folder.map(|it| record(it, config, view, events));
+        let recorder = folder.map(|it| open_recorder(it, config, view, events));
         let recorder = recorder.transpose()?;
-        let up_s = view.up_s().unwrap_or(0.0).min(UP_MAX);
+        let up_s = view.uptime_s().unwrap_or(0.0).min(UPTIME_MAX_S);
         let up = Duration::try_from_secs_f64(up_s).unwrap_or_default();
         let now = Instant::now();
         let began = now.checked_sub(up).unwrap_or(now);
@@ -51,16 +51,17 @@ impl Watched {
     }
 
     /// Shows and records the poller's last answers. Returns true if the run is over.
-    pub(super) fn take(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
+    pub(super) fn show_and_record(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
         if let Some(other) = poller.view.servers.iter().find(|it| it.is_another_run) {
             bail!(
                 "{} now serves a run with other settings: start `driml watch` again, with another --run-dir",
                 other.endpoint
             );
         }
-        if let Some(recorder) = self.recorder.as_mut().filter(|_| poller.view.is_answered()) {
-            let ask = |shard, since| poller.episodes(shard, since, false);
-            let mut warnings = recorder.record_episodes(&poller.view, ask);
+        let recorder = self.recorder.as_mut();
+        if let Some(recorder) = recorder.filter(|_| poller.view.servers_answered()) {
+            let fetch = |shard, since| poller.fetch_episodes(shard, since, false);
+            let mut warnings = recorder.record_episodes(&poller.view, fetch);
             warnings.extend(recorder.record(&mut poller.view, &[]));
             self.display.screen.lines(warnings);
         }
@@ -70,18 +71,17 @@ impl Watched {
 
     fn is_over(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
         let view = &poller.view;
-        if view.is_learned() {
+        if view.is_all_learned() {
             return Ok(true);
         }
         let silent = view.replay_silence.length();
         // The servers exit once the learner has saved. Another client may have received the learner's last answer, or the launcher may
         // have stopped the learner before it was polled again.
-        if silent > FAREWELL_MAX && view.replay.waiting == Waiting::Finished {
-            self.learn_all_that_was_served(poller);
+        if silent > EXIT_SILENCE_MAX && view.replay.waiting == Waiting::Finished {
+            self.count_served_updates(poller);
             return Ok(true);
         }
-        let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
-        if silent > silent_max {
+        if silent > Duration::from_millis(poller.config.learner.unreachable_max_ms) {
             bail!(
                 "the replay server has not answered for {}: the run has ended, or the network is interrupted",
                 duration(silent)
@@ -91,7 +91,7 @@ impl Watched {
     }
 
     /// Counts the updates that the learner did after its last answer.
-    fn learn_all_that_was_served(&mut self, poller: &mut Poller) {
+    fn count_served_updates(&mut self, poller: &mut Poller) {
         let updates = updates_served(&poller.config, poller.view.replay.rows_sampled);
         if poller.view.learner.updates >= updates {
             return;
@@ -107,19 +107,19 @@ impl Watched {
     }
 
     /// Removes the live lines, prints what could not be recorded, and returns the summary of a run that ended with `outcome`.
-    pub(super) fn conclude(&mut self, view: &mut RunView, outcome: Outcome) -> Summary {
+    pub(super) fn finish(&mut self, view: &mut RunView, outcome: Outcome) -> Summary {
         self.display.screen.clear();
         let Some(recorder) = &self.recorder else {
             let seconds = self.display.began.elapsed().as_secs_f64();
-            return Summary::of(outcome, view, seconds, ResumePoint::default());
+            return Summary::new(outcome, view, seconds, ResumePoint::default());
         };
-        let missing = recorder.missing();
+        let missing = recorder.loss_messages();
         missing.iter().for_each(|line| console::line(line));
         recorder.summarise(outcome, view)
     }
 }
 
-fn record(
+fn open_recorder(
     folder: &RunFolder,
     config: &RunConfig,
     view: &RunView,
@@ -128,7 +128,7 @@ fn record(
     let mut resumed = None;
     // A learner may have just begun in this folder.
     if folder.config().exists() || folder.checkpoints().is_dir() {
-        check_same(folder, config)?;
+        check_same_run(folder, config)?;
         resumed = Some(resume_point(folder, view)?);
         if folder.is_locked() {
             bail!(usage!(
@@ -137,33 +137,31 @@ fn record(
             ));
         }
     }
-    let processes = process_names(config);
-    let mut recorder = RunRecorder::open(folder, config, processes, resumed, events)?;
+    let mut recorder = RunRecorder::open(folder, config, process_names(config), resumed, events)?;
     if resumed.is_none() {
-        let after_updates = view.after_updates.unwrap_or(0);
-        let of_replay = Uncounted {
-            after_updates,
-            ..Uncounted::default()
+        let before_replay = BeforeReplay {
+            after_updates: view.after_updates.unwrap_or(0),
+            ..BeforeReplay::default()
         };
-        of_replay.write(folder)?;
+        before_replay.write(folder)?;
     }
-    recorder.count_seconds_from(view.up_s().unwrap_or(0.0));
+    recorder.raise_seconds_before(view.uptime_s().unwrap_or(0.0));
     Ok(recorder)
 }
 
-fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
-    let there = match folder.config().exists() {
+fn check_same_run(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
+    let recorded = match folder.config().exists() {
         true => read_config(folder)?.run,
         false => return Ok(()),
     };
-    if there.hash() == config.run.hash() {
+    if recorded.hash() == config.run.hash() {
         return Ok(());
     }
     let name = |it: &RunSpec| format!("{} with {}, seed {}", it.world, it.agent, it.seed);
     bail!(usage!(
         "{} holds another run ({}) than the one that is watched ({}): choose another --run-dir",
         folder.display(),
-        name(&there),
+        name(&recorded),
         name(&config.run)
     ))
 }
@@ -189,7 +187,7 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
         },
         rows: view.replay.rows_sampled,
         frames: now,
-        replay_is_kept: after_updates == Uncounted::read(folder)?.after_updates,
+        replay_is_kept: after_updates == BeforeReplay::read(folder)?.after_updates,
         after_updates,
         frames_max: u64::MAX,
     })

@@ -22,9 +22,9 @@ use driml_launch::{
     evaluator::{RankedEvaluation, evaluate_and_keep},
     metrics::rounded,
     pretrained,
-    run_folder::{RunFolder, write_whole},
+    run_folder::{RunFolder, write_atomically},
     stats::mean_and_deviation,
-    view::TEMPLATE,
+    view::PROGRESS_TEMPLATE,
 };
 use driml_machine::{
     error::{Interrupted, usage},
@@ -162,7 +162,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         (PolicyKind::Agent, &*spec.agent),
         (PolicyKind::Random, "random"),
     ] {
-        let mut screen = Screen::new(episodes as u64, TEMPLATE);
+        let mut screen = Screen::new(episodes as u64, PROGRESS_TEMPLATE);
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
             film.iter_mut().for_each(|film| film.add_step(step));
@@ -201,7 +201,7 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
         ));
     }
     let bytes = pretrained::export(player)?;
-    write_whole(path, &bytes)?;
+    write_atomically(path, &bytes)?;
     print(&format!(
         "{} weights after {} updates as f16, {} kB; `driml evaluate {}` plays them\n",
         player.weights_name(),

@@ -25,22 +25,22 @@ pub(super) enum Value {
 
 /// The time of an event: seconds since 1970, and the step over which it is drawn.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct At {
+pub(super) struct EventTime {
     pub(super) seconds: f64,
     pub(super) step: u64,
 }
 
-pub(super) fn version(at: At) -> Vec<u8> {
+pub(super) fn version(at: EventTime) -> Vec<u8> {
     record(at, 3, FILE_VERSION.as_bytes())
 }
 
 /// A record that invalidates what was written before for this step or later.
-pub(super) fn begin_anew(at: At) -> Vec<u8> {
+pub(super) fn restart_record(at: EventTime) -> Vec<u8> {
     const START: u64 = 1;
     record(at, 7, &number(1, START))
 }
 
-pub(super) fn summary(at: At, values: &[(String, Value)]) -> Vec<u8> {
+pub(super) fn summary(at: EventTime, values: &[(String, Value)]) -> Vec<u8> {
     let field = |(name, value): &(String, Value)| {
         let value = match value {
             Value::Scalar(value) => fixed(2, FIXED32, &value.to_le_bytes()),
@@ -110,7 +110,7 @@ fn varint(mut value: u64) -> Vec<u8> {
 }
 
 /// The record of an event that has one field beside its time and step.
-fn record(At { seconds, step }: At, field: u8, value: &[u8]) -> Vec<u8> {
+fn record(EventTime { seconds, step }: EventTime, field: u8, value: &[u8]) -> Vec<u8> {
     let seconds = fixed(1, FIXED64, &seconds.to_le_bytes());
     let event = [seconds, number(2, step), bytes(field, value)].concat();
     let length = (event.len() as u64).to_le_bytes();
@@ -150,7 +150,7 @@ mod tests {
 
     #[test]
     fn a_record_is_framed_and_a_scalar_has_its_fields() {
-        let at = At {
+        let at = EventTime {
             seconds: 1.5,
             step: 300,
         };

@@ -16,9 +16,9 @@ use driml_figure::{Ink, Picture, Rect};
 use driml_learner::checkpoint;
 use driml_protocol::ReplayStatus;
 
-use self::encode::{At, Value};
+use self::encode::{EventTime, Value};
 use super::{
-    folder::{EVENTS, RunFolder},
+    folder::{EVENTS_PREFIX, RunFolder},
     table::AppendLog,
 };
 
@@ -35,36 +35,37 @@ pub(super) struct Events {
     checkpoints: PathBuf,
     slow_at: Option<Instant>,
     /// The counts of the last histograms.
-    k: Vec<u64>,
-    actions: Vec<u64>,
-    drawn: Option<u64>,
+    k_counts: Vec<u64>,
+    action_counts: Vec<u64>,
+    drawn_updates: Option<u64>,
 }
 
 impl Events {
     /// Creates a file, which invalidates what earlier files of the run have beyond `frames_kept`.
     pub(super) fn create(folder: &RunFolder, frames_kept: u64) -> anyhow::Result<Self> {
-        let seconds = now();
+        let seconds = unix_seconds();
         let name = |number: u32| match number {
-            0 => format!("{EVENTS}{:010}.driml", seconds as u64),
-            _ => format!("{EVENTS}{:010}.driml.{number}", seconds as u64),
+            0 => format!("{EVENTS_PREFIX}{:010}.driml", seconds as u64),
+            _ => format!("{EVENTS_PREFIX}{:010}.driml.{number}", seconds as u64),
         };
         let mut paths = (0..).map(|number| folder.path().join(name(number)));
         let path = paths.find(|path| !path.exists());
         let path = path.context("naming an event file")?;
-        let mut first = encode::version(At { seconds, step: 0 });
-        let is_events = |it: fs::DirEntry| it.file_name().to_string_lossy().starts_with(EVENTS);
+        let mut first = encode::version(EventTime { seconds, step: 0 });
+        let is_events =
+            |it: fs::DirEntry| it.file_name().to_string_lossy().starts_with(EVENTS_PREFIX);
         let mut others = fs::read_dir(folder.path())?.flatten();
         if others.any(is_events) {
             let step = frames_kept + 1;
-            first.extend(encode::begin_anew(At { seconds, step }));
+            first.extend(encode::restart_record(EventTime { seconds, step }));
         }
         Ok(Self {
             file: AppendLog::create(&path, &first)?,
             checkpoints: folder.checkpoints(),
             slow_at: None,
-            k: Vec::new(),
-            actions: Vec::new(),
-            drawn: None,
+            k_counts: Vec::new(),
+            action_counts: Vec::new(),
+            drawn_updates: None,
         })
     }
 
@@ -76,8 +77,8 @@ impl Events {
         replay: &ReplayStatus,
         is_last: bool,
     ) -> Option<String> {
-        let at = At {
-            seconds: now(),
+        let at = EventTime {
+            seconds: unix_seconds(),
             step: replay.transitions_inserted,
         };
         let curve = |(name, value): &(String, f64)| (name.clone(), Value::Scalar(*value as f32));
@@ -93,17 +94,17 @@ impl Events {
     }
 
     /// Histograms of what was counted since the last ones.
-    fn histograms(&mut self, at: At, replay: &ReplayStatus) -> Option<Vec<u8>> {
+    fn histograms(&mut self, at: EventTime, replay: &ReplayStatus) -> Option<Vec<u8>> {
         let mut histograms = Vec::new();
         for (name, now, before) in [
-            ("k/served", &replay.k_histogram, &mut self.k),
+            ("k/served", &replay.k_histogram, &mut self.k_counts),
             (
                 "actions/stored",
                 &replay.action_histogram,
-                &mut self.actions,
+                &mut self.action_counts,
             ),
         ] {
-            let counts = since(now, before);
+            let counts = counts_since(now, before);
             before.clone_from(now);
             if counts.iter().any(|&n| n > 0) {
                 histograms.push((name.to_owned(), Value::Counts(counts)));
@@ -113,15 +114,15 @@ impl Events {
     }
 
     /// Draws A of a new checkpoint. A checkpoint that cannot be read just now is tried again later.
-    fn affinity(&mut self, at: At) -> Option<Vec<u8>> {
+    fn affinity(&mut self, at: EventTime) -> Option<Vec<u8>> {
         let (updates, path) = checkpoint::list(&self.checkpoints).ok()?.pop()?;
-        if self.drawn.is_some_and(|drawn| drawn >= updates) {
+        if self.drawn_updates.is_some_and(|drawn| drawn >= updates) {
             return None;
         }
         let affinity = checkpoint::read_affinity(&path).ok()?;
-        self.drawn = Some(updates);
+        self.drawn_updates = Some(updates);
         let affinity = affinity?;
-        let picture = draw(affinity.num_actions(), &affinity.matrix()).ok()?;
+        let picture = draw_affinity(affinity.num_actions(), &affinity.matrix()).ok()?;
         let (width, height) = picture.size();
         let png = picture.png().ok()?;
         let image = Value::Image { width, height, png };
@@ -129,13 +130,13 @@ impl Events {
     }
 }
 
-fn now() -> f64 {
+fn unix_seconds() -> f64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     since.unwrap_or_default().as_secs_f64()
 }
 
 /// The counts since `before`, or all counts if a counter has restarted.
-fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
+fn counts_since(now: &[u64], before: &[u64]) -> Vec<u64> {
     let before = before.iter().copied().chain(std::iter::repeat(0));
     let both = now.iter().zip(before);
     let difference: Option<Vec<_>> = both.map(|(now, before)| now.checked_sub(before)).collect();
@@ -143,7 +144,7 @@ fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
 }
 
 /// Draws A as cells: each row is an action, each column the next action.
-fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
+fn draw_affinity(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
     let length = side * CELL;
     let width = (length + 2 * MARGIN).max(320);
     let mut picture = Picture::new(width, length + 2 * MARGIN + CAPTION)?;
@@ -164,8 +165,8 @@ mod tests {
 
     #[test]
     fn counts_are_those_since_the_last_histogram() {
-        assert_eq!(since(&[1, 5, 2], &[1, 2]), [0, 3, 2]);
-        assert_eq!(since(&[1, 0], &[2, 0]), [1, 0], "of another server");
+        assert_eq!(counts_since(&[1, 5, 2], &[1, 2]), [0, 3, 2]);
+        assert_eq!(counts_since(&[1, 0], &[2, 0]), [1, 0], "of another server");
     }
 
     #[test]
@@ -179,7 +180,7 @@ mod tests {
         let points = [("return/mean_return".to_owned(), 1.5)];
         assert_eq!(events.add(&points, &replay, false), None);
         let again = Events::create(&folder, 70).unwrap();
-        assert_eq!(again.file.missing(), None);
+        assert_eq!(again.file.loss_message(), None);
         let mut counts = Vec::new();
         let files = fs::read_dir(root.path()).unwrap();
         let mut paths: Vec<_> = files.map(|it| it.unwrap().path()).collect();
