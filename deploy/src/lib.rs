@@ -30,7 +30,7 @@ pub fn main() -> ExitCode {
 /// Runs like [`main`], for a program that adds worlds, losses or agents.
 pub fn main_with(registry: Registry) -> ExitCode {
     registry.register();
-    panics::end_the_process();
+    panics::abort_on_panic();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
@@ -49,12 +49,12 @@ pub fn main_with(registry: Registry) -> ExitCode {
         tracing::warn!("this process runs without the environment that makes it fast: {e}");
     }
     let ran = cli.command.run();
-    panics::process_ends();
+    panics::mark_process_ending();
     match ran {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),
         Err(e) => {
-            console::line(&format!("error: {}", console::describe(&e)));
+            console::eprintln(&format!("error: {}", console::describe_error(&e)));
             match e.is::<Usage>() {
                 true => ExitCode::from(EXIT_USAGE),
                 false => ExitCode::FAILURE,

@@ -29,7 +29,7 @@ pub(super) fn measure(worlds: &[String], bench: &mut Bench<'_>) -> anyhow::Resul
         cases.push((format!("{world}, {ENVS} environments"), world.clone(), 0));
     }
     if worlds.is_empty() {
-        procgen_sys::Engine::install(&mut console::line)?;
+        procgen_sys::Engine::install(&mut console::eprintln)?;
         for game in GAMES {
             let case = |threads| (label(game, threads), format!("procgen:{game}"), threads);
             cases.extend(ENGINE_THREADS.map(case));

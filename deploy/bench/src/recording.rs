@@ -63,7 +63,7 @@ struct Step {
 
 impl Recording {
     pub(super) fn record() -> anyhow::Result<Self> {
-        procgen_sys::Engine::install(&mut console::line)?;
+        procgen_sys::Engine::install(&mut console::eprintln)?;
         let config = settings::run_config(settings::WORLD, "c51", "paper", &[])?;
         let run = &config.run;
         let sent = (run.frame_height as usize, run.frame_width as usize);

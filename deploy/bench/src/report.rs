@@ -4,7 +4,7 @@
 use std::{fs, path::Path};
 
 use anyhow::Context;
-use driml_launch::console::{self, aligned, print};
+use driml_launch::console::{self, align_columns, print};
 use driml_learner::Precision;
 use driml_machine::{
     resources::MachineInfo,
@@ -43,7 +43,7 @@ impl Figures {
     /// Adds a figure, or its value in another round, and prints it to stderr at once.
     pub(super) fn record(&mut self, what: impl Into<String>, value: f64, unit: &str) {
         let (what, unit) = (what.into(), unit.to_owned());
-        console::line(&format!("  {what}: {} {unit}", format_number(value)));
+        console::eprintln(&format!("  {what}: {} {unit}", format_number(value)));
         self.add(Measurement { what, value, unit });
     }
 
@@ -99,7 +99,7 @@ impl Report {
     pub(super) fn rows(&self) -> String {
         let row =
             |it: &Measurement| vec![format_number(it.value), it.unit.clone(), it.what.clone()];
-        aligned(&self.figures.iter().map(row).collect::<Vec<_>>(), &[0])
+        align_columns(&self.figures.iter().map(row).collect::<Vec<_>>(), &[0])
     }
 }
 

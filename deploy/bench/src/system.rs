@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{bail, ensure};
 use driml_launch::{
-    console::{self, aligned},
+    console::{self, align_columns},
     managed_process::ManagedProcess,
     run_folder::{RunFolder, Summary},
     view::{Poller, ServerConnection},
@@ -41,7 +41,7 @@ const RATIOS: [(f64, u64); 2] = [(8.0, 256), (0.1, 10_000)];
 
 /// Measures updates and frames per second of a run, the share of time in which the learner computes, and each process's peak memory.
 pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Result<()> {
-    procgen_sys::Engine::install(&mut console::line)?;
+    procgen_sys::Engine::install(&mut console::eprintln)?;
     let frames = frames.unwrap_or(match bench.flags.quick {
         true => FRAMES.1,
         false => FRAMES.0,
@@ -75,7 +75,7 @@ pub(super) fn scale(
     seconds: Option<u32>,
     bench: &mut Bench<'_>,
 ) -> anyhow::Result<()> {
-    procgen_sys::Engine::install(&mut console::line)?;
+    procgen_sys::Engine::install(&mut console::eprintln)?;
     let quick = bench.flags.quick;
     let actors = match (actors, quick) {
         ([], true) => &ACTORS[..2],
@@ -97,7 +97,7 @@ pub(super) fn scale(
                 }
                 heads.push(column);
             }
-            console::line(&format!("  {}", row.join("  ")));
+            console::eprintln(&format!("  {}", row.join("  ")));
             if rows.is_empty() {
                 rows.push(heads);
             }
@@ -105,7 +105,7 @@ pub(super) fn scale(
         }
     }
     let columns: Vec<_> = (0..rows[0].len()).collect();
-    bench.table = Some(aligned(&rows, &columns));
+    bench.table = Some(align_columns(&rows, &columns));
     Ok(())
 }
 

@@ -198,7 +198,7 @@ impl Session {
         }
         let stopped = |e: &anyhow::Error| {
             if e.is::<Interrupted>() {
-                console::line("stopped; the same command resumes after the last whole piece");
+                console::eprintln("stopped; the same command resumes after the last whole piece");
             }
         };
         self.progress.begin(key);

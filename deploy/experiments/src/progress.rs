@@ -73,7 +73,7 @@ impl Progress {
     }
 
     pub(crate) fn line(&self, line: &str) {
-        self.screen.line(line);
+        self.screen.print_line(line);
     }
 
     /// The shutdown flags: `ending` is set by the first Ctrl-C or signal, `now` by the second.

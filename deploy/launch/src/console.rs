@@ -25,7 +25,7 @@ const DRAWS_PER_SECOND: u8 = 20;
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 
 /// Writes a line to stderr. A line that cannot be written is dropped, as the run continues after a closed pipe or on a full disk.
-pub fn line(text: &str) {
+pub fn eprintln(text: &str) {
     // A single write, so that lines of several threads do not mix.
     let _ = stderr().write_all(format!("{text}\n").as_bytes());
 }
@@ -39,7 +39,7 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 pub(crate) fn print_unless_closed(text: &str) -> anyhow::Result<bool> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(e) if !is_gone(&e) => Err(e).context("writing to stdout"),
+        Err(e) if !is_closed(&e) => Err(e).context("writing to stdout"),
         written => Ok(written.is_ok()),
     }
 }
@@ -48,7 +48,7 @@ pub(crate) fn print_unless_closed(text: &str) -> anyhow::Result<bool> {
 pub(crate) fn print_page(text: &str) -> anyhow::Result<bool> {
     let on_terminal = io::stdout().is_terminal().then(Term::stdout);
     match on_terminal.map(|it| it.clear_screen()) {
-        Some(Err(e)) if !is_gone(&e) => Err(e.into()),
+        Some(Err(e)) if !is_closed(&e) => Err(e.into()),
         _ => print_unless_closed(text),
     }
 }
@@ -56,20 +56,20 @@ pub(crate) fn print_page(text: &str) -> anyhow::Result<bool> {
 /// [`print`] for lines that a narrow terminal would break inside words: a wrapped line continues after `indent` blanks.
 pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
     match io::stdout().is_terminal() {
-        true => print(&wrapped(text, " ", indent)),
+        true => print(&wrap(text, " ", indent)),
         false => print(text),
     }
 }
 
 /// Breaks the lines of `text` at `separator`, so that no line is wider than the terminal where that is possible. A wrapped line
 /// continues after `indent` blanks.
-pub(crate) fn wrapped(text: &str, separator: &str, indent: usize) -> String {
+pub(crate) fn wrap(text: &str, separator: &str, indent: usize) -> String {
     let size = Term::stderr().size_checked();
     let width = size.map_or(usize::MAX, |it| it.1.into());
-    wrapped_to(text, separator, indent, width)
+    wrap_to(text, separator, indent, width)
 }
 
-fn wrapped_to(text: &str, separator: &str, indent: usize, width: usize) -> String {
+fn wrap_to(text: &str, separator: &str, indent: usize, width: usize) -> String {
     let mut lines = String::new();
     for line in text.split_inclusive('\n') {
         let mut column = 0;
@@ -91,7 +91,7 @@ fn wrapped_to(text: &str, separator: &str, indent: usize, width: usize) -> Strin
 }
 
 /// Formats rows as lines with aligned columns: to the right for the columns in `right`, to the left for all others.
-pub fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
+pub fn align_columns(rows: &[Vec<String>], right: &[usize]) -> String {
     let width_of = |column: usize| {
         let cells = rows.iter().filter_map(|row| row.get(column));
         cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
@@ -111,12 +111,12 @@ pub fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
 }
 
 /// Whether writing failed because the pipe's reader has exited or the terminal was closed.
-fn is_gone(e: &io::Error) -> bool {
+fn is_closed(e: &io::Error) -> bool {
     e.kind() == ErrorKind::BrokenPipe || e.raw_os_error() == Some(nix::libc::EIO)
 }
 
 /// Formats an error with its causes, each once: the text of many errors already contains their cause.
-pub fn describe(error: &anyhow::Error) -> String {
+pub fn describe_error(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let cause = cause.to_string();
@@ -152,34 +152,34 @@ pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String
 /// that are not wanted any more. The only error of its token module, `Unknown token`, comes up now and then over QUIC: a process that
 /// leaves drops its liveliness token while its link closes. quinn's warnings are off. Warnings of zenoh's QUIC link stay: they name
 /// rejected connections, of which the other side learns only that they failed.
-const OF_OTHERS: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
+const THIRD_PARTY_FILTER: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
                          zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=warn,quinn=error";
 
-fn usual_filter(level: &str) -> String {
-    format!("warn,driml={level},{OF_OTHERS}")
+fn default_filter(level: &str) -> String {
+    format!("warn,driml={level},{THIRD_PARTY_FILTER}")
 }
 
 /// The log filter for a value of `DRIML_LOG`. A level alone applies to driml's own crates only, as zenoh's lines would bury theirs.
 /// Any other value is used unchanged: `off`, for example, applies to everything.
-fn wanted_filter(wanted: &str) -> String {
+fn filter_for(wanted: &str) -> String {
     let level = wanted.trim().to_ascii_lowercase();
     match level.as_str() {
-        "trace" | "debug" | "info" | "warn" | "error" => usual_filter(&level),
+        "trace" | "debug" | "info" | "warn" | "error" => default_filter(&level),
         _ => wanted.to_owned(),
     }
 }
 
 /// Sends the log to stderr. `DRIML_LOG` sets what is logged: a level for driml's own crates, or a filter in the syntax of `RUST_LOG`.
 pub fn log_to_stderr() {
-    let usual = || EnvFilter::new(usual_filter("info"));
+    let default = || EnvFilter::new(default_filter("info"));
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
     let is_debugged = wanted.is_some();
-    let filter = wanted.map_or_else(usual, |wanted| {
-        EnvFilter::try_new(wanted_filter(&wanted)).unwrap_or_else(|e| {
-            line(&format!(
+    let filter = wanted.map_or_else(default, |wanted| {
+        EnvFilter::try_new(filter_for(&wanted)).unwrap_or_else(|e| {
+            eprintln(&format!(
                 "DRIML_LOG={wanted} is not a filter ({e}) and is ignored; use for example debug"
             ));
-            usual()
+            default()
         })
     });
     let log = tracing_subscriber::fmt::layer()
@@ -221,29 +221,29 @@ const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
 #[derive(Clone, Debug, Default)]
 pub struct Screen {
     bar: Option<ProgressBar>,
-    full_disk: Arc<Mutex<FullDisk>>,
+    full_disk: Arc<Mutex<FullDiskLimiter>>,
     /// When the next plain line of progress is due.
-    plain_next: Option<Instant>,
+    next_plain_line: Option<Instant>,
 }
 
 /// When a full disk was last reported, and how many lines about it were left out.
 #[derive(Debug, Default)]
-struct FullDisk {
-    said: Option<Instant>,
-    left_out: u64,
+struct FullDiskLimiter {
+    reported_at: Option<Instant>,
+    omitted: u64,
 }
 
-impl FullDisk {
+impl FullDiskLimiter {
     fn is_due(&mut self, text: &str, now: Instant) -> bool {
         let mut causes = ["No space left on device", "Disk quota exceeded"].iter();
         if !causes.any(|it| text.contains(it)) {
             return true;
         }
         let is_fresh = |said| now.saturating_duration_since(said) < FULL_DISK_PERIOD;
-        let is_due = !self.said.is_some_and(is_fresh);
+        let is_due = !self.reported_at.is_some_and(is_fresh);
         match is_due {
-            true => self.said = Some(now),
-            false => self.left_out += 1,
+            true => self.reported_at = Some(now),
+            false => self.omitted += 1,
         }
         is_due
     }
@@ -263,7 +263,7 @@ impl Screen {
         });
         Self {
             bar,
-            plain_next: Some(Instant::now() + PLAIN_PERIOD),
+            next_plain_line: Some(Instant::now() + PLAIN_PERIOD),
             ..Self::default()
         }
     }
@@ -274,19 +274,19 @@ impl Screen {
     }
 
     /// Writes one line. A line about a full disk is left out if another one was written less than ten minutes ago.
-    pub fn line(&self, text: &str) {
+    pub fn print_line(&self, text: &str) {
         if !lock(&self.full_disk).is_due(text, Instant::now()) {
             return;
         }
         match &self.bar {
-            Some(bar) => bar.suspend(|| line(text)),
-            None => line(text),
+            Some(bar) => bar.suspend(|| eprintln(text)),
+            None => eprintln(text),
         }
     }
 
     /// Writes several lines, each with [`Self::line`].
-    pub(crate) fn lines(&self, lines: impl IntoIterator<Item = String>) {
-        lines.into_iter().for_each(|it| self.line(&it));
+    pub(crate) fn print_lines(&self, lines: impl IntoIterator<Item = String>) {
+        lines.into_iter().for_each(|it| self.print_line(&it));
     }
 
     /// Shows progress beside the bar, or every ten seconds in a plain line. The argument of `text` is true for text beside the bar.
@@ -295,9 +295,9 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.set_position(position);
             bar.set_message(text(true));
-        } else if self.plain_next.is_none_or(|next| now >= next) {
-            self.plain_next = Some(now + PLAIN_PERIOD);
-            self.line(&text(false));
+        } else if self.next_plain_line.is_none_or(|next| now >= next) {
+            self.next_plain_line = Some(now + PLAIN_PERIOD);
+            self.print_line(&text(false));
         }
     }
 
@@ -306,9 +306,9 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        let more = std::mem::take(&mut lock(&self.full_disk).left_out);
+        let more = std::mem::take(&mut lock(&self.full_disk).omitted);
         if more > 0 {
-            line(&format!("and {more} more about the full disk"));
+            eprintln(&format!("and {more} more about the full disk"));
         }
     }
 }
@@ -321,7 +321,7 @@ mod tests {
     fn a_cause_is_said_once() {
         let full = || io::Error::from_raw_os_error(nix::libc::ENOSPC);
         let inner = anyhow::Error::new(full());
-        let said = describe(&inner.context("writing x").context("saving"));
+        let said = describe_error(&inner.context("writing x").context("saving"));
         assert_eq!(said, format!("saving: writing x: {}", full()));
 
         #[derive(Debug, thiserror::Error)]
@@ -330,50 +330,50 @@ mod tests {
             source: io::Error,
         }
         let named = anyhow::Error::new(NamesItsCause { source: full() });
-        let said = describe(&named.context("saving"));
+        let said = describe_error(&named.context("saving"));
         assert_eq!(said, format!("saving: cannot write x: {}", full()));
     }
 
     #[test]
     fn no_word_is_broken_in_a_narrow_terminal() {
         let text = "name    one two three\nx       four\n";
-        assert_eq!(wrapped_to(text, " ", 8, 80), text);
+        assert_eq!(wrap_to(text, " ", 8, 80), text);
         let narrow = "name    one two\n        three\nx       four\n";
-        assert_eq!(wrapped_to(text, " ", 8, 16), narrow);
+        assert_eq!(wrap_to(text, " ", 8, 16), narrow);
         let facts = "frames 1 of 2  updates 3 of 4";
         let narrow = "frames 1 of 2\nupdates 3 of 4";
-        assert_eq!(wrapped_to(facts, "  ", 0, 20), narrow);
+        assert_eq!(wrap_to(facts, "  ", 0, 20), narrow);
     }
 
     #[test]
     fn a_reader_that_is_gone_is_told_from_a_full_disk() {
         let error = io::Error::from_raw_os_error;
-        assert!(is_gone(&error(nix::libc::EPIPE)) && is_gone(&error(nix::libc::EIO)));
-        assert!(!is_gone(&error(nix::libc::ENOSPC)));
+        assert!(is_closed(&error(nix::libc::EPIPE)) && is_closed(&error(nix::libc::EIO)));
+        assert!(!is_closed(&error(nix::libc::ENOSPC)));
     }
 
     #[test]
     fn a_level_alone_is_for_driml_s_own_crates() {
         for (wanted, driml) in [("debug", "debug"), (" TRACE", "trace"), ("error", "error")] {
-            let filter = wanted_filter(wanted);
+            let filter = filter_for(wanted);
             let begins = format!("warn,driml={driml},zenoh=error,");
             assert!(filter.starts_with(&begins), "{filter}");
             assert!(EnvFilter::try_new(&filter).is_ok(), "{filter}");
         }
         for raw in ["off", "debug,zenoh=info", "driml_actor=trace"] {
-            assert_eq!(wanted_filter(raw), raw);
+            assert_eq!(filter_for(raw), raw);
         }
     }
 
     #[test]
     fn a_full_disk_is_one_line() {
-        let (mut full, start) = (FullDisk::default(), Instant::now());
+        let (mut full, start) = (FullDiskLimiter::default(), Instant::now());
         let mut is_due = |text, seconds| full.is_due(text, start + Duration::from_secs(seconds));
         assert!(is_due("a.csv: No space left on device (os error 28)", 0));
         assert!(!is_due("b.csv: No space left on device (os error 28)", 1));
         assert!(is_due("learner is gone", 1));
         assert!(is_due("a.csv: No space left on device (os error 28)", 601));
-        assert_eq!(full.left_out, 1);
+        assert_eq!(full.omitted, 1);
 
         let lost = "2 rows of a are lost: full\nx\n1 rows of b are lost: full";
         let joined = join_losses(lost.lines().map(str::to_owned));

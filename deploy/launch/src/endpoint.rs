@@ -166,8 +166,7 @@ mod tests {
     use super::*;
 
     fn listening(endpoint: &str, tls: bool, allow_insecure: bool) -> Result<(), String> {
-        let checked = check_listen_endpoints(&[endpoint.into()], tls, allow_insecure);
-        checked.map_err(|e| e.to_string())
+        check_listen_endpoints(&[endpoint.into()], tls, allow_insecure).map_err(|e| e.to_string())
     }
 
     /// Each case is an endpoint to connect to, whether certificates are used, and a part of the error; empty for a valid endpoint.

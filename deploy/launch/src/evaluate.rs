@@ -222,8 +222,7 @@ fn play_episodes(
     };
     let actions = world.actions(config.actor.actions);
     let world = RestrictedWorld::of(world.build(envs, seed, 0)?, actions, frame_size(config))?;
-    let rng = policy_rng(seed);
-    episode_returns(world, policy, evaluation, rng, watch)
+    episode_returns(world, policy, evaluation, policy_rng(seed), watch)
         .with_context(|| format!("playing {}", config.run.world))
 }
 

@@ -64,9 +64,8 @@ pub fn evaluate_and_keep(
     };
     let evaluation = evaluate(&path)?;
     let mut best_before = EvaluationRow::best(folder)?;
-    let is_shorter =
-        |it: &EvaluationRow| it.updates != evaluation.updates && it.episodes < episodes;
-    if best_before.is_some_and(|it| is_shorter(&it))
+    let is_short = |it: &EvaluationRow| it.updates != evaluation.updates && it.episodes < episodes;
+    if best_before.is_some_and(|it| is_short(&it))
         && let Some((_, best)) = checkpoint::list(&folder.best())?.pop()
     {
         let again = evaluate(&best)?;
@@ -150,10 +149,10 @@ impl Evaluator {
                     return;
                 }
                 last = true;
-                screen.line("playing the last checkpoint (skip it with Ctrl-C)");
+                screen.print_line("playing the last checkpoint (skip it with Ctrl-C)");
             }
             if abort() || Instant::now() > deadline {
-                screen.line("the last evaluation was left out");
+                screen.print_line("the last evaluation was left out");
                 return;
             }
             std::thread::sleep(POLL);
@@ -180,7 +179,7 @@ impl Evaluator {
         let logs = self.run_dir.logs();
         match ManagedProcess::start("evaluation", &args, 1, &logs, screen, None) {
             Ok(process) => self.process = Some(process),
-            Err(e) => screen.line(&format!(
+            Err(e) => screen.print_line(&format!(
                 "the checkpoint after {updates} updates is not played: {e:#}"
             )),
         }
@@ -205,7 +204,7 @@ impl Evaluator {
             (false, Ok(all)) => all.last().map(EvaluationRow::describe).unwrap_or_default(),
             (false, Err(e)) => format!("{e:#}"),
         };
-        screen.line(&report);
+        screen.print_line(&report);
         self.process = None;
     }
 }

@@ -31,7 +31,7 @@ pub(crate) fn play(
     if !config.local.play {
         return;
     }
-    console::line(
+    console::eprintln(
         "playing the weights beside a random policy, for at most about 30 s (skip it with Ctrl-C or --no-play)",
     );
     let noted = played(folder, is_stopped).and_then(|played| {
@@ -39,9 +39,9 @@ pub(crate) fn play(
         summary.write(folder)
     });
     if let Err(e) = noted {
-        console::line(&format!(
+        console::eprintln(&format!(
             "the run is finished, but playing its weights failed: {}; `driml evaluate {}` plays them again",
-            console::describe(&e),
+            console::describe_error(&e),
             folder.quoted()
         ));
     }
@@ -59,14 +59,14 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
         if batch > 0 && started.elapsed() * (batch + 1) > PLAY_MAX * batch {
             break;
         }
-        let mut of = |who| player.play(who, &world, BATCH, batch.into(), watch);
-        let both = [of(PolicyKind::Agent)?, of(PolicyKind::Random)?];
+        let mut play = |policy| player.play(policy, &world, BATCH, batch.into(), watch);
+        let both = [play(PolicyKind::Agent)?, play(PolicyKind::Random)?];
         if both.iter().any(|returns| returns.len() < BATCH) {
             break;
         }
-        let [of_agent, of_random] = both;
-        agent.extend(of_agent);
-        random.extend(of_random);
+        let [agent_returns, random_returns] = both;
+        agent.extend(agent_returns);
+        random.extend(random_returns);
     }
     if agent.is_empty() {
         let max = FIRST_BATCH_MAX.as_secs();

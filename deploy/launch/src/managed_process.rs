@@ -175,7 +175,7 @@ impl ManagedProcess {
             }
             Some((None, None)) => "exited".into(),
         };
-        let (name, log, last) = (&self.name, self.log.path.display(), self.log.last_words());
+        let (name, log, last) = (&self.name, self.log.path.display(), self.log.last_lines());
         format!("{name} {how} (log: {log}){last}")
     }
 }

@@ -31,7 +31,7 @@ pub(crate) enum Value {
     /// A number that may fall.
     Gauge(fn(&RunView) -> Option<f64>),
     /// A gauge with several members, such as the auxiliary losses: a column per member, named `prefix` and the member's name.
-    Each {
+    Members {
         /// The Prometheus label that distinguishes the members.
         label: &'static str,
         prefix: &'static str,
@@ -89,19 +89,19 @@ columns! {
         Value::Gauge(|it| Some(it.episodes.mean_return_of as f64));
     "c51_kl", "KL divergence [nats]", "learning", "C51 loss":
         "C51's loss of the last update.",
-        Value::Gauge(|it| learned(it, |it| it.c51_kl.into()));
+        Value::Gauge(|it| last_update(it, |it| it.c51_kl.into()));
     "losses", "auxiliary loss [nats]", "learning", "Auxiliary loss":
         "The last update's auxiliary losses, a column each, such as `dim_4t4`.",
-        Value::Each { label: "loss", prefix: "", members: losses };
+        Value::Members { label: "loss", prefix: "", members: losses };
     "total_loss", "loss [nats]", "learning", "Total loss":
         "The total loss of the last update.",
-        Value::Gauge(|it| learned(it, |it| it.total.into()));
+        Value::Gauge(|it| last_update(it, |it| it.total.into()));
     "grad_norm", "global 2-norm", "learning", "Gradient before clipping":
         "Norm of the last update's gradient before clipping.",
-        Value::Gauge(|it| learned(it, |it| it.grad_norm));
+        Value::Gauge(|it| last_update(it, |it| it.grad_norm));
     "q_mean", "discounted return", "learning", "Mean Q value":
         "Mean Q value of the last update's states.",
-        Value::Gauge(|it| learned(it, |it| it.q_mean.into()));
+        Value::Gauge(|it| last_update(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
         "Mean k of all rows served; of several positives the furthest.",
         Value::Gauge(|it| it.k.map(|it| it.mean));
@@ -143,7 +143,7 @@ columns! {
         Value::Counter(|it| Some(it.replay.actors_waited_s));
     "rss_mib", "resident memory [MiB]", "memory", "Memory":
         "Resident memory of each process, such as `rss_mib_actor_0`.",
-        Value::Each { label: "process", prefix: "rss_mib_", members: |it| it.rss_mib.clone() };
+        Value::Members { label: "process", prefix: "rss_mib_", members: |it| it.rss_mib.clone() };
 }
 
 fn updates(it: &RunView) -> Option<f64> {
@@ -153,7 +153,7 @@ fn updates(it: &RunView) -> Option<f64> {
 }
 
 /// A number of the last update; none before the first update, as a 0 would look like a loss.
-fn learned(it: &RunView, value: fn(&LearnerStatus) -> f64) -> Option<f64> {
+fn last_update(it: &RunView, value: fn(&LearnerStatus) -> f64) -> Option<f64> {
     it.learner_shown().filter(|it| it.updates > 0).map(value)
 }
 
@@ -168,15 +168,15 @@ impl Column {
     pub(crate) fn members(&self, view: &RunView) -> Vec<Member> {
         match self.value {
             Value::Counter(value) | Value::Gauge(value) => vec![(self.name.into(), value(view))],
-            Value::Each { members, .. } => members(view),
+            Value::Members { members, .. } => members(view),
             Value::Words(_) => Vec::new(),
         }
     }
 
     /// The column of `metrics.csv` for a member.
-    fn column_of(&self, member: &str) -> String {
+    fn csv_name(&self, member: &str) -> String {
         match self.value {
-            Value::Each { prefix, .. } => prefix.to_owned() + &member.replace('-', "_"),
+            Value::Members { prefix, .. } => prefix.to_owned() + &member.replace('-', "_"),
             _ => member.to_owned(),
         }
     }
@@ -188,13 +188,13 @@ pub(crate) fn cell(value: Option<impl ToString>) -> String {
 }
 
 /// The name and the cell of each column of `metrics.csv`, in order.
-pub(crate) fn cells(view: &RunView) -> Vec<(String, String)> {
+pub(crate) fn csv_cells(view: &RunView) -> Vec<(String, String)> {
     let cells = COLUMNS.iter().flat_map(|column| match column.value {
         Value::Words(words) => vec![(column.name.to_owned(), words(view))],
         _ => {
             let members = column.members(view).into_iter();
             let cells =
-                members.map(|(name, value)| (column.column_of(&name), cell(value.map(rounded))));
+                members.map(|(name, value)| (column.csv_name(&name), cell(value.map(rounded))));
             cells.collect()
         }
     });
@@ -202,10 +202,10 @@ pub(crate) fn cells(view: &RunView) -> Vec<(String, String)> {
 }
 
 /// TensorBoard's curves, named `GROUP/COLUMN`, with their newest points. They are drawn over frames.
-pub(crate) fn points(view: &RunView) -> Vec<(String, f64)> {
+pub(crate) fn curve_points(view: &RunView) -> Vec<(String, f64)> {
     let drawn = COLUMNS.iter().filter(|it| it.name != "frames");
     let points = drawn.flat_map(|column| {
-        let curve = |name: &str| format!("{}/{}", column.group, column.column_of(name));
+        let curve = |name: &str| format!("{}/{}", column.group, column.csv_name(name));
         let members = column.members(view).into_iter();
         members.filter_map(move |(name, value)| Some((curve(&name), rounded(value?))))
     });
@@ -219,7 +219,7 @@ pub(crate) fn json(view: &RunView) -> BTreeMap<&'static str, serde_json::Value> 
             value(view).map_or(serde_json::Value::Null, json_number)
         }
         Value::Words(words) => words(view).into(),
-        Value::Each { members, .. } => {
+        Value::Members { members, .. } => {
             let members = members(view).into_iter();
             let known = members.filter_map(|(name, value)| Some((name, json_number(value?))));
             serde_json::Value::Object(known.collect())
@@ -239,9 +239,9 @@ fn json_number(value: f64) -> serde_json::Value {
 }
 
 /// The metric of a column of `metrics.csv`, also for the memory of a process, whose name differs by run. None for an auxiliary loss.
-pub fn column(name: &str) -> Option<&'static Column> {
+pub fn find_column(name: &str) -> Option<&'static Column> {
     COLUMNS.iter().find(|it| match it.value {
-        Value::Each {
+        Value::Members {
             label: "process", ..
         } => name.starts_with(it.name),
         _ => it.name == name,
@@ -284,7 +284,7 @@ mod tests {
     #[test]
     fn the_columns_of_the_file_keep_their_names_and_their_order() {
         let view = of_two_losses(ReplayStatus::default(), Some(LearnerStatus::default()));
-        let names: Vec<_> = cells(&view).into_iter().map(|(name, _)| name).collect();
+        let names: Vec<_> = csv_cells(&view).into_iter().map(|(name, _)| name).collect();
         let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
                       dim_3t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon";
         assert!(names.join(",").starts_with(before), "{names:?}");
@@ -312,7 +312,7 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part} in {text}");
         }
-        let points = points(&known);
+        let points = curve_points(&known);
         let of = |name: &str| points.iter().find(|it| it.0 == name).map(|it| it.1);
         assert_eq!(of("memory/rss_mib_actor_0"), Some(12.34));
         assert_eq!(of("memory/rss_mib_actor_1"), None);
@@ -344,12 +344,12 @@ mod tests {
     #[test]
     fn a_name_is_one_metric_s_and_none_hides_another() {
         for (at, it) in COLUMNS.iter().enumerate() {
-            assert_eq!(column(it.name).map(|it| it.name), Some(it.name));
+            assert_eq!(find_column(it.name).map(|it| it.name), Some(it.name));
             assert!(COLUMNS[..at].iter().all(|other| other.name != it.name));
             assert!(it.help.ends_with('.') && !it.unit.is_empty(), "{}", it.name);
         }
-        assert_eq!(column("rss_mib_actor_7").unwrap().name, "rss_mib");
-        assert!(column("dim_4t4").is_none());
+        assert_eq!(find_column("rss_mib_actor_7").unwrap().name, "rss_mib");
+        assert!(find_column("dim_4t4").is_none());
     }
 
     /// `UPDATE_EXPECT=1` rewrites the page.
@@ -363,7 +363,7 @@ mod tests {
             let prometheus = match column.value {
                 Value::Counter(_) => format!("`driml_{}_total`", column.name),
                 Value::Gauge(_) => format!("`driml_{}`", column.name),
-                Value::Each { label, .. } => format!("`driml_{}{{{label}}}`", column.name),
+                Value::Members { label, .. } => format!("`driml_{}{{{label}}}`", column.name),
                 Value::Words(_) => "-".into(),
             };
             let Column {

@@ -8,17 +8,17 @@ use driml_settings::config::RunConfig;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
 /// Open files of each process, with some room for files that are open only briefly.
-const BASE: u64 = 48;
+const BASE_FILES: u64 = 48;
 /// Additional open files of the launcher per process: the ends of two pipes, and a log.
-const OF_LAUNCHER: u64 = 3;
+const LAUNCHER_FILES_PER_PROCESS: u64 = 3;
 
 /// Open files of a replay server for this many actors: per actor a socket, a segment of zenoh's, and the memory in which it sends.
-fn of_server(actors: u64, shared_memory: bool) -> u64 {
-    BASE + actors * if shared_memory { 4 } else { 2 }
+fn server_files(actors: u64, shared_memory: bool) -> u64 {
+    BASE_FILES + actors * if shared_memory { 4 } else { 2 }
 }
 
 /// Checks that this process, or a child of it, may have `needed` open files. Raises the soft limit to the hard limit.
-fn check(needed: u64, whose: &str) -> Result<(), String> {
+fn check_limit(needed: u64, whose: &str) -> Result<(), String> {
     let max = match getrlimit(Resource::RLIMIT_NOFILE) {
         Ok((_, hard)) if setrlimit(Resource::RLIMIT_NOFILE, hard, hard).is_ok() => hard,
         Ok((soft, _)) => soft,
@@ -37,20 +37,20 @@ fn check(needed: u64, whose: &str) -> Result<(), String> {
 pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
     let actors = u64::from(config.local.actors);
     let shards = u64::from(config.replay.shards);
-    let of_launcher = BASE + OF_LAUNCHER * (actors + shards + 1);
-    let of_server = of_server(actors.div_ceil(shards), config.transport.shared_memory);
-    let (needed, whose) = match of_server > of_launcher {
-        true => (of_server, "the replay server"),
-        false => (of_launcher, "the launcher"),
+    let launcher_files = BASE_FILES + LAUNCHER_FILES_PER_PROCESS * (actors + shards + 1);
+    let server_files = server_files(actors.div_ceil(shards), config.transport.shared_memory);
+    let (needed, whose) = match server_files > launcher_files {
+        true => (server_files, "the replay server"),
+        false => (launcher_files, "the launcher"),
     };
-    check(needed, &format!("{whose} of a run with {actors} actors")).map_err(Usage)
+    check_limit(needed, &format!("{whose} of a run with {actors} actors")).map_err(Usage)
 }
 
 /// Warns if a replay server that is started by hand may not open as many files as the actors in its settings need.
-pub fn warn_of_server(config: &RunConfig) {
+pub fn warn_if_limit_low(config: &RunConfig) {
     let actors = u64::from(config.local.actors);
-    let needed = of_server(actors, config.transport.shared_memory);
-    if let Err(why) = check(needed, &format!("a replay server for {actors} actors")) {
+    let needed = server_files(actors, config.transport.shared_memory);
+    if let Err(why) = check_limit(needed, &format!("a replay server for {actors} actors")) {
         tracing::warn!("{why}");
     }
 }

@@ -11,16 +11,16 @@ use std::{
 use driml_machine::limits;
 
 /// The thread that ends the process, set once the exit code is decided.
-static ENDING: OnceLock<ThreadId> = OnceLock::new();
+static ENDING_THREAD: OnceLock<ThreadId> = OnceLock::new();
 
 /// Makes every panic print its thread, place and message on stderr in one line, and then abort the process. For a panic of a library,
 /// the line also names the resources of the system that are nearly used up: they may be the cause.
 ///
 /// The launcher shows that line with the name of the process. If a launcher aborts, its processes exit in order.
-pub fn end_the_process() {
+pub fn abort_on_panic() {
     std::panic::set_hook(Box::new(|panic| {
         let thread = std::thread::current();
-        if ENDING.get().is_some_and(|it| *it != thread.id()) {
+        if ENDING_THREAD.get().is_some_and(|it| *it != thread.id()) {
             #[cfg(test)]
             tests::STOPPED.store(true, std::sync::atomic::Ordering::Release);
             loop {
@@ -28,13 +28,13 @@ pub fn end_the_process() {
             }
         }
         let scarce = match panic.location() {
-            Some(place) if !is_ours(place.file()) => limits::scarce_resources(),
+            Some(place) if !is_own_source(place.file()) => limits::scarce_resources(),
             _ => Vec::new(),
         };
-        say(&line(panic, thread.name(), &scarce));
+        write_stderr(&panic_line(panic, thread.name(), &scarce));
         let trace = Backtrace::capture();
         if trace.status() == BacktraceStatus::Captured {
-            say(&trace.to_string());
+            write_stderr(&trace.to_string());
         }
         std::process::abort();
     }));
@@ -44,22 +44,22 @@ pub fn end_the_process() {
 ///
 /// During the exit, libraries destroy their global state. A library's thread that still uses that state panics (zenoh's shared
 /// memory does so). That must not change the exit code any more, so the hook parks such a thread silently.
-pub fn process_ends() {
-    ENDING.get_or_init(|| std::thread::current().id());
+pub fn mark_process_ending() {
+    ENDING_THREAD.get_or_init(|| std::thread::current().id());
 }
 
 /// Writes without a buffer and without the lock of `std::io::stderr`, which another thread may hold forever.
-fn say(text: &str) {
+fn write_stderr(text: &str) {
     // Nothing can be done if stderr is closed.
     let _ = nix::unistd::write(std::io::stderr(), format!("{text}\n").as_bytes());
 }
 
 /// Whether a file is one of this program's own sources, whose paths are relative to the root of the repository.
-fn is_ours(file: &str) -> bool {
+fn is_own_source(file: &str) -> bool {
     !file.starts_with('/')
 }
 
-fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]) -> String {
+fn panic_line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]) -> String {
     let message = panic.payload();
     let text = message.downcast_ref::<String>().map(String::as_str);
     let text = text.or_else(|| message.downcast_ref::<&str>().copied());
@@ -107,9 +107,9 @@ mod tests {
     #[test]
     fn a_panic_while_the_process_ends_does_not_change_how() {
         if let Ok(says) = std::env::var(CHILD) {
-            end_the_process();
+            abort_on_panic();
             if says == "ends" {
-                process_ends();
+                mark_process_ending();
             }
             let thread = std::thread::spawn(|| panic!("too late"));
             let started = Instant::now();
@@ -138,7 +138,7 @@ mod tests {
     #[test]
     fn a_library_s_panic_names_what_was_scarce() {
         if std::env::var(CHILD).is_ok() {
-            end_the_process();
+            abort_on_panic();
             let pool = ShmProviderBuilder::default_backend(1 << 12).wait().unwrap();
             let open = || File::open("/dev/null").ok();
             let _files: Vec<_> = std::iter::from_fn(open).collect();
@@ -159,9 +159,9 @@ mod tests {
 
     #[test]
     fn sources_of_this_program_are_told_from_others() {
-        assert!(is_ours(file!()));
-        assert!(!is_ours("/rustc/0/library/core/src/option.rs"));
-        assert!(!is_ours(
+        assert!(is_own_source(file!()));
+        assert!(!is_own_source("/rustc/0/library/core/src/option.rs"));
+        assert!(!is_own_source(
             "/home/one/.cargo/registry/src/index/zenoh-shm-1.10.2/src/lib.rs"
         ));
     }

@@ -50,13 +50,13 @@ pub fn describe(
     let held = frames.min(replay.capacity_transitions);
     let with_fields = |max: u64| max.saturating_add(held * COMPRESSED_FIELDS_BYTES);
     let compressed = replay.compressed_bytes_max.map_or(u64::MAX, with_fields);
-    let bytes = size(compressed.min(held * replay_bytes_each(run)));
+    let bytes = format_size(compressed.min(held * replay_bytes_each(run)));
     let disk = match config.local.durable || lockstep {
         true => " and about as much of disk, in the run folder",
         false => "",
     };
     let left = (1.0 - resume_point.updates as f64 / updates.max(1) as f64).max(0.0);
-    let time = about(estimate(config, machine.cores).mul_f64(left));
+    let time = format_estimate(estimate(config, machine.cores).mul_f64(left));
     let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);
     let (processes, run_dir) = (processes(config, lockstep), run_dir.display());
@@ -91,7 +91,7 @@ fn processes(config: &RunConfig, lockstep: bool) -> String {
     format!("{servers}; learner {learner}; {count} {actors} with {envs} environments each")
 }
 
-fn size(bytes: u64) -> String {
+fn format_size(bytes: u64) -> String {
     match bytes >> 20 {
         mib @ 0..1024 => format!("{} MiB", mib + 1),
         mib => format!("{:.1} GiB", mib as f64 / 1024.0),
@@ -99,7 +99,7 @@ fn size(bytes: u64) -> String {
 }
 
 /// Formats a time with no more precision than an estimate has.
-fn about(time: Duration) -> String {
+fn format_estimate(time: Duration) -> String {
     let time = match time.as_secs() {
         0..60 => return "under a minute".into(),
         seconds @ 60..7200 => format!("{} min", seconds.div_ceil(60)),
@@ -154,7 +154,7 @@ mod tests {
             (90_000, "about 1 d 1 h"),
             (86_400, "about 1 d"),
         ] {
-            assert_eq!(about(Duration::from_secs(seconds)), text);
+            assert_eq!(format_estimate(Duration::from_secs(seconds)), text);
         }
     }
 }

@@ -30,7 +30,7 @@ const EXTENSION: &str = "safetensors";
 /// and add its name here.
 const BUILT_IN: &[(&str, &[u8])] = built_in_games!["bigfish", "coinrun", "fruitbot", "starpilot"];
 
-const EXPORTED: &str = "exported";
+const EXPORTED_KEY: &str = "exported";
 
 /// What the description of an exported network has in addition to that of a checkpoint.
 #[derive(Serialize, Deserialize)]
@@ -45,19 +45,19 @@ struct Exported {
 ///
 /// # Errors
 /// A name that no built-in network has, a file that cannot be read or is not an exported network.
-pub fn find(name: &Path) -> anyhow::Result<Option<Player>> {
+pub fn load(name: &Path) -> anyhow::Result<Option<Player>> {
     let shown = name.display().to_string();
     if let Some(game) = shown.strip_prefix(PREFIX) {
-        return built_in(BUILT_IN, game).map(Some);
+        return load_built_in(BUILT_IN, game).map(Some);
     }
     if name.extension().is_none_or(|it| it != EXTENSION) || name.is_dir() {
         return Ok(None);
     }
     let bytes = fs::read(name).map_err(|e| usage!("reading {shown}: {e}"))?;
-    read(&shown, &bytes).map(Some)
+    load_bytes(&shown, &bytes).map(Some)
 }
 
-fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
+fn load_built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
     let games: Vec<_> = all.iter().map(|(game, _)| *game).collect();
     let Some((_, bytes)) = all.iter().find(|(known, _)| *known == game) else {
         let near = did_you_mean(game, games.iter().copied());
@@ -67,7 +67,7 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
         };
         bail!(usage!("no pretrained weights of {game:?}{near}; {known}"));
     };
-    let player = read(&format!("{PREFIX}{game}"), bytes)?;
+    let player = load_bytes(&format!("{PREFIX}{game}"), bytes)?;
     let world = &player.config.run.world;
     if world.rsplit(':').next() != Some(game) {
         bail!("{PREFIX}{game} holds weights of {world}");
@@ -75,11 +75,11 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
     Ok(player)
 }
 
-fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
+fn load_bytes(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
     let described = read_description(bytes);
     let described =
         described.map_err(|e| usage!("{name} is damaged, or not a safetensors file: {e}"))?;
-    let exported = described.and_then(|it| it.get(EXPORTED).cloned());
+    let exported = described.and_then(|it| it.get(EXPORTED_KEY).cloned());
     let exported: Exported = exported
         .and_then(|it| serde_json::from_value(it).ok())
         .with_context(|| {
@@ -106,13 +106,13 @@ fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
     })
 }
 
-/// Exports the network, without DIM's heads, as the bytes of a file that [`find`] reads.
+/// Exports the network, without DIM's heads, as the bytes of a file that [`load`] reads.
 pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
     let config = &player.config;
     let model = config.model.without_dim();
     let mut description: Value =
         serde_json::from_str(&describe(&config.run, &model, &config.input))?;
-    description[EXPORTED] = serde_json::to_value(Exported {
+    description[EXPORTED_KEY] = serde_json::to_value(Exported {
         settings: config.to_toml(),
         updates: player.updates,
         is_averaged: player.is_averaged,
@@ -128,13 +128,13 @@ mod tests {
     use crate::testing::{play_returns, untrained_player};
 
     fn said(all: &[(&str, &[u8])], game: &str) -> String {
-        format!("{:#}", built_in(all, game).map(drop).unwrap_err())
+        format!("{:#}", load_built_in(all, game).map(drop).unwrap_err())
     }
 
     #[test]
     fn every_built_in_network_can_be_read() {
         for (game, _) in BUILT_IN {
-            built_in(BUILT_IN, game).unwrap();
+            load_built_in(BUILT_IN, game).unwrap();
         }
     }
 
@@ -143,7 +143,7 @@ mod tests {
         let player = untrained_player("chain", "driml-ada");
         let bytes = export(&player).unwrap();
         assert_eq!(bytes, export(&player).unwrap());
-        let read = built_in(&[("chain", &bytes[..])], "chain").unwrap();
+        let read = load_built_in(&[("chain", &bytes[..])], "chain").unwrap();
         assert_eq!((read.updates, read.weights_name()), (7, "averaged"));
         assert_eq!(read.config.run, player.config.run);
         for (name, var) in read.network.iter() {
@@ -158,8 +158,7 @@ mod tests {
         }
         assert_eq!(play_returns(&read).len(), 4);
         // Exporting what was read rounds nothing again.
-        let again = export(&read).unwrap();
-        let again = built_in(&[("chain", &again[..])], "chain").unwrap();
+        let again = load_built_in(&[("chain", &export(&read).unwrap()[..])], "chain").unwrap();
         assert_eq!(play_returns(&read), play_returns(&again));
         assert_eq!(play_returns(&read), play_returns(&read.with_f32()));
     }
@@ -200,7 +199,7 @@ mod tests {
         ] {
             let text = mixed.config.to_toml().replace(from, to);
             let description = serde_json::json!({
-                EXPORTED: Exported { settings: text, updates: 1, is_averaged: false }
+                EXPORTED_KEY: Exported { settings: text, updates: 1, is_averaged: false }
             });
             let network = &mixed.network;
             let bytes = network

@@ -23,12 +23,12 @@ const WAITING_MAX: usize = 1000;
 pub(crate) struct ProcessLog {
     name: String,
     pub(crate) path: PathBuf,
-    kept: Arc<Mutex<Kept>>,
+    state: Arc<Mutex<LogState>>,
     threads: Vec<JoinHandle<()>>,
 }
 
 #[derive(Debug)]
-struct Kept {
+struct LogState {
     file: AppendLog,
     tail: VecDeque<String>,
     /// The error line with which the process ended, and how many lines followed it: the causes may take several lines.
@@ -38,7 +38,7 @@ struct Kept {
 impl ProcessLog {
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
         let path = logs.join(format!("{name}.log"));
-        let kept = Kept {
+        let state = LogState {
             file: AppendLog::open(&path, format!("the log of {name}"), "lines", WAITING_MAX)?,
             tail: VecDeque::new(),
             error: None,
@@ -46,7 +46,7 @@ impl ProcessLog {
         Ok(Self {
             name: name.into(),
             path,
-            kept: Arc::new(Mutex::new(kept)),
+            state: Arc::new(Mutex::new(state)),
             threads: Vec::new(),
         })
     }
@@ -57,42 +57,42 @@ impl ProcessLog {
         pipe: impl Read + Send + 'static,
         screen: &Screen,
     ) -> anyhow::Result<()> {
-        let (name, kept, screen) = (self.name.clone(), self.kept.clone(), screen.clone());
-        let carry = move || {
+        let (name, state, screen) = (self.name.clone(), self.state.clone(), screen.clone());
+        let copy_lines = move || {
             let point = format!("log of {name}");
             for line in BufReader::new(pipe).split(b'\n') {
                 fail_point::reach(&point);
                 let Ok(line) = line else { return };
                 let line = String::from_utf8_lossy(&line).into_owned();
                 let shown = is_warning(&line).then(|| format!("{name}: {line}"));
-                let said = lock(&kept).add(line);
-                screen.lines(shown.into_iter().chain(said));
+                let said = lock(&state).add(line);
+                screen.print_lines(shown.into_iter().chain(said));
             }
         };
         let thread = std::thread::Builder::new().name(format!("log of {}", self.name));
-        let thread = thread.spawn(carry).context("starting a thread")?;
+        let thread = thread.spawn(copy_lines).context("starting a thread")?;
         self.threads.push(thread);
         Ok(())
     }
 
     /// The error with which the process ended, if it printed one, or else its last lines.
-    pub(crate) fn last_words(&self) -> String {
-        let kept = lock(&self.kept);
+    pub(crate) fn last_lines(&self) -> String {
+        let state = lock(&self.state);
         let last = |count: usize| -> String {
-            let lines = kept.tail.iter().skip(kept.tail.len().saturating_sub(count));
+            let lines = state.tail.range(state.tail.len().saturating_sub(count)..);
             lines.map(|line| format!("\n  {line}")).collect()
         };
-        match &kept.error {
+        match &state.error {
             // The error and the lines after it say everything.
             Some((error, followed)) => format!(": {error}{}", last(*followed)),
-            None if kept.tail.is_empty() => String::new(),
+            None if state.tail.is_empty() => String::new(),
             None => format!("; its last lines:{}", last(TAIL_LINES_MAX)),
         }
     }
 
     /// How many lines could not be written, and why; none if all were written.
     pub(crate) fn loss_message(&self) -> Option<String> {
-        lock(&self.kept).file.loss_message()
+        lock(&self.state).file.loss_message()
     }
 
     /// Waits until everything that the process wrote is in the log. The process must have ended, and no other process may hold the
@@ -104,7 +104,7 @@ impl ProcessLog {
     }
 }
 
-impl Kept {
+impl LogState {
     /// Adds a line. Returns a warning the first time that a line cannot be written.
     fn add(&mut self, line: String) -> Option<String> {
         let warning = self.file.add([format!("{line}\n").into_bytes()]);
@@ -154,13 +154,13 @@ mod tests {
             .unwrap();
         log.finish();
         assert_eq!(std::fs::read_to_string(&log.path).unwrap(), lines);
-        let said = log.last_words();
+        let said = log.last_lines();
         assert!(said.starts_with("; its last lines:\n  line 2\n") && said.ends_with("line 9"));
         assert_eq!(log.loss_message(), None);
         for line in ["error: it failed. Its last words:", "no", "more"] {
-            lock(&log.kept).add(line.into());
+            lock(&log.state).add(line.into());
         }
         let said = ": it failed. Its last words:\n  no\n  more";
-        assert_eq!(log.last_words(), said);
+        assert_eq!(log.last_lines(), said);
     }
 }

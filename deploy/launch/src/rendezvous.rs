@@ -20,9 +20,9 @@ use crate::endpoint::{ADDRESS_ENDS, SOCKET_PATH_MAX};
 
 const PREFIX: &str = "driml-run-";
 /// The longest path of a socket below the folder for temporary files.
-const SOCKET: &str = "/driml-run-XXXXXX/replay-server-255.sock";
+const LONGEST_SOCKET: &str = "/driml-run-XXXXXX/replay-server-255.sock";
 /// Where the folder lies if the path for temporary files is too long, or has characters that an endpoint cannot have.
-const SHORT_PLACE: &str = "/tmp";
+const SHORT_PARENT: &str = "/tmp";
 const IN_USE: &str = "in-use";
 
 /// A run's folder for sockets, removed on drop.
@@ -35,28 +35,28 @@ pub struct Rendezvous {
 impl Rendezvous {
     /// Makes a folder, and removes the folders that are no longer in use.
     pub(crate) fn create() -> anyhow::Result<Self> {
-        let place = place_under(std::env::temp_dir());
-        sweep(&place);
-        Self::create_in(&place).with_context(|| {
-            let place = place.display();
-            format!("making a folder for the socket in {place}: set TMPDIR to a folder that may be written")
+        let parent = parent_folder(std::env::temp_dir());
+        remove_unused(&parent);
+        Self::create_in(&parent).with_context(|| {
+            let parent = parent.display();
+            format!("making a folder for the socket in {parent}: set TMPDIR to a folder that may be written")
         })
     }
 
-    fn create_in(place: &Path) -> io::Result<Self> {
+    fn create_in(parent: &Path) -> io::Result<Self> {
         // Private, because any process that can reach the socket can take part in the run.
         let folder = tempfile::Builder::new()
             .prefix(PREFIX)
             .permissions(Permissions::from_mode(0o700))
-            .tempdir_in(place)?;
+            .tempdir_in(parent)?;
         // Locked before it gets its final name; otherwise a process that sweeps just now would find a folder without a holder.
-        let fresh = folder.path().join("new");
-        let lock = File::create(&fresh)?;
+        let new_lock = folder.path().join("new");
+        let lock = File::create(&new_lock)?;
         if let Err(e) = lock_file::try_lock(&lock) {
             // A folder that cannot be locked is never swept.
-            tracing::debug!("locking {}: {e}", fresh.display());
+            tracing::debug!("locking {}: {e}", new_lock.display());
         }
-        fs::rename(fresh, folder.path().join(IN_USE))?;
+        fs::rename(new_lock, folder.path().join(IN_USE))?;
         Ok(Self { folder, lock })
     }
 
@@ -77,24 +77,24 @@ impl Rendezvous {
 }
 
 /// Where such folders lie: in `folder`, the one for temporary files, if an endpoint can name a path there.
-fn place_under(folder: PathBuf) -> PathBuf {
+fn parent_folder(folder: PathBuf) -> PathBuf {
     let path = folder.to_string_lossy();
-    let fits = path.len() + SOCKET.len() <= SOCKET_PATH_MAX && !path.contains(ADDRESS_ENDS);
-    if fits { folder } else { SHORT_PLACE.into() }
+    let fits = path.len() + LONGEST_SOCKET.len() <= SOCKET_PATH_MAX && !path.contains(ADDRESS_ENDS);
+    if fits { folder } else { SHORT_PARENT.into() }
 }
 
 /// Called at the orderly exit of a process: releases its lock on the folder, and sweeps, as its launcher may have been killed.
 pub fn leave() {
     let nothing = File::open("/dev/null");
     match nothing.and_then(|nothing| Ok(dup2_stdin(nothing)?)) {
-        Ok(()) => sweep(&place_under(std::env::temp_dir())),
+        Ok(()) => remove_unused(&parent_folder(std::env::temp_dir())),
         Err(e) => tracing::debug!("leaving the folder of the socket: {e}"),
     }
 }
 
-/// Removes this user's folders in `place` that are no longer in use. A folder that cannot be removed stays and does no harm.
-fn sweep(place: &Path) {
-    let entries = fs::read_dir(place).into_iter().flatten().flatten();
+/// Removes this user's folders in `parent` that are no longer in use. A folder that cannot be removed stays and does no harm.
+fn remove_unused(parent: &Path) {
+    let entries = fs::read_dir(parent).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
         let is_ours = |it: fs::Metadata| it.is_dir() && it.uid() == geteuid().as_raw();
         if entry.metadata().is_ok_and(is_ours) && is_free(&entry.path()) == Some(true) {
@@ -118,32 +118,32 @@ pub(crate) fn is_used(path: &Path) -> bool {
 mod tests {
     use super::*;
 
-    fn folders(place: &Path) -> usize {
-        fs::read_dir(place).unwrap().count()
+    fn folders(parent: &Path) -> usize {
+        fs::read_dir(parent).unwrap().count()
     }
 
     #[test]
     fn a_folder_that_no_endpoint_can_name_is_not_used() {
-        for (folder, place) in [("/tmp/a", "/tmp/a"), ("/tmp/a#b", "/tmp"), ("/a?", "/tmp")] {
-            assert_eq!(place_under(folder.into()), Path::new(place));
+        for (folder, parent) in [("/tmp/a", "/tmp/a"), ("/tmp/a#b", "/tmp"), ("/a?", "/tmp")] {
+            assert_eq!(parent_folder(folder.into()), Path::new(parent));
         }
     }
 
     #[test]
     fn unused_folders_are_swept_and_nothing_else() {
-        let place = tempfile::tempdir().unwrap();
-        let rendezvous = Rendezvous::create_in(place.path()).unwrap();
+        let parent = tempfile::tempdir().unwrap();
+        let rendezvous = Rendezvous::create_in(parent.path()).unwrap();
         let path = rendezvous.folder.path().display().to_string();
         let endpoint = format!("unixsock-stream/{path}/learner.sock");
         assert_eq!(rendezvous.endpoint("learner"), endpoint);
         let mode = fs::metadata(rendezvous.folder.path()).unwrap().mode();
         assert_eq!(mode & 0o777, 0o700);
         // Folders of other programs, by their name or content.
-        fs::create_dir(place.path().join("driml-run-other")).unwrap();
-        fs::create_dir(place.path().join("else")).unwrap();
-        fs::write(place.path().join("else").join(IN_USE), "").unwrap();
-        sweep(place.path());
-        assert_eq!(folders(place.path()), 3);
+        fs::create_dir(parent.path().join("driml-run-other")).unwrap();
+        fs::create_dir(parent.path().join("else")).unwrap();
+        fs::write(parent.path().join("else").join(IN_USE), "").unwrap();
+        remove_unused(parent.path());
+        assert_eq!(folders(parent.path()), 3);
 
         // As after the launcher was killed, while a process still uses the folder.
         let process = rendezvous.lock_handle().unwrap();
@@ -151,13 +151,13 @@ mod tests {
         let path = folder.keep();
         fs::write(path.join("learner.sock"), "").unwrap();
         drop(lock);
-        sweep(place.path());
+        remove_unused(parent.path());
         assert!(path.exists() && is_used(&path));
         drop(process);
         assert!(!is_used(&path));
-        sweep(place.path());
+        remove_unused(parent.path());
         assert!(!is_used(&path), "it is gone");
         assert!(!path.exists());
-        assert_eq!(folders(place.path()), 2);
+        assert_eq!(folders(parent.path()), 2);
     }
 }

@@ -34,7 +34,7 @@ use crate::{
 const SAVING_MAX: Duration = Duration::from_secs(120);
 /// How long the other processes may then take to exit; a replay server stays for 10 s if one of them is frozen.
 const ENDING_MAX: Duration = Duration::from_secs(20);
-const LOOK: Duration = Duration::from_millis(250);
+const WAIT_POLL: Duration = Duration::from_millis(250);
 
 /// Whether the run in `folder`, which plays `world`, can be resumed. It needs a checkpoint, and a world that keeps no progress across
 /// episodes or whose progress the checkpoint holds.
@@ -54,9 +54,9 @@ pub fn newest_updates(folder: &RunFolder) -> Option<u64> {
 }
 
 /// Prints how to resume a run that was interrupted or failed, if that is possible.
-pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
+pub fn print_resume_hint(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
-        console::line(&format!(
+        console::eprintln(&format!(
             "`driml train --resume {}` resumes it",
             folder.quoted()
         ));
@@ -67,13 +67,13 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
 ///
 /// # Errors
 /// [`Interrupted`] if the run was interrupted.
-pub(crate) fn say_next(
+pub(crate) fn print_next_steps(
     summary: &Summary,
     world: &WorldConfig,
     folder: &RunFolder,
 ) -> anyhow::Result<()> {
     if summary.outcome == Outcome::Interrupted {
-        say_how(world, folder);
+        print_resume_hint(world, folder);
         return Err(Interrupted.into());
     }
     console::print(&summary.next_steps(folder, is_resumable(world, folder)))
@@ -98,47 +98,47 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
         checkpoint::lock(&checkpoints)?;
     }
     // The replay server exits last: until then it holds its replay and its endpoint.
-    let is_left = || {
+    let have_exited = || {
         let place = std::fs::read(folder.rendezvous());
         let is_used = |place: Vec<u8>| rendezvous::is_used(Path::new(OsStr::from_bytes(&place)));
         Ok(!place.is_ok_and(is_used))
     };
     let why = format!("processes of the run in {} still end", folder.display());
-    wait_until(is_left, ENDING_MAX, &why).map(drop)
+    wait_until(have_exited, ENDING_MAX, &why).map(drop)
 }
 
-/// Waits until `is_so` returns true, and prints `why` if it has to wait. Returns false after `max`.
+/// Waits until `is_done` returns true, and prints `why` if it has to wait. Returns false after `max`.
 fn wait_until(
-    is_so: impl Fn() -> Result<bool, CheckpointError>,
+    is_done: impl Fn() -> Result<bool, CheckpointError>,
     max: Duration,
     why: &str,
 ) -> anyhow::Result<bool> {
     let started = Instant::now();
     let mut said = false;
-    while !is_so()? {
+    while !is_done()? {
         if started.elapsed() >= max {
             return Ok(false);
         }
         if !std::mem::replace(&mut said, true) {
-            console::line(&format!("{why}: waiting"));
+            console::eprintln(&format!("{why}: waiting"));
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(WAIT_POLL);
     }
     Ok(true)
 }
 
 /// Whether and how a run can be resumed.
 #[derive(Debug)]
-pub enum Found {
+pub enum Resumption {
     /// Nothing is left to do. The text says so, and what else can be done.
-    Nothing(String),
+    Done(String),
     /// Something is left to do, or the run has all its updates but did not come to its end.
-    Resumed(Box<Resumed>),
+    Resumed(Box<ResumedRun>),
 }
 
 /// What a resumed run continues with.
 #[derive(Debug)]
-pub struct Resumed {
+pub struct ResumedRun {
     /// The run's settings.
     pub config: RunConfig,
     /// The point from which the run continues.
@@ -185,7 +185,7 @@ fn check_changes(
 ///
 /// # Errors
 /// The folder is not a run's, the settings cannot work, it has no checkpoint, or the run is still running.
-pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Found> {
+pub fn prepare(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Resumption> {
     let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
@@ -225,10 +225,10 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         0 if !lockstep => (0, 0),
         _ => (counts.frames(), counts.rows()),
     };
-    let has_other_pace = before.learner.batch_size != config.learner.batch_size
+    let has_pace_changed = before.learner.batch_size != config.learner.batch_size
         || before.replay.replay_ratio != config.replay.replay_ratio
         || before.replay.warmup_transitions != config.replay.warmup_transitions;
-    if has_other_pace && updates > 0 {
+    if has_pace_changed && updates > 0 {
         config.replay.since = Some(RatioStart {
             transitions: frames,
             rows,
@@ -240,7 +240,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     let is_shortened = config.frames() < frames.min(before.frames());
     if is_complete && (is_shortened || Summary::is_finished(folder)) {
         let run = folder.quoted();
-        return Ok(Found::Nothing(format!(
+        return Ok(Resumption::Done(format!(
             "nothing is left to do: the run in {run} has done {updates} updates and {frames} frames.\n\
              `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains on, up to N frames"
         )));
@@ -266,7 +266,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         after_updates: updates,
         frames_max: config.frames(),
     };
-    Ok(Found::Resumed(Box::new(Resumed {
+    Ok(Resumption::Resumed(Box::new(ResumedRun {
         config,
         point,
         lockstep,

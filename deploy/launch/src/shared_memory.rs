@@ -9,12 +9,12 @@ use driml_protocol::shared_memory::FOLDER;
 const EXTENSION: &str = ".zenoh";
 
 /// Removes the segments of shared memory that only this process has mapped. The process must not use them any more.
-pub fn remove_own() {
-    let (mut own, this) = (segments("self"), std::process::id());
+pub fn remove_own_segments() {
+    let (mut own, this) = (mapped_segments("self"), std::process::id());
     for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
         let pid = entry.file_name().to_string_lossy().into_owned();
         if pid.parse::<u32>().is_ok_and(|it| it != this) {
-            let theirs = segments(&pid);
+            let theirs = mapped_segments(&pid);
             own.retain(|it| !theirs.contains(it));
         }
     }
@@ -25,7 +25,7 @@ pub fn remove_own() {
 }
 
 /// The segments that a process has mapped.
-fn segments(pid: &str) -> BTreeSet<PathBuf> {
+fn mapped_segments(pid: &str) -> BTreeSet<PathBuf> {
     let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default();
     let lines = maps.lines();
     let paths = lines.filter_map(|line| line.split_whitespace().nth(5));

@@ -4,7 +4,7 @@
 use std::fmt;
 
 /// 0.975 quantiles of Student's t with 1, 2, .. degrees of freedom. Source: the tables of any textbook.
-const T: [f64; 30] = [
+const STUDENT_T: [f64; 30] = [
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160,
     2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056,
     2.052, 2.048, 2.045, 2.042,
@@ -13,7 +13,7 @@ const T: [f64; 30] = [
 /// The 0.975 quantile of Student's t for this many degrees of freedom, at least 1. Beyond the table it is an expansion in
 /// 1 / `freedom` (Fisher and Cornish 1960), within 0.001.
 pub fn student_quantile(freedom: usize) -> f64 {
-    let in_table = T.get(freedom.max(1) - 1).copied();
+    let in_table = STUDENT_T.get(freedom.max(1) - 1).copied();
     let freedom = freedom as f64;
     in_table.unwrap_or_else(|| 1.960 + 2.372 / freedom + 2.822 / freedom.powi(2))
 }
@@ -45,8 +45,8 @@ pub struct Interval {
 pub fn interval(values: &[f64]) -> Option<Interval> {
     let freedom = values.len().checked_sub(1)?;
     let (mean, deviation) = mean_and_deviation(values);
-    let by = student_quantile(freedom) * deviation / (values.len() as f64).sqrt();
-    let ends = (freedom > 0).then_some((mean - by, mean + by));
+    let half_width = student_quantile(freedom) * deviation / (values.len() as f64).sqrt();
+    let ends = (freedom > 0).then_some((mean - half_width, mean + half_width));
     Some(Interval { mean, ends })
 }
 

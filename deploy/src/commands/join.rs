@@ -76,7 +76,7 @@ pub(super) fn prepare_join<T>(
 /// a scheduler that stops the process does not count it as complete.
 pub(super) fn clean_up_after(ran: anyhow::Result<bool>) -> anyhow::Result<()> {
     rendezvous::leave();
-    shared_memory::remove_own();
+    shared_memory::remove_own_segments();
     match ran? {
         true => Ok(()),
         false => Err(Interrupted.into()),

@@ -12,7 +12,7 @@ pub(crate) enum ProcgenCommand {
 pub(crate) fn run(command: &ProcgenCommand) -> anyhow::Result<()> {
     match command {
         ProcgenCommand::Install => {
-            let engine = procgen_sys::Engine::install(&mut console::line)?;
+            let engine = procgen_sys::Engine::install(&mut console::eprintln)?;
             let library = engine.library().display();
             print(&format!("procgen's engine is {library}\n"))
         }

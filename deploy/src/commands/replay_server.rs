@@ -57,7 +57,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     }
     let GracefulShutdown { ending, now } = prepare_join(&args.join, GracefulShutdown::on_signals)?;
     config.notes.iter().for_each(|it| tracing::warn!("{it}"));
-    open_files::warn_of_server(&config);
+    open_files::warn_if_limit_low(&config);
     let run = driml_replay_server::RunArgs {
         listen: args.listen,
         connect: args.connect,

@@ -9,7 +9,7 @@ use driml_launch::{
     console::{self, print_wrapped},
     endpoint::{check_listen_endpoints, check_unused},
     launcher, lockstep, plan,
-    resume::{self, Found},
+    resume::{self, Resumption},
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
@@ -99,9 +99,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let found = match resume::find(&RunFolder::new(folder), &args.run.over, &machine)? {
-                Found::Nothing(sentence) => return console::print(&format!("{sentence}\n")),
-                Found::Resumed(found) => found,
+            let found = match resume::prepare(&RunFolder::new(folder), &args.run.over, &machine)? {
+                Resumption::Done(sentence) => return console::print(&format!("{sentence}\n")),
+                Resumption::Resumed(found) => found,
             };
             args.lockstep = found.lockstep;
             if args.lockstep && args.listen.is_some() {
@@ -142,7 +142,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let (lockstep, point) = (args.lockstep, resume_point.unwrap_or_default());
     let plan = plan::describe(&config, &from, &run_dir, lockstep, point, &machine);
     print_wrapped(&plan, plan::INDENT)?;
-    config.world.install(&mut console::line)?;
+    config.world.install(&mut console::eprintln)?;
     if args.lockstep {
         lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
     } else {

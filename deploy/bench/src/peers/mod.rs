@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_launch::console::{self, aligned};
+use driml_launch::console::{self, align_columns};
 use driml_machine::{resources::MachineInfo, speed_meter::median, units::format_number};
 use serde::Serialize;
 
@@ -111,11 +111,11 @@ pub(super) fn run(
     for round in 1..=rounds {
         for (component, (script, sides)) in &mut sides {
             let name = component.name();
-            console::line(&format!("round {round} of {rounds}: {name} of ours"));
+            console::eprintln(&format!("round {round} of {rounds}: {name} of ours"));
             let ours = script::ours(*component, flags)?;
             ours.into_iter().for_each(|it| sides.ours.add(it));
             if sides.absent.is_none() {
-                console::line(&format!("round {round} of {rounds}: {}", sides.peer));
+                console::eprintln(&format!("round {round} of {rounds}: {}", sides.peer));
                 match script.run(folder.path()) {
                     Ok((peer, figures)) => sides.add_theirs(peer, figures),
                     Err(why) => sides.skip(format!("{why:#}")),
@@ -148,7 +148,7 @@ impl Sides {
 
     /// Continues the measurements without the peer.
     fn skip(&mut self, why: String) {
-        console::line(&format!("skipped: {why}"));
+        console::eprintln(&format!("skipped: {why}"));
         self.absent = Some(why);
     }
 }
@@ -213,7 +213,7 @@ fn format_table(comparison: &Comparison) -> String {
         ]);
         skipped.extend(row.skipped.iter().map(|why| format!("skipped: {why}\n")));
     }
-    let mut text = aligned(&cells, &[1, 2, 5, 6]);
+    let mut text = align_columns(&cells, &[1, 2, 5, 6]);
     text.extend(skipped);
     let (rounds, threads) = (comparison.rounds, comparison.threads);
     let machine = &comparison.machine;

@@ -100,7 +100,7 @@ fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     }
     for other in others {
         let other = other.display();
-        console::line(&format!("left out {other}: it is not the folder of a run"));
+        console::eprintln(&format!("left out {other}: it is not the folder of a run"));
     }
     Ok(runs)
 }
@@ -146,7 +146,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
         if column == RETURN || !(args.column.is_empty() || is_loss) {
-            absent(column, &runs).for_each(|line| console::line(&line));
+            absent(column, &runs).for_each(|line| console::eprintln(&line));
         }
         if is_return(column) {
             series.extend(lines(&random, &series, groups.len()));
@@ -185,7 +185,7 @@ fn words(column: &str) -> (String, String) {
         );
     }
     let named = column.replace('_', " ");
-    match metrics::column(column) {
+    match metrics::find_column(column) {
         Some(it) if it.name == column => (it.plot_label.into(), it.unit.into()),
         // The column is one of several that share a description.
         Some(it) => (named, it.unit.into()),

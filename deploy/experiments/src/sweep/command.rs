@@ -1,7 +1,7 @@
 //! `driml sweep`: makes a run for each combination of settings and each seed, then a table and a plot of all runs.
 //! `axes` decides which runs there are, and `queue` makes them.
 
-use driml_launch::console::{aligned, print};
+use driml_launch::console::{align_columns, print};
 use driml_machine::error::usage;
 use driml_settings::presets;
 use serde::{Deserialize, Serialize};
@@ -76,7 +76,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
     session.csv(NAME, &header.join(","), &rows)?;
     let lines = [vec![header], rows].concat();
-    print(&format!("{}{LEGEND}", aligned(&lines, &[])))?;
+    print(&format!("{}{LEGEND}", align_columns(&lines, &[])))?;
     session.check_any(&made)?;
     let runs = made.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {

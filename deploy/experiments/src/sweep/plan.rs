@@ -124,7 +124,7 @@ pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<(
                 is_its_own,
                 usage!("--set changes the run's seed or frames: use --seeds and --frames")
             );
-            config.world.install(&mut console::line)?;
+            config.world.install(&mut console::eprintln)?;
             known.push(call);
         }
     }

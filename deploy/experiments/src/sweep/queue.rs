@@ -13,7 +13,7 @@ use std::{
 use anyhow::Context;
 use driml_launch::{
     managed_process::{ask_to_stop, exit_with_parent_flags},
-    resume::{self, Found},
+    resume::{self, Resumption},
     run_folder::{Progress as RunProgress, read_progress},
 };
 use driml_machine::{
@@ -304,12 +304,12 @@ impl Queue {
         if !is_resumable {
             return Ok(None);
         }
-        match resume::find(&folder, &Flags::default(), &Machine::detect())? {
-            Found::Nothing(sentence) => {
+        match resume::prepare(&folder, &Flags::default(), &Machine::detect())? {
+            Resumption::Done(sentence) => {
                 progress.line(&sentence);
                 Ok(None)
             }
-            Found::Resumed(_) => {
+            Resumption::Resumed(_) => {
                 let run = folder.display();
                 progress.line(&format!("{run} resumes from its checkpoint"));
                 Ok(newest)
@@ -411,9 +411,7 @@ mod tests {
         let (queue, plan) = queue(root.path());
         let share = |resumed| {
             let command = queue.command(&plan, resumed);
-            let mut shares = command
-                .get_envs()
-                .filter(|(name, _)| *name == MEMORY_SHARE_ENV);
+            let mut shares = command.get_envs().filter(|it| it.0 == MEMORY_SHARE_ENV);
             shares.next().map(|(_, value)| value == Some("7".as_ref()))
         };
         assert_eq!([share(false), share(true)], [Some(true), None]);

@@ -69,7 +69,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let report_only = args.queue.report;
     if !report_only {
         let base = settings.common.config(&settings.levels[0].base)?;
-        base.world.install(&mut console::line)?;
+        base.world.install(&mut console::eprintln)?;
     }
     // The budget is the machine time for the runs of this call.
     let (started, budget_seconds) = (Instant::now(), f64::from(args.budget) * 60.0);

@@ -8,7 +8,7 @@ use driml_settings::config::RunConfig;
 use indicatif::HumanCount;
 use serde::Serialize;
 
-use crate::console::aligned;
+use crate::console::align_columns;
 use count::{CostCounter, EVERYTHING, Line};
 
 /// Width of the names in characters; a longer name pushes its row to the right.
@@ -96,7 +96,7 @@ pub fn describe_worlds(inspections: &[Inspection]) -> String {
         let cells = sums.map(|it| format!("{} ({})", HumanCount(it.is), HumanCount(it.everything)));
         rows.push([vec![it.world.clone()], cells.into()].concat());
     }
-    let table = aligned(&rows, &[1, 2, 3, 4]);
+    let table = align_columns(&rows, &[1, 2, 3, 4]);
     format!("{table}\nin brackets: {EVERYTHING}\n")
 }
 

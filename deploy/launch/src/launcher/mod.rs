@@ -108,7 +108,7 @@ pub fn run(
     let watched = launch.start_and_watch();
     let result = launch.stop_all(watched);
     session::sweep_shared_memory();
-    crate::shared_memory::remove_own();
+    crate::shared_memory::remove_own_segments();
     launch.display.screen.clear();
     let outcome = result.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
     let (mut summary, written) = launch.write_summary(outcome, restarts_before);
@@ -128,10 +128,10 @@ pub fn run(
     if let Err(failed) = result {
         // The caller reports `failed` last. A summary that could not be written, as on a full disk, is reported before.
         if let Err(e) = written {
-            console::line(&console::describe(&e));
+            console::eprintln(&console::describe_error(&e));
         }
         if has_learned {
-            resume::say_how(&config.world, run_dir);
+            resume::print_resume_hint(&config.world, run_dir);
         }
         return Err(failed);
     }
@@ -147,7 +147,7 @@ pub fn run(
         let is_stopped = || launch.shutdown.ending.is_set();
         last_play::play(&mut summary, config, run_dir, &is_stopped);
     }
-    resume::say_next(&summary, &config.world, run_dir)
+    resume::print_next_steps(&summary, &config.world, run_dir)
 }
 
 impl Launch<'_> {
@@ -209,7 +209,7 @@ impl Launch<'_> {
                 let fetch = |shard, since| poller.fetch_episodes(shard, since, true);
                 let mut warnings = self.recorder.record_episodes(view, fetch);
                 warnings.extend(self.recorder.record(&mut poller.view, &rss));
-                self.display.screen.lines(warnings);
+                self.display.screen.print_lines(warnings);
             }
             self.recorder.fill_totals(&mut poller.view);
             let view = &poller.view;
@@ -246,7 +246,7 @@ impl Launch<'_> {
             true => watched.or(Ok(Outcome::Interrupted)),
         };
         if matches!(watched, Ok(Outcome::Interrupted)) {
-            self.display.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
+            self.display.screen.print_line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
         }
         let now = self.shutdown.now.clone();
         let abort = move || now.is_set();
@@ -299,7 +299,7 @@ impl Launch<'_> {
         warnings.extend(failed.filter(|it| !warnings.contains(it)));
         let new = warnings.iter().filter(|it| !error.contains(*it));
         let lines = new.map(|warning| format!("while stopping, {warning}"));
-        self.display.screen.lines(lines);
+        self.display.screen.print_lines(lines);
         result
     }
 
@@ -347,7 +347,7 @@ impl Launch<'_> {
         };
         let logs = self.processes.iter().filter_map(|it| it.log.loss_message());
         let missing = console::join_losses(self.recorder.loss_messages().into_iter().chain(logs));
-        missing.iter().for_each(|line| console::line(line));
+        missing.iter().for_each(|line| console::eprintln(line));
         let mut summary = self.recorder.summarise(outcome, view);
         summary.replay_servers_restarted = servers_before + self.server_restarts;
         summary.actors_restarted = actors_before + self.actor_restarts;

@@ -201,7 +201,7 @@ impl Launch<'_> {
                 );
             }
             *restarts += 1;
-            self.display.screen.line(&format!(
+            self.display.screen.print_line(&format!(
                 "{report}\n{name} is started again{with_replay} ({restarts} of {max} times in a run)"
             ));
             session::sweep_shared_memory();

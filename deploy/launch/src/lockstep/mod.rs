@@ -60,9 +60,9 @@ pub fn run(
         };
         let choice = CheckpointChoice::After(updates);
         match evaluate_and_keep(run_dir, choice, episodes, &is_stopped) {
-            Ok(ranked) => screen.line(&ranked.evaluation.describe()),
-            Err(_) if is_stopped() => screen.line("an evaluation was left out"),
-            Err(e) => screen.line(&format!("the run continues without an evaluation: {e:#}")),
+            Ok(ranked) => screen.print_line(&ranked.evaluation.describe()),
+            Err(_) if is_stopped() => screen.print_line("an evaluation was left out"),
+            Err(e) => screen.print_line(&format!("the run continues without an evaluation: {e:#}")),
         }
     };
     let mut shown_at = Instant::now();
@@ -72,7 +72,6 @@ pub fn run(
 
     let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| (point.updates, point.frames));
-    // The updates at the last attempt to save.
     let mut save_tried_at = updates;
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
@@ -82,7 +81,7 @@ pub fn run(
             save_tried_at = updates;
             // A failed save does not end the training, but at the end of the run it is an error.
             if let Err(e) = lockstep.save(&folder) {
-                screen.line(&format!(
+                screen.print_line(&format!(
                     "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
                 ));
             } else {
@@ -93,7 +92,7 @@ pub fn run(
         let show = shown_at.elapsed() >= POLL;
         if show || lockstep.replay.inserted_total() / row_frames > row_number {
             row_number = lockstep.replay.inserted_total() / row_frames;
-            screen.lines(record(&mut recorder, &mut view, &mut lockstep));
+            screen.print_lines(record(&mut recorder, &mut view, &mut lockstep));
             if show {
                 shown_at = Instant::now();
                 display.show(&view);
@@ -118,18 +117,19 @@ pub fn run(
         evaluate(lockstep.learner.updates(), true);
     }
     let missing = console::join_losses(recorder.loss_messages());
-    missing.iter().for_each(|line| console::line(line));
+    missing.iter().for_each(|line| console::eprintln(line));
     run_dir.check_intact()?;
     let summary = recorder.summarise(outcome, &mut view);
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
-    resume::say_next(&summary, &config.world, run_dir)
+    resume::print_next_steps(&summary, &config.world, run_dir)
 }
 
 fn exit_on_second_interrupt(second: Shutdown) -> anyhow::Result<()> {
     let exit = move || {
         second.wait();
-        console::line("error: stopped at once by a second interrupt: what was not saved is lost");
+        let error = "error: stopped at once by a second interrupt: what was not saved is lost";
+        console::eprintln(error);
         std::process::exit(1);
     };
     let thread = std::thread::Builder::new().name("end".into());

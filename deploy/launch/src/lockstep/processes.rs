@@ -70,11 +70,7 @@ impl SavedState {
 }
 
 /// Opens the replay in a run's folder; with a mark, in the state at that mark.
-fn open_replay(
-    config: &RunConfig,
-    run_dir: &RunFolder,
-    mark: Option<Mark>,
-) -> anyhow::Result<Replay> {
+fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {
     let args = PersistArgs {
         dir: run_dir.replay(),
         shard: 0,
@@ -108,11 +104,11 @@ impl Lockstep {
         let mut this = Self::in_memory(config)?;
         match this.actor_states() {
             Ok(_) => {
-                this.replay = open_replay(config, run_dir, None)?;
+                this.replay = open(config, run_dir, None)?;
                 this.join_actors()?;
             }
             Err(ActError::World(e @ EnvError::NotSaved(_))) => {
-                console::line(&format!("{e}: the run cannot be resumed, only repeated"));
+                console::eprintln(&format!("{e}: the run cannot be resumed, only repeated"));
             }
             Err(e) => return Err(e.into()),
         }
@@ -125,7 +121,7 @@ impl Lockstep {
         let compute = config.local.learner_device.open(config.learner.precision)?;
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
         let learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
-        let replay = open_replay(config, run_dir, Some(saved.replay))?;
+        let replay = open(config, run_dir, Some(saved.replay))?;
         let (actors, turn) = (saved.actors, saved.turn);
         let (found, count) = (actors.len(), config.local.actors as usize);
         let resuming = "resuming the actors from the checkpoint";

@@ -84,8 +84,7 @@ pub(super) fn rows_up_to(
         // Actors run ahead: without the limit on frames, a run that now ends sooner would keep rows from after its end. A replay that
         // is filled anew counts from the checkpoint's frames.
         let is_counted = resume_point.replay_is_kept || it.frames <= resume_point.frames;
-        let is_before = it.updates <= resume_point.updates && it.frames <= resume_point.frames_max;
-        is_before && is_counted
+        is_counted && it.updates <= resume_point.updates && it.frames <= resume_point.frames_max
     })?;
     let columns: Vec<_> = header.iter().map(|name| table.column_index(name)).collect();
     let rows = table.rows.iter().map(|row| {

@@ -19,7 +19,7 @@ use super::{
     table::{AppendLog, Table, csv_row},
 };
 use crate::{
-    metrics::{cells, points},
+    metrics::{csv_cells, curve_points},
     run_view::{Episodes, Plan, RunView, Spread},
 };
 
@@ -65,8 +65,7 @@ impl RunRecorder {
         let summarised = Summary::read(folder).map_or(0.0, |it| it.wall_seconds);
         let noted = earlier.as_ref().map_or(0.0, |it| it.seconds);
         let seconds_before = noted.max(summarised);
-        let kept = resume_point.replay_is_kept;
-        let kept = kept.then_some(earlier).transpose()?;
+        let kept = resume_point.replay_is_kept.then_some(earlier).transpose()?;
         let (rows, seconds) = match resumed {
             None => {
                 // First, because a folder in which nothing was learned is recognised as a run's by its settings.
@@ -172,8 +171,8 @@ impl RunRecorder {
         if before.updates > 0 && (updates <= before.updates || frames < before.frames) {
             return Vec::new();
         }
-        let row = csv_row(cells(view).into_iter().map(|(_, cell)| cell));
-        let points = points(view);
+        let row = csv_row(csv_cells(view).into_iter().map(|(_, cell)| cell));
+        let points = curve_points(view);
         let events = self.events.as_mut();
         let drawn = events.and_then(|it| it.add(&points, &view.replay, view.learner.finished));
         self.metrics.add([row]).into_iter().chain(drawn).collect()
@@ -207,7 +206,7 @@ impl RunRecorder {
 fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
     let mut nothing = RunView::new(Plan::new(config));
     nothing.rss_mib = processes.iter().map(|it| (it.clone(), None)).collect();
-    cells(&nothing).into_iter().map(|(name, _)| name).collect()
+    csv_cells(&nothing).into_iter().map(|it| it.0).collect()
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use super::{
     table::{read_json, write_atomically},
 };
 use crate::{
-    console::aligned,
+    console::align_columns,
     run_view::RunView,
     stats::{interval, mean_and_deviation},
 };
@@ -205,8 +205,8 @@ impl Summary {
 
     /// Describes how the run ended, and the returns of its weights.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
-        let (counts, earned) = (self.describe_counts(), self.describe_returns());
-        format!("{counts}\n{earned}{}\n", run_dir.display())
+        let (counts, returns) = (self.describe_counts(), self.describe_returns());
+        format!("{counts}\n{returns}{}\n", run_dir.display())
     }
 
     fn describe_returns(&self) -> String {
@@ -250,5 +250,5 @@ pub(crate) fn plot_command(run_dir: &RunFolder) -> (String, &'static str) {
 pub(crate) fn format_commands(commands: &[(String, &str)]) -> String {
     let row =
         |(command, what): &(String, &str)| vec![format!("  driml {command}"), format!(" {what}")];
-    aligned(&commands.iter().map(row).collect::<Vec<_>>(), &[])
+    align_columns(&commands.iter().map(row).collect::<Vec<_>>(), &[])
 }

@@ -124,7 +124,7 @@ impl Table {
         let aside_path = free.context("no name is free beside the table")?;
         write_atomically(&aside_path, &aside.to_csv())?;
         let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
-        console::line(&format!(
+        console::eprintln(&format!(
             "{} rows of {} are past the point where the run is resumed; they are now in {}",
             aside.rows.len(),
             name(path),
@@ -256,8 +256,8 @@ mod tests {
         let is_kept = |row: BTreeMap<String, String>| row["a"] != "3";
         table.keep_rows(&path, is_kept).unwrap();
         assert_eq!(table.to_csv(), b"a,b\n1,2\n5,6\n");
-        let aside_path = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
-        assert_eq!(aside_path, b"a,b\n3,\"4, of five\"\n");
+        let aside = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
+        assert_eq!(aside, b"a,b\n3,\"4, of five\"\n");
         let log = AppendLog::create(&path, &table.to_csv()).unwrap();
         assert_eq!((log.name.as_str(), log.unit), ("x.csv", "rows"));
     }

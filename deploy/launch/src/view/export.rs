@@ -133,7 +133,7 @@ impl PrometheusText {
         for column in COLUMNS {
             let (kind, label, ending) = match column.value {
                 Value::Counter(_) => ("counter", "", "_total"),
-                Value::Each { label, .. } => ("gauge", label, ""),
+                Value::Members { label, .. } => ("gauge", label, ""),
                 Value::Gauge(_) | Value::Words(_) => ("gauge", "", ""),
             };
             let name = format!("{}{ending}", column.name);

@@ -81,7 +81,7 @@ impl Display {
         let frames = view.replay.transitions_inserted;
         let position = frames.min(view.plan.frames_planned);
         self.screen.show(position, |is_bar| match is_bar {
-            true => console::wrapped(&texts.join("\n"), "  ", 0),
+            true => console::wrap(&texts.join("\n"), "  ", 0),
             false => plain_line(self.began.elapsed(), &texts),
         });
     }
@@ -211,8 +211,7 @@ mod tests {
             frames 8000/8000 (+192) (0/s)  updates 218/218 (+6) (0.0/s)  replay ratio 0.00
             return - (0 episodes)  C51 0.000  neither side waits"#]]
         .assert_eq(&shown(8_192, 224));
-        let nothing_happens = (10, 0.0);
-        assert_eq!(time_left(nothing_happens, (0, 0.0)), None);
+        assert_eq!(time_left((10, 0.0), (0, 0.0)), None, "no progress");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use super::{
     live::progress_text,
 };
 use crate::{
-    console::aligned,
+    console::align_columns,
     run_view::{RunView, ServerAnswer},
 };
 
@@ -63,7 +63,7 @@ pub(crate) fn status_page(view: &RunView) -> String {
             rows.push(vec![format!("and {more} more actors")]);
         }
     }
-    page += &aligned(&rows, &[]);
+    page += &align_columns(&rows, &[]);
     for note in notes {
         page += &format!("\n{note}\n");
     }

@@ -88,8 +88,7 @@ impl Poller {
     pub fn poll(&mut self) -> &RunView {
         let servers: Vec<_> = self.servers.iter().map(ServerConnection::poll).collect();
         // The learner is asked through the first server.
-        let first = self.servers.first();
-        let first = first.filter(|_| servers[0].replay.is_some());
+        let first = self.servers.first().filter(|_| servers[0].replay.is_some());
         let view = &mut self.view;
         if let (None, Some(first)) = (view.after_updates, first) {
             let run_info = first.client.fetch::<RunInfo>(ANSWER_MAX);

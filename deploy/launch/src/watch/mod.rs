@@ -140,10 +140,10 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
         }
         if said.due().is_some() {
             for (server, progress) in view.recovering() {
-                console::line(&describe_recovery(&server.name, progress));
+                console::eprintln(&describe_recovery(&server.name, progress));
             }
             if view.servers_answered() {
-                console::line("no learner has joined the run yet: waiting for it");
+                console::eprintln("no learner has joined the run yet: waiting for it");
             }
         }
         if interrupted.wait_timeout(POLL) {
@@ -183,14 +183,14 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
         }
         poller.poll();
         if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-            watched.display.screen.line(&failed);
+            watched.display.screen.print_line(&failed);
         }
     };
     poller.close();
     let outcome = *ended.as_ref().unwrap_or(&Outcome::Failed);
     let summary = watched.finish(&mut poller.view, outcome);
     if ended? == Outcome::Interrupted {
-        console::line("the run continues without being watched");
+        console::eprintln("the run continues without being watched");
         return Err(Interrupted.into());
     }
     match &folder {
@@ -237,8 +237,7 @@ impl UnreachableRun {
 /// The folder has no settings: it is not a run's, or the processes of the run were started by hand.
 pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<String>>> {
     let config = read_config(folder)?;
-    let endpoints = std::fs::read_to_string(folder.endpoints());
-    let endpoints = endpoints.unwrap_or_default();
+    let endpoints = std::fs::read_to_string(folder.endpoints()).unwrap_or_default();
     let mut lines = endpoints.lines();
     if lines.any(|it| reach::look(it).is_ok()) {
         return Ok(Ok(endpoints.lines().map(str::to_owned).collect()));

@@ -63,7 +63,7 @@ impl WatchedRun {
             let fetch = |shard, since| poller.fetch_episodes(shard, since, false);
             let mut warnings = recorder.record_episodes(&poller.view, fetch);
             warnings.extend(recorder.record(&mut poller.view, &[]));
-            self.display.screen.lines(warnings);
+            self.display.screen.print_lines(warnings);
         }
         self.display.show(&poller.view);
         self.is_over(poller)
@@ -96,13 +96,13 @@ impl WatchedRun {
         if poller.view.learner.updates >= updates {
             return;
         }
-        self.display.screen.line(
+        self.display.screen.print_line(
             "the learner's last answer is missing: its updates are those whose batches were served, its losses and weights those before",
         );
         poller.view.learner.updates = updates;
         if let Some(recorder) = &mut self.recorder {
             let warnings = recorder.record(&mut poller.view, &[]);
-            self.display.screen.lines(warnings);
+            self.display.screen.print_lines(warnings);
         }
     }
 
@@ -114,7 +114,7 @@ impl WatchedRun {
             return Summary::new(outcome, view, seconds, ResumePoint::default());
         };
         let missing = recorder.loss_messages();
-        missing.iter().for_each(|line| console::line(line));
+        missing.iter().for_each(|line| console::eprintln(line));
         recorder.summarise(outcome, view)
     }
 }

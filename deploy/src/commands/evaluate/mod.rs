@@ -95,7 +95,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     let folder = args.folder.as_ref().or(args.run.as_ref());
     let folder = folder.expect("clap asks for one of the two");
-    let pretrained = pretrained::find(folder)?;
+    let pretrained = pretrained::load(folder)?;
     let folder = RunFolder::new(folder);
     let choice = args.checkpoint.unwrap_or_default();
     if pretrained.is_some() && (args.checkpoint.is_some() || args.weights.is_some() || args.keep) {
@@ -125,7 +125,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         player = player.with_f32();
     }
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
-    player.config.world.install(&mut console::line)?;
+    player.config.world.install(&mut console::eprintln)?;
     // Open the file before an hour of playing; its content is replaced only after that.
     let table = args.returns.as_ref().map(|path| {
         let file = File::options().create(true).append(true).open(path);
