@@ -70,11 +70,11 @@ pub(crate) fn checkpoint_path(
     choice: CheckpointChoice,
 ) -> anyhow::Result<PathBuf> {
     let run = folder.display();
-    let place = match choice {
+    let parent = match choice {
         CheckpointChoice::Best => folder.best(),
         CheckpointChoice::Newest | CheckpointChoice::After(_) => folder.checkpoints(),
     };
-    let mut all = checkpoint::list(&place)?;
+    let mut all = checkpoint::list(&parent)?;
     let known: Vec<_> = all.iter().map(|(updates, _)| updates.to_string()).collect();
     let chosen = match choice {
         CheckpointChoice::After(wanted) => all.into_iter().find(|(updates, _)| *updates == wanted),

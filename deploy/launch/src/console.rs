@@ -284,7 +284,7 @@ impl Screen {
         }
     }
 
-    /// Writes several lines, each with [`Self::line`].
+    /// Writes several lines, each with [`Self::print_line`].
     pub(crate) fn print_lines(&self, lines: impl IntoIterator<Item = String>) {
         lines.into_iter().for_each(|it| self.print_line(&it));
     }

@@ -141,14 +141,14 @@ impl Evaluator {
     /// Evaluates the last checkpoint. Waits for the result up to an hour, or until the run is told to stop.
     pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
         let deadline = Instant::now() + LAST_EVALUATION_MAX;
-        let mut last = false;
+        let mut is_last_begun = false;
         loop {
             self.report_result(screen);
             if self.process.is_none() {
-                if last || !self.start_if_due(true, screen) {
+                if is_last_begun || !self.start_if_due(true, screen) {
                     return;
                 }
-                last = true;
+                is_last_begun = true;
                 screen.print_line("playing the last checkpoint (skip it with Ctrl-C)");
             }
             if abort() || Instant::now() > deadline {

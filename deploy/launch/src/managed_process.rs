@@ -101,10 +101,10 @@ impl ManagedProcess {
     /// Whether the process ended in a way that a restart may fix: it exited in order, a signal other than SIGABRT killed it, or it
     /// had run for longer than `EARLY_FAILURE_MAX`. SIGABRT comes from a broken invariant of our own.
     pub(crate) fn is_restartable(&mut self) -> bool {
-        let killed = |signal| signal != Signal::SIGABRT as i32;
+        let is_external = |signal| signal != Signal::SIGABRT as i32;
         let ran_long = self.started.elapsed() > EARLY_FAILURE_MAX;
         self.exit_status().is_some_and(|status| {
-            is_orderly_exit(status) || status.signal().is_some_and(killed) || ran_long
+            is_orderly_exit(status) || status.signal().is_some_and(is_external) || ran_long
         })
     }
 

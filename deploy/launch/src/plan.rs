@@ -39,7 +39,7 @@ pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
 /// The plan of a run that starts at `resume_point`, one fact per line.
 pub fn describe(
     config: &RunConfig,
-    from: &str,
+    source: &str,
     run_dir: &RunFolder,
     lockstep: bool,
     resume_point: ResumePoint,
@@ -63,7 +63,7 @@ pub fn describe(
     let note = |note: &String| format!("{:INDENT$}{note}\n", "note");
     let notes: String = config.notes.iter().map(note).collect();
     format!(
-        "trains      {agent} on {world}, seed {seed}, from {from}\n\
+        "trains      {agent} on {world}, seed {seed}, from {source}\n\
          frames      {frames} in all, with {updates} updates of {rows} rows (replay ratio {ratio})\n\
          processes   {processes}\n\
          replay      the newest {held} transitions, up to {bytes} of memory{disk}\n\

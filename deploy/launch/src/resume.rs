@@ -114,12 +114,12 @@ fn wait_until(
     why: &str,
 ) -> anyhow::Result<bool> {
     let started = Instant::now();
-    let mut said = false;
+    let mut is_reported = false;
     while !is_done()? {
         if started.elapsed() >= max {
             return Ok(false);
         }
-        if !std::mem::replace(&mut said, true) {
+        if !std::mem::replace(&mut is_reported, true) {
             console::eprintln(&format!("{why}: waiting"));
         }
         std::thread::sleep(WAIT_POLL);
@@ -159,16 +159,16 @@ fn check_changes(
         let why = usage!("world.{key} cannot change in a run: resume without this --set");
         bail!(why);
     }
-    let parts = |it: &RunConfig| (it.run.clone(), it.model.clone(), it.learner.clone());
-    if parts(before) != parts(config) {
+    let network_settings = |it: &RunConfig| (it.run.clone(), it.model.clone(), it.learner.clone());
+    if network_settings(before) != network_settings(config) {
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
         let compute = DeviceName::Cpu.open(config.learner.precision)?;
         Learner::resume(settings, &compute, &folder.checkpoints()).map_err(|e| usage!("{e}"))?;
     }
-    let (had, has) = (before.local.actors, config.local.actors);
-    if lockstep && had != has {
+    let (actors_before, actors) = (before.local.actors, config.local.actors);
+    if lockstep && actors_before != actors {
         bail!(usage!(
-            "local.actors = {has}, but this run in lockstep has {had}: resume with as many"
+            "local.actors = {actors}, but this run in lockstep has {actors_before}: resume with as many"
         ));
     }
     let replay = folder.replay();

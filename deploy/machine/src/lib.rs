@@ -1,7 +1,7 @@
 //! The hardware of this machine, cores, memory and devices, and what it lacks for a run.
 //!
 //! Start with [`resources::Machine`] for the sizes of a run, with [`doctor::examine`] for what is missing, and with
-//! [`device::ready_for`] before computing on a device. This crate starts no run and reads no settings. The program exits with
+//! [`device::check_device`] before computing on a device. This crate starts no run and reads no settings. The program exits with
 //! code 64 on an [`error::Usage`].
 //!
 //! ```

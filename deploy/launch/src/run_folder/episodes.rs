@@ -108,8 +108,8 @@ impl TrainingEpisodes {
         let frames: u64 = shards.iter().map(|it| it.transitions_inserted).sum();
         let mut warnings = Vec::new();
         if let Some((mut rows, unknown)) = self.rows_at_start.take() {
-            let cut = self.set_aside_after(&mut rows, frames);
-            warnings.extend(cut.err().map(|e| format!("{e:#}")));
+            let set_aside = self.set_aside_after(&mut rows, frames);
+            warnings.extend(set_aside.err().map(|e| format!("{e:#}")));
             self.set_received(shards, &rows, unknown);
         }
         // The new episodes ended after the last status; a shard may report fewer frames, as its count of the other shards is older.
@@ -175,9 +175,9 @@ impl TrainingEpisodes {
         let mut unreceived: u64 = shards.iter().map(|it| it.episodes).sum();
         unreceived = unreceived.saturating_sub(self.newest.saturating_sub(unknown));
         let received = shards.iter().zip(rows_of_shards).map(|(status, rows)| {
-            let here = unreceived.min(status.episodes.saturating_sub(rows));
-            unreceived -= here;
-            status.episodes - here
+            let new_here = unreceived.min(status.episodes.saturating_sub(rows));
+            unreceived -= new_here;
+            status.episodes - new_here
         });
         self.received = received.collect();
     }

@@ -62,9 +62,9 @@ impl RunRecorder {
         let header = header(config, &processes);
         let resume_point = resumed.unwrap_or_default();
         let earlier = BeforeReplay::read(folder);
-        let summarised = Summary::read(folder).map_or(0.0, |it| it.wall_seconds);
-        let noted = earlier.as_ref().map_or(0.0, |it| it.seconds);
-        let seconds_before = noted.max(summarised);
+        let seconds_summarised = Summary::read(folder).map_or(0.0, |it| it.wall_seconds);
+        let seconds_noted = earlier.as_ref().map_or(0.0, |it| it.seconds);
+        let seconds_before = seconds_noted.max(seconds_summarised);
         let kept = resume_point.replay_is_kept.then_some(earlier).transpose()?;
         let (rows, seconds) = match resumed {
             None => {

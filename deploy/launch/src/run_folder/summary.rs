@@ -216,11 +216,11 @@ impl Summary {
 
     /// How the run ended and what it counted, in one line.
     pub(crate) fn describe_counts(&self) -> String {
-        let (of, episodes) = (self.mean_return_of, self.episodes);
+        let (count, episodes) = (self.mean_return_of, self.episodes);
         let returns = match self.mean_return {
             None => "no episode ended".into(),
             Some(mean) => {
-                format!("mean return {mean:.2} over the last {of} of {episodes} episodes")
+                format!("mean return {mean:.2} over the last {count} of {episodes} episodes")
             }
         };
         let ratio = self.replay_ratio.map(|it| format!("{it:.2}"));

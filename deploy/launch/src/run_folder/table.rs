@@ -98,7 +98,7 @@ impl Table {
         is_kept: impl Fn(T) -> bool,
     ) -> anyhow::Result<bool> {
         let header = StringRecord::from(&self.header[..]);
-        let mut aside = Self {
+        let mut set_aside = Self {
             header: self.header.clone(),
             rows: Vec::new(),
         };
@@ -113,20 +113,20 @@ impl Table {
             })?;
             match is_kept(read) {
                 true => self.rows.push(row),
-                false => aside.rows.push(row),
+                false => set_aside.rows.push(row),
             }
         }
-        if aside.rows.is_empty() {
+        if set_aside.rows.is_empty() {
             return Ok(false);
         }
         let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
         let free = (1..).map(free).find(|it| !it.exists());
         let aside_path = free.context("no name is free beside the table")?;
-        write_atomically(&aside_path, &aside.to_csv())?;
+        write_atomically(&aside_path, &set_aside.to_csv())?;
         let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
         console::eprintln(&format!(
             "{} rows of {} are past the point where the run is resumed; they are now in {}",
-            aside.rows.len(),
+            set_aside.rows.len(),
             name(path),
             name(&aside_path)
         ));

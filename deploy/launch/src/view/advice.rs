@@ -25,15 +25,15 @@ fn server_statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &Proc
 /// The status of the learner and of all actors, each with the endpoint of the server that it is connected to.
 fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
     server_statuses(view)
-        .flat_map(|(server, account)| account.processes.iter().map(|it| (&*server.endpoint, it)))
+        .flat_map(|(server, status)| status.processes.iter().map(|it| (&*server.endpoint, it)))
 }
 
 /// Which side waits at the rate limiter, and for how long.
 pub(super) fn limiter_waits(view: &RunView) -> Vec<String> {
-    let limiter = |(_, account): (_, &ProcessesStatus)| match account.waiting {
+    let limiter = |(_, status): (_, &ProcessesStatus)| match status.waiting {
         Waiting::Neither => None,
-        Waiting::Finished => Some(account.waiting.to_string()),
-        waiting => Some(format!("{waiting} ({})", format_s(account.waiting_s))),
+        Waiting::Finished => Some(status.waiting.to_string()),
+        waiting => Some(format!("{waiting} ({})", format_s(status.waiting_s))),
     };
     let mut waits: Vec<_> = server_statuses(view).filter_map(limiter).collect();
     waits.dedup();
@@ -72,8 +72,8 @@ fn server_action(server: &ServerAnswer) -> Option<String> {
     })
 }
 
-fn disk_action((server, account): (&ServerAnswer, &ProcessesStatus)) -> Option<String> {
-    let log = account.log.as_ref()?;
+fn disk_action((server, status): (&ServerAnswer, &ProcessesStatus)) -> Option<String> {
+    let log = status.log.as_ref()?;
     let (since, why) = log.refused.as_ref()?;
     Some(format!(
         "the disk of the replay server on {} has rejected its replay for {} ({why}): make room for {}, or make it writable; the run then \

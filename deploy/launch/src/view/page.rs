@@ -48,18 +48,18 @@ pub(crate) fn status_page(view: &RunView) -> String {
     let mut notes = Vec::new();
     for server in &view.servers {
         rows.push(server_row(server, view.servers.len()));
-        let Some(account) = &server.processes else {
+        let Some(status) = &server.processes else {
             continue;
         };
-        let log = account.log.as_ref();
+        let log = status.log.as_ref();
         notes.extend(log.map(|log| log_line(server, log, view.servers.len())));
-        notes.extend(warning_note("replay-server", account.last_warning.as_ref()));
-        for process in account.processes.iter().take(ACTORS_MAX + 1) {
+        notes.extend(warning_note("replay-server", status.last_warning.as_ref()));
+        for process in status.processes.iter().take(ACTORS_MAX + 1) {
             rows.push(process_row(process));
             let who = process.who.to_string();
             notes.extend(warning_note(&who, process.last_warning.as_ref()));
         }
-        if let more @ 1.. = account.processes.len().saturating_sub(ACTORS_MAX + 1) {
+        if let more @ 1.. = status.processes.len().saturating_sub(ACTORS_MAX + 1) {
             rows.push(vec![format!("and {more} more actors")]);
         }
     }
@@ -88,9 +88,9 @@ fn warning_note(who: &str, warning: Option<&Warning>) -> Option<String> {
 }
 
 /// Describes the log of a replay server that keeps its replay on disk.
-fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
+fn log_line(server: &ServerAnswer, log: &LogStatus, server_count: usize) -> String {
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
-    let name = match of {
+    let name = match server_count {
         1 => "replay on disk".to_owned(),
         _ => format!("{}, replay on disk", server.endpoint),
     };
@@ -117,15 +117,15 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
     line
 }
 
-fn server_row(server: &ServerAnswer, of: usize) -> Vec<String> {
-    let name = match of {
+fn server_row(server: &ServerAnswer, server_count: usize) -> Vec<String> {
+    let name = match server_count {
         1 => "replay-server".to_owned(),
         _ => server.endpoint.clone(),
     };
     if let Some(progress) = server.recovering {
         return vec![name, "reads its replay back".into(), progress.to_string()];
     }
-    let Some(account) = &server.processes else {
+    let Some(status) = &server.processes else {
         let state = match server.is_gone {
             true => "has ended",
             false => "does not answer",
@@ -134,14 +134,14 @@ fn server_row(server: &ServerAnswer, of: usize) -> Vec<String> {
     };
     let does = format!(
         "{} chunks ({:.1} MiB) and {} requests wait",
-        account.chunks_waiting,
-        account.chunk_bytes_waiting as f64 / f64::from(1 << 20),
-        account.requests_waiting
+        status.chunks_waiting,
+        status.chunk_bytes_waiting as f64 / f64::from(1 << 20),
+        status.requests_waiting
     );
-    let weights = account.weights_age_s.map_or("none yet".into(), |age| {
-        format!("{}, {} old", account.weights_version, format_s(age))
+    let weights = status.weights_age_s.map_or("none yet".into(), |age| {
+        format!("{}, {} old", status.weights_version, format_s(age))
     });
-    let state = format!("up for {}", format_s(account.up_s));
+    let state = format!("up for {}", format_s(status.up_s));
     vec![name, state, does, String::new(), String::new(), weights]
 }
 

@@ -128,7 +128,7 @@ fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
 /// Waits until the replay servers have read their replay back and a learner has joined. Prints the progress; fails if they are silent.
 fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
-    let mut said = LogLimiter::default();
+    let mut limiter = LogLimiter::default();
     loop {
         let view = poller.poll();
         if view.servers_answered() && view.after_updates.is_some() {
@@ -138,7 +138,7 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
         if is_another_run || view.replay_silence.length() > silent_max {
             bail!("{}", actions_needed(view).join("; "));
         }
-        if said.due().is_some() {
+        if limiter.due().is_some() {
             for (server, progress) in view.recovering() {
                 console::eprintln(&describe_recovery(&server.name, progress));
             }

@@ -86,8 +86,8 @@ impl Report {
 }
 
 /// The names of the facts whose state is bad, joined by commas.
-fn names_where(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
-    let bad = facts.iter().filter(|fact| bad(fact.state));
+fn names_where(facts: &[Fact], is_bad: impl Fn(State) -> bool) -> String {
+    let bad = facts.iter().filter(|fact| is_bad(fact.state));
     let names: Vec<_> = bad.map(|fact| fact.what.as_str()).collect();
     names.join(", ")
 }

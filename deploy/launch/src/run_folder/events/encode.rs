@@ -67,9 +67,9 @@ fn histogram(counts: &[u64]) -> Vec<u8> {
         sum += value as f64 * n as f64;
         squares += (value * value) as f64 * n as f64;
     }
-    let counted = |(_, n): &(usize, &u64)| **n > 0;
-    let least = counts.iter().enumerate().find(counted);
-    let most = counts.iter().enumerate().rfind(counted);
+    let is_counted = |(_, n): &(usize, &u64)| **n > 0;
+    let least = counts.iter().enumerate().find(is_counted);
+    let most = counts.iter().enumerate().rfind(is_counted);
     let [least, most] = [(least, -0.5), (most, 0.5)]
         .map(|(found, half)| found.map_or(0.0, |(value, _)| value as f64 + half));
     let facts = [(1, least), (2, most), (3, total), (4, sum), (5, squares)];
