@@ -27,29 +27,29 @@ impl Cache {
 
     /// `DRIML_CACHE`, else `$XDG_CACHE_HOME/driml`, else `$HOME/.cache/driml`. Empty counts as not set.
     fn from_variables(get: impl Fn(&str) -> Option<OsString>) -> Result<Cache, ProcgenError> {
-        let set = |name: &str| get(name).filter(|value| !value.is_empty());
-        let below = |name: &str, path: &str| set(name).map(|it| PathBuf::from(it).join(path));
-        let folder = set("DRIML_CACHE")
+        let value_of = |name: &str| get(name).filter(|value| !value.is_empty());
+        let below = |name: &str, path: &str| value_of(name).map(|it| PathBuf::from(it).join(path));
+        let folder = value_of("DRIML_CACHE")
             .map(PathBuf::from)
             .or_else(|| below("XDG_CACHE_HOME", "driml"))
             .or_else(|| below("HOME", ".cache/driml"));
-        let none = "there is no folder for it: set DRIML_CACHE, XDG_CACHE_HOME or HOME";
+        let no_folder = "there is no folder for it: set DRIML_CACHE, XDG_CACHE_HOME or HOME";
         Ok(Cache {
-            folder: folder.ok_or_else(|| ProcgenError::Cache(none.to_owned()))?,
-            offline: set("DRIML_OFFLINE").is_some_and(|value| value != "0"),
+            folder: folder.ok_or_else(|| ProcgenError::Cache(no_folder.to_owned()))?,
+            offline: value_of("DRIML_OFFLINE").is_some_and(|value| value != "0"),
         })
     }
 }
 
 /// Checks that only this user and root can change the file or folder, as the engine runs as this user. A missing path passes.
 pub(crate) fn check_private(path: &Path) -> Result<(), ProcgenError> {
-    let Ok(data) = fs::metadata(path) else {
+    let Ok(metadata) = fs::metadata(path) else {
         return Ok(());
     };
-    let why = if data.uid() != 0 && data.uid() != geteuid().as_raw() {
-        format!("it belongs to user {}", data.uid())
-    } else if data.mode() & 0o022 != 0 {
-        format!("its permissions are {:o}", data.mode() & 0o777)
+    let why = if metadata.uid() != 0 && metadata.uid() != geteuid().as_raw() {
+        format!("it belongs to user {}", metadata.uid())
+    } else if metadata.mode() & 0o022 != 0 {
+        format!("its permissions are {:o}", metadata.mode() & 0o777)
     } else {
         return Ok(());
     };

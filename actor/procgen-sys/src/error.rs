@@ -15,12 +15,12 @@ pub enum ProcgenError {
     #[error(
         "procgen's engine in {}: {reason}; run with network access and without DRIML_OFFLINE, or fetch the wheel where there is a network \
          with `{}` and put it into {} {WITHOUT_ENGINE}",
-        .root.display(), .fetched_by, .root.parent().unwrap_or(.root).display()
+        .root.display(), .fetch_command, .root.parent().unwrap_or(.root).display()
     )]
     Missing {
         root: PathBuf,
         reason: String,
-        fetched_by: String,
+        fetch_command: String,
     },
     /// The cache folder cannot be used: no variable names it, or others can change it.
     #[error("procgen's engine has no safe place: {0} {WITHOUT_ENGINE}")]

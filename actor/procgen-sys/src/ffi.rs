@@ -76,16 +76,16 @@ const _: () = {
 };
 
 pub(crate) type Handle = *mut c_void;
-pub(crate) type Version = unsafe extern "C" fn() -> i32;
-pub(crate) type Make = unsafe extern "C" fn(i32, LibenvOptions) -> Handle;
+pub(crate) type VersionFn = unsafe extern "C" fn() -> i32;
+pub(crate) type MakeFn = unsafe extern "C" fn(i32, LibenvOptions) -> Handle;
 pub(crate) type GetTensortypes = unsafe extern "C" fn(Handle, u32, *mut LibenvTensortype) -> i32;
 pub(crate) type SetBuffers = unsafe extern "C" fn(Handle, *mut LibenvBuffers);
-pub(crate) type Unit = unsafe extern "C" fn(Handle);
+pub(crate) type HandleFn = unsafe extern "C" fn(Handle);
 pub(crate) type GetState = unsafe extern "C" fn(Handle, i32, *mut c_char, i32) -> i32;
 pub(crate) type SetState = unsafe extern "C" fn(Handle, i32, *mut c_char, i32);
 
 /// A name in the engine's fixed, NUL-terminated form. Panics on names that do not fit; ours are constants.
-pub(crate) fn name(text: &str) -> [c_char; NAME_BYTES] {
+pub(crate) fn option_name(text: &str) -> [c_char; NAME_BYTES] {
     assert!(
         text.len() < NAME_BYTES && text.is_ascii(),
         "\"{text}\" does not fit in an option's name"
@@ -111,12 +111,12 @@ impl LibenvTensortype {
         }
     }
 
-    /// Returns the tensor's name, dtype and shape in the form of [`describe`].
+    /// Returns the tensor's name, dtype and shape in the form of [`describe_tensor`].
     pub(crate) fn describe(&self) -> String {
         let bytes: Vec<u8> = self.name.iter().map(|&byte| byte as u8).collect();
         let name = bytes.split(|&byte| byte == 0).next().unwrap_or_default();
         let ndim = usize::try_from(self.ndim).unwrap_or(0).min(DIMENSIONS_MAX);
-        describe(
+        describe_tensor(
             &String::from_utf8_lossy(name),
             self.dtype,
             &self.shape[..ndim],
@@ -125,6 +125,6 @@ impl LibenvTensortype {
 }
 
 /// Returns the name, dtype and shape of a tensor in one line.
-pub(crate) fn describe(name: &str, dtype: u32, shape: &[i32]) -> String {
+pub(crate) fn describe_tensor(name: &str, dtype: u32, shape: &[i32]) -> String {
     format!("{name} (dtype {dtype}) {shape:?}")
 }

@@ -34,7 +34,7 @@ macro_rules! games {
             }
 
             /// Whether the game has this difficulty; the engine ends the process if not.
-            pub const fn has(self, mode: DistributionMode) -> bool {
+            pub const fn has_mode(self, mode: DistributionMode) -> bool {
                 match self {
                     $(Game::$Game => matches!(mode, Easy | Hard $(| $mode)*),)+
                 }

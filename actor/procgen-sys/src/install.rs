@@ -17,7 +17,7 @@ use crate::wheel::{self, LIBRARY_SHA256, WHEEL_NAME, WHEEL_SHA256};
 const PYTHON: &str = "python3";
 
 /// How long to wait for another process that installs; then this process installs too.
-const WAIT_MAX: Duration = Duration::from_secs(120);
+const LOCK_WAIT_MAX: Duration = Duration::from_secs(120);
 
 /// The unpacked engine.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -52,10 +52,10 @@ impl Engine {
     ///
     /// # Errors
     /// No pip, or `DRIML_OFFLINE=1` and no wheel in the cache folder.
-    pub fn source() -> Result<String, ProcgenError> {
+    pub fn describe_source() -> Result<String, ProcgenError> {
         let cache = Cache::from_env()?;
-        let provided = cache.provided("it is not installed")?;
-        wheel::pip(PYTHON, &["--version"])?;
+        let provided = cache.provided_wheel("it is not installed")?;
+        wheel::run_pip(PYTHON, &["--version"])?;
         Ok(provided.map_or_else(
             || "the package index with `python3 -m pip`".to_owned(),
             |wheel| wheel.display().to_string(),
@@ -68,7 +68,7 @@ impl Engine {
     ///
     /// # Errors
     /// The library or the pictures are missing, or this machine cannot run the engine.
-    pub fn other(library: &Path) -> Result<Engine, ProcgenError> {
+    pub fn from_library(library: &Path) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         // The loader would look for a name without a folder among the system's libraries.
         let library =
@@ -115,7 +115,7 @@ impl Engine {
             }
             return Ok(engine);
         };
-        Err(cache.missing(reason))
+        Err(cache.missing_error(reason))
     }
 
     fn install_in(
@@ -128,10 +128,10 @@ impl Engine {
             Err(ProcgenError::Missing { reason, .. }) => reason,
             other => return other,
         };
-        let provided = cache.provided(&reason)?;
+        let provided = cache.provided_wheel(&reason)?;
         check_private(&cache.folder)?;
         wheel::make_folder(&cache.folder)?;
-        let _turn = wait_for_turn(cache, WAIT_MAX);
+        let _lock = lock_install(cache, LOCK_WAIT_MAX);
         // Another process may have been faster.
         if let Ok(engine) = Engine::locate_in(cache) {
             return Ok(engine);
@@ -141,14 +141,14 @@ impl Engine {
             .tempdir_in(&cache.folder)
             .map_err(ProcgenError::io("making a folder in", &cache.folder))?;
         let root = cache.root();
-        let (fresh, into) = (folder.path().join("fresh"), root.display());
+        let (fresh, target) = (folder.path().join("fresh"), root.display());
         if let Some(wheel) = &provided {
             let from = wheel.display();
-            progress(&format!("procgen's engine: unpacking {from} into {into}"));
+            progress(&format!("procgen's engine: unpacking {from} into {target}"));
             wheel::check_hash(wheel, WHEEL_SHA256)?;
         } else {
             progress(&format!(
-                "procgen's engine: {reason}; fetching it with pip (36 MB) into {into}"
+                "procgen's engine: {reason}; fetching it with pip (36 MB) into {target}"
             ));
         }
         unpack(&fresh, provided.is_some().then_some(&*cache.folder))?;
@@ -171,22 +171,22 @@ impl Cache {
         self.folder.join("procgen-0.10.7")
     }
 
-    fn missing(&self, reason: &str) -> ProcgenError {
+    fn missing_error(&self, reason: &str) -> ProcgenError {
         ProcgenError::Missing {
             root: self.root(),
             reason: reason.to_owned(),
-            fetched_by: wheel::command_for_people(),
+            fetch_command: wheel::fetch_command(),
         }
     }
 
     /// Returns the wheel that the user has put into the cache folder. Returns an error if it is missing and fetching is forbidden.
-    fn provided(&self, reason: &str) -> Result<Option<PathBuf>, ProcgenError> {
+    fn provided_wheel(&self, reason: &str) -> Result<Option<PathBuf>, ProcgenError> {
         let provided = self.folder.join(WHEEL_NAME);
         if provided.is_file() {
             return Ok(Some(provided));
         }
         match self.offline {
-            true => Err(self.missing(&format!(
+            true => Err(self.missing_error(&format!(
                 "{reason}, and DRIML_OFFLINE=1 forbids fetching it"
             ))),
             false => Ok(None),
@@ -198,7 +198,7 @@ impl Cache {
 ///
 /// Returns `None` if the file cannot be locked or the limit has passed: then two processes may install at once, which
 /// wastes time, and at worst one of them reports an error.
-fn wait_for_turn(cache: &Cache, limit: Duration) -> Option<File> {
+fn lock_install(cache: &Cache, limit: Duration) -> Option<File> {
     let file = File::create(cache.folder.join("install.lock")).ok()?;
     let started = Instant::now();
     loop {
@@ -242,7 +242,7 @@ mod tests {
     }
 
     /// The names of all that lies in the cache folder, except the wheel, sorted.
-    fn left(cache: &Cache) -> Vec<String> {
+    fn file_names(cache: &Cache) -> Vec<String> {
         let entries = fs::read_dir(&cache.folder).unwrap();
         let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
         let mut names: Vec<String> = names.filter(|name| name != WHEEL_NAME).collect();
@@ -268,7 +268,7 @@ mod tests {
                     assert!(engine.assets().join("b/c.png").is_file());
                 }
             });
-            assert_eq!(left(&cache), ["install.lock", "procgen-0.10.7"]);
+            assert_eq!(file_names(&cache), ["install.lock", "procgen-0.10.7"]);
         }
     }
 
@@ -324,7 +324,7 @@ mod tests {
         assert!(error.contains(&text), "{error}");
         fs::write(cache.folder.join(WHEEL_NAME), b"no wheel").unwrap();
         says(&cache, 1, &format!("expected {WHEEL_SHA256}"));
-        assert_eq!(left(&cache), ["install.lock"]);
+        assert_eq!(file_names(&cache), ["install.lock"]);
         // A cache folder that cannot be written: a file is in its place.
         cache.folder = cache.folder.join("install.lock");
         says(&cache, 0, "installing procgen's engine: making ");
@@ -334,11 +334,11 @@ mod tests {
     fn one_process_installs_and_the_others_wait_for_it() {
         let folder = tempfile::tempdir().unwrap();
         let cache = cache_in(folder.path());
-        let turn = wait_for_turn(&cache, Duration::ZERO);
-        assert!(turn.is_some());
-        assert!(wait_for_turn(&cache, Duration::from_millis(120)).is_none());
-        drop(turn);
+        let lock = lock_install(&cache, Duration::ZERO);
+        assert!(lock.is_some());
+        assert!(lock_install(&cache, Duration::from_millis(120)).is_none());
+        drop(lock);
         // A child that another test has just forked holds the lock until it runs its program.
-        assert!(wait_for_turn(&cache, Duration::from_secs(60)).is_some());
+        assert!(lock_install(&cache, Duration::from_secs(60)).is_some());
     }
 }

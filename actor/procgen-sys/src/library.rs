@@ -9,17 +9,17 @@ use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 
 use crate::error::ProcgenError;
 use crate::ffi::{
-    GetState, GetTensortypes, LIBENV_VERSION, Make, SetBuffers, SetState, Unit, Version,
+    GetState, GetTensortypes, HandleFn, LIBENV_VERSION, MakeFn, SetBuffers, SetState, VersionFn,
 };
 
 /// The engine's functions. They stay valid for the rest of the process.
 pub(crate) struct Api {
-    pub(crate) make: Make,
+    pub(crate) make: MakeFn,
     pub(crate) get_tensortypes: GetTensortypes,
     pub(crate) set_buffers: SetBuffers,
-    pub(crate) observe: Unit,
-    pub(crate) act: Unit,
-    pub(crate) close: Unit,
+    pub(crate) observe: HandleFn,
+    pub(crate) act: HandleFn,
+    pub(crate) close: HandleFn,
     pub(crate) get_state: GetState,
     pub(crate) set_state: SetState,
 }
@@ -27,7 +27,7 @@ pub(crate) struct Api {
 const GLIB: &str = "libglib2.0-0` or, since Debian 13 and Ubuntu 24.04, `libglib2.0-0t64";
 
 /// The libraries that the engine needs: file, Debian package, Fedora package.
-const PACKAGES: [(&str, &str, &str); 6] = [
+const LIBRARIES: [(&str, &str, &str); 6] = [
     ("libglib-2.0.so.0", GLIB, "glib2"),
     ("libgthread-2.0.so.0", GLIB, "glib2"),
     ("libz.so.1", "zlib1g", "zlib-ng-compat"),
@@ -44,7 +44,7 @@ pub(crate) fn load(path: &Path) -> Result<&'static Api, ProcgenError> {
     if let Some(api) = loaded.get(path) {
         return Ok(api);
     }
-    let api: &'static Api = Box::leak(Box::new(open(path)?));
+    let api: &'static Api = Box::leak(Box::new(open_library(path)?));
     loaded.insert(path.to_owned(), api);
     Ok(api)
 }
@@ -67,13 +67,13 @@ pub(crate) fn check_machine() -> Result<(), ProcgenError> {
     Ok(())
 }
 
-fn open(path: &Path) -> Result<Api, ProcgenError> {
+fn open_library(path: &Path) -> Result<Api, ProcgenError> {
     // SAFETY: loading runs the library's initialisers, which are trusted. Either the library's hash was compared with
     // the pinned one at its installation, and only this user can change it since, or the user has named another build.
     let library = unsafe { Library::open(Some(path), RTLD_NOW | RTLD_LOCAL) };
-    let library = library.map_err(|error| explain(path, &error.to_string()))?;
+    let library = library.map_err(|error| load_error(path, &error.to_string()))?;
     // SAFETY: the types are those of gym3's `libenv.h`, and the version is checked before any other function is called.
-    let found = unsafe { functions(&library) };
+    let found = unsafe { find_functions(&library) };
     let (version, api) = found.map_err(|error| ProcgenError::library(path, error))?;
     // Keep it loaded for the rest of the process, so that the function pointers stay valid.
     std::mem::forget(library);
@@ -89,7 +89,7 @@ fn open(path: &Path) -> Result<Api, ProcgenError> {
 
 /// # Safety
 /// The library's functions have the types of `ffi`, and are called only while it is loaded.
-unsafe fn functions(library: &Library) -> Result<(Version, Api), libloading::Error> {
+unsafe fn find_functions(library: &Library) -> Result<(VersionFn, Api), libloading::Error> {
     // SAFETY: the caller vouches for the types.
     unsafe {
         let api = Api {
@@ -107,21 +107,21 @@ unsafe fn functions(library: &Library) -> Result<(Version, Api), libloading::Err
 }
 
 /// Turns an error of `dlopen` into an error that says what to do.
-fn explain(path: &Path, said: &str) -> ProcgenError {
-    let is_missing = |library: &str| said.contains(library) && said.contains("cannot open shared");
-    let missing = PACKAGES.iter().find(|(library, ..)| is_missing(library));
+fn load_error(path: &Path, text: &str) -> ProcgenError {
+    let is_missing = |library: &str| text.contains(library) && text.contains("cannot open shared");
+    let missing = LIBRARIES.iter().find(|(library, ..)| is_missing(library));
     let reason = if let Some((library, debian, fedora)) = missing {
         format!(
             "the system library {library} is missing; install it with `apt-get install {debian}` (Debian, Ubuntu) or `dnf install {fedora}` \
              (Fedora)"
         )
-    } else if said.contains("GLIBC") && said.contains("not found") {
+    } else if text.contains("GLIBC") && text.contains("not found") {
         format!(
             "this system's C or C++ library is too old, it needs glibc 2.17 and libstdc++ of gcc 4.6 or later; use a newer distribution; \
-             the loader said: {said}"
+             the loader said: {text}"
         )
     } else {
-        said.to_owned()
+        text.to_owned()
     };
     ProcgenError::library(path, reason)
 }
@@ -157,7 +157,7 @@ mod tests {
                 &["engine from /cache/libenv.so: ", "file too short"],
             ),
         ] {
-            let text = explain(Path::new("/cache/libenv.so"), &said).to_string();
+            let text = load_error(Path::new("/cache/libenv.so"), &said).to_string();
             assert!(text.ends_with(WITHOUT_ENGINE), "{text}");
             assert!(texts.iter().all(|it| text.contains(it)), "{text}");
         }

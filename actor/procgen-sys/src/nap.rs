@@ -14,12 +14,12 @@ const NAP_MIN: Duration = Duration::from_micros(100);
 #[derive(Debug, Default)]
 pub(crate) struct Nap {
     /// The estimated duration of a fast step; `None` before the first step.
-    step: Option<Duration>,
+    estimate: Option<Duration>,
 }
 
 impl Nap {
     /// Sleeps for the nap, if there is one; a step that has just begun takes longer than it.
-    pub(crate) fn take(&self) {
+    pub(crate) fn sleep(&self) {
         if let Some(duration) = self.duration() {
             std::thread::sleep(duration);
         }
@@ -27,13 +27,13 @@ impl Nap {
 
     /// Updates the estimate by the duration of a step, including the nap. A step that makes levels takes longer, so one
     /// step raises the estimate by at most an eighth.
-    pub(crate) fn learn(&mut self, took: Duration) {
-        let step = self.step.map_or(took, |step| took.min(step + step / 8));
-        self.step = Some(step);
+    pub(crate) fn update(&mut self, took: Duration) {
+        let estimate = self.estimate.map_or(took, |it| took.min(it + it / 8));
+        self.estimate = Some(estimate);
     }
 
     fn duration(&self) -> Option<Duration> {
-        self.step.map(|step| step / 2).filter(|nap| *nap >= NAP_MIN)
+        self.estimate.map(|it| it / 2).filter(|nap| *nap >= NAP_MIN)
     }
 }
 
@@ -56,7 +56,7 @@ mod tests {
             (&[400, 150], None),
         ] {
             let mut nap = Nap::default();
-            steps.iter().for_each(|&step| nap.learn(us(step)));
+            steps.iter().for_each(|&step| nap.update(us(step)));
             assert_eq!(nap.duration(), duration, "{steps:?}");
         }
     }
@@ -64,12 +64,12 @@ mod tests {
     #[test]
     fn a_nap_that_was_too_long_is_halved_until_it_is_not() {
         let mut nap = Nap::default();
-        nap.learn(us(64_000));
+        nap.update(us(64_000));
         let mut steps = 0;
         while let Some(slept) = nap.duration()
             && slept > us(300)
         {
-            nap.learn(slept.max(us(600)));
+            nap.update(slept.max(us(600)));
             steps += 1;
         }
         assert_eq!((nap.duration(), steps), (Some(us(300)), 7));

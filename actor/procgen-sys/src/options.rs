@@ -67,8 +67,8 @@ impl Options {
             format!(
                 "start_level = {start_level} has no effect with num_levels = 0 (every level); set one of them otherwise"
             )
-        } else if !game.has(mode) {
-            let games = Game::ALL.into_iter().filter(|game| game.has(mode));
+        } else if !game.has_mode(mode) {
+            let games = Game::ALL.into_iter().filter(|game| game.has_mode(mode));
             let games: Vec<&str> = games.map(Game::name).collect();
             format!(
                 "{game} has no distribution mode \"{mode}\"; easy and hard work, and these games have that one: {}",
@@ -83,7 +83,7 @@ impl Options {
 
 /// Passes checked settings to `make` in the engine's layout, which is valid until `make` returns. `resource_root` is
 /// the folder of the pictures, with a slash at its end.
-pub(crate) fn lay_out<T>(
+pub(crate) fn with_raw_options<T>(
     options: &Options,
     resource_root: &str,
     make: impl FnOnce(LibenvOptions) -> T,
@@ -91,15 +91,15 @@ pub(crate) fn lay_out<T>(
     let text = |value: &str| (DTYPE_UINT8, value.len(), value.as_bytes().to_vec());
     let int = |value: i32| (DTYPE_INT32, 1, value.to_ne_bytes().to_vec());
     let flag = |value: bool| (DTYPE_UINT8, 1, vec![u8::from(value)]);
-    let i32 = |number: usize| i32::try_from(number).expect("validated to be small");
+    let to_i32 = |number: usize| i32::try_from(number).expect("validated to be small");
     let mut table = [
         ("env_name", text(options.game.name())),
         ("resource_root", text(resource_root)),
         ("num_levels", int(options.num_levels)),
         ("start_level", int(options.start_level)),
-        ("num_actions", int(i32(NUM_ACTIONS))),
+        ("num_actions", int(to_i32(NUM_ACTIONS))),
         ("rand_seed", int(options.rand_seed)),
-        ("num_threads", int(i32(options.num_threads))),
+        ("num_threads", int(to_i32(options.num_threads))),
         ("debug_mode", int(0)),
         ("distribution_mode", int(options.distribution_mode as i32)),
         ("render_human", flag(false)),
@@ -114,14 +114,14 @@ pub(crate) fn lay_out<T>(
     let mut items = table
         .each_mut()
         .map(|(name, (dtype, count, value))| LibenvOption {
-            name: ffi::name(name),
+            name: ffi::option_name(name),
             dtype: *dtype,
-            count: i32(*count),
+            count: to_i32(*count),
             data: value.as_mut_ptr().cast::<c_void>(),
         });
     make(LibenvOptions {
         items: items.as_mut_ptr(),
-        count: i32(items.len()),
+        count: to_i32(items.len()),
     })
 }
 
@@ -169,7 +169,7 @@ mod tests {
 
     #[test]
     fn values_lie_where_the_items_point() {
-        let values = lay_out(&OPTIONS, "/somewhere/", |raw| {
+        let values = with_raw_options(&OPTIONS, "/somewhere/", |raw| {
             // SAFETY: `raw.items` has `raw.count` items, which are valid until this closure returns.
             let items = unsafe { std::slice::from_raw_parts(raw.items, raw.count as usize) };
             // SAFETY: no caller reads more bytes than the item's value has.

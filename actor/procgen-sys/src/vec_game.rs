@@ -26,7 +26,7 @@ pub const RESET: i32 = -1;
 
 /// The first size of a state's buffer, in bytes; doubled when a state takes more than half. The engine ends the process
 /// if a state does not fit; states seen are below 100 kB.
-const STATE_BYTES: usize = 1 << 20;
+const STATE_BYTES_START: usize = 1 << 20;
 
 /// An environment's complete state, as the engine wrote it. The engine trusts what it reads back: a forged one may end
 /// the process, so load states from your own files alone.
@@ -49,7 +49,7 @@ pub struct VecGame {
     handle: Handle,
     game: Game,
     num_envs: usize,
-    state_bytes: usize,
+    state_capacity: usize,
     /// The sleep before waiting for the engine's threads; `None` if the calling thread steps.
     nap: Option<Nap>,
     // The engine keeps the addresses of all of these until `close`, which `Drop` calls before they are freed.
@@ -89,7 +89,7 @@ impl VecGame {
         };
         let n = options.num_envs;
         let num_envs = i32::try_from(n).expect("validated to be small");
-        let handle = options::lay_out(options, &resource_root, |raw| {
+        let handle = options::with_raw_options(options, &resource_root, |raw| {
             // SAFETY: the settings were validated, are laid out as the engine reads them, and live until after the call.
             unsafe { (api.make)(num_envs, raw) }
         });
@@ -101,7 +101,7 @@ impl VecGame {
             handle,
             game: options.game,
             num_envs: n,
-            state_bytes: STATE_BYTES,
+            state_capacity: STATE_BYTES_START,
             nap: (options.num_threads > 0).then(Nap::default),
             frames: Pinned::new(0, n * FRAME_BYTES),
             rewards: Pinned::new(0.0, n),
@@ -111,7 +111,7 @@ impl VecGame {
             level_seed: Pinned::new(0, n),
             actions: Pinned::new(0, n),
         };
-        game.check_types()?;
+        game.check_tensors()?;
         game.set_buffers();
         Ok(game)
     }
@@ -157,15 +157,15 @@ impl VecGame {
     /// Not N actions, or one out of range; nothing was stepped.
     pub fn act(&mut self, actions: &[i32]) -> Result<(), ProcgenError> {
         let (n, game) = (self.num_envs, self.game);
-        let wrong = |text| Err(ProcgenError::Action(text));
+        let error = |text| Err(ProcgenError::Action(text));
         let count = actions.len();
         if count != n {
-            return wrong(format!("{count} actions for {n} environments of {game}"));
+            return error(format!("{count} actions for {n} environments of {game}"));
         }
         let valid = RESET..NUM_ACTIONS as i32;
         if let Some(env) = actions.iter().position(|action| !valid.contains(action)) {
             let action = actions[env];
-            return wrong(format!(
+            return error(format!(
                 "action {action} for environment {env} of {game}; 0 to 14 exist"
             ));
         }
@@ -175,23 +175,23 @@ impl VecGame {
         // SAFETY: the handle is open, the buffers are set, and no reference into them is alive thanks to `&mut self`.
         unsafe { (self.api.act)(self.handle) };
         if let Some(nap) = &self.nap {
-            nap.take();
+            nap.sleep();
         }
         // SAFETY: as for `act`. It returns once every environment is stepped, so that nothing is written after this.
         unsafe { (self.api.observe)(self.handle) };
         if let Some(nap) = &mut self.nap {
-            nap.learn(started.elapsed());
+            nap.update(started.elapsed());
         }
         Ok(())
     }
 
     /// Returns the complete state of environment `env`, including its level and generators.
     pub fn state(&mut self, env: usize) -> Result<State, ProcgenError> {
-        let index = self.index(env)?;
-        let mut bytes = vec![0_u8; self.state_bytes];
+        let index = self.env_index(env)?;
+        let mut bytes = vec![0_u8; self.state_capacity];
         // The engine may write 4 bytes past the length it is told (`write_string` forgets its own prefix).
         let len =
-            i32::try_from(self.state_bytes - 8).expect("doubled from 1 MiB with a limit below");
+            i32::try_from(self.state_capacity - 8).expect("doubled from 1 MiB with a limit below");
         // SAFETY: the handle is open, `index` is one of its environments, and `bytes` is longer than `len`.
         let used =
             unsafe { (self.api.get_state)(self.handle, index, bytes.as_mut_ptr().cast(), len) };
@@ -200,8 +200,8 @@ impl VecGame {
         let used = used.ok_or_else(|| {
             ProcgenError::Unexpected("it wrote a state of an impossible size".to_owned())
         })?;
-        if used > self.state_bytes / 2 && self.state_bytes < 1 << 28 {
-            self.state_bytes *= 2;
+        if used > self.state_capacity / 2 && self.state_capacity < 1 << 28 {
+            self.state_capacity *= 2;
         }
         bytes.truncate(used);
         bytes.shrink_to_fit();
@@ -213,7 +213,7 @@ impl VecGame {
 
     /// Puts environment `env` into a state of the same game; its frame, reward and flags become those of that state.
     pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
-        let index = self.index(env)?;
+        let index = self.env_index(env)?;
         if state.game != self.game {
             return Err(ProcgenError::State(format!(
                 "a state of {} for an environment of {}",
@@ -228,7 +228,7 @@ impl VecGame {
         Ok(())
     }
 
-    fn index(&self, env: usize) -> Result<i32, ProcgenError> {
+    fn env_index(&self, env: usize) -> Result<i32, ProcgenError> {
         if env >= self.num_envs {
             return Err(ProcgenError::State(format!(
                 "environment {env} of {} environments of {}",
@@ -239,10 +239,10 @@ impl VecGame {
     }
 
     /// Checks that the engine has exactly the tensors for which the buffers above are made.
-    fn check_types(&self) -> Result<(), ProcgenError> {
+    fn check_tensors(&self) -> Result<(), ProcgenError> {
         let side = FRAME_SIDE as i32;
-        let frame = ffi::describe("rgb", DTYPE_UINT8, &[side, side, 3]);
-        let number = |name, dtype| ffi::describe(name, dtype, &[]);
+        let frame = ffi::describe_tensor("rgb", DTYPE_UINT8, &[side, side, 3]);
+        let number = |name, dtype| ffi::describe_tensor(name, dtype, &[]);
         let infos = [
             number("prev_level_seed", DTYPE_INT32),
             number("prev_level_complete", DTYPE_UINT8),
@@ -272,15 +272,15 @@ impl VecGame {
 
     /// Tells the engine where to read and write, which also does the first reset. Call this once only.
     fn set_buffers(&self) {
-        let each = |address: &dyn Fn(usize) -> *mut c_void| {
+        let per_env = |address: &dyn Fn(usize) -> *mut c_void| {
             (0..self.num_envs).map(address).collect::<Vec<_>>()
         };
-        let mut ob = each(&|env| self.frames.address(env * FRAME_BYTES).cast());
-        let mut ac = each(&|env| self.actions.address(env).cast());
-        // In the order of the tensors that `check_types` has seen.
-        let mut info = each(&|env| self.prev_level_seed.address(env).cast());
-        info.extend(each(&|env| self.prev_level_complete.address(env).cast()));
-        info.extend(each(&|env| self.level_seed.address(env).cast()));
+        let mut ob = per_env(&|env| self.frames.address(env * FRAME_BYTES).cast());
+        let mut ac = per_env(&|env| self.actions.address(env).cast());
+        // In the order of the tensors that `check_tensors` has seen.
+        let mut info = per_env(&|env| self.prev_level_seed.address(env).cast());
+        info.extend(per_env(&|env| self.prev_level_complete.address(env).cast()));
+        info.extend(per_env(&|env| self.level_seed.address(env).cast()));
         let mut buffers = LibenvBuffers {
             ob: ob.as_mut_ptr(),
             rew: self.rewards.address(0),
@@ -289,7 +289,7 @@ impl VecGame {
             ac: ac.as_mut_ptr(),
         };
         // SAFETY: every address lies in memory that `self` keeps in place until the handle is closed, with the sizes
-        // that `check_types` has confirmed; the engine copies the pointer arrays. No reference into the buffers is
+        // that `check_tensors` has confirmed; the engine copies the pointer arrays. No reference into the buffers is
         // alive, and `observe` returns once the first frames are written.
         unsafe {
             (self.api.set_buffers)(self.handle, &raw mut buffers);

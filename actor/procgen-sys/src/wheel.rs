@@ -24,7 +24,7 @@ pub(crate) const LIBRARY_SHA256: &str =
     "f44786431a902e9ae1a32cd44f4aa650f4bdad893240a322e49e6098d6a7a2ea";
 
 /// The files of the wheel that the engine needs, and their names where they are installed.
-const NEEDED: [(&str, &str); 3] = [
+const ENGINE_FILES: [(&str, &str); 3] = [
     ("procgen/data/prebuilt/libenv.so", "libenv.so"),
     ("procgen/data/assets", "assets"),
     ("procgen-0.10.7.dist-info/LICENSE", "LICENSE"),
@@ -40,35 +40,35 @@ const PIP_LIMITS: &str = "--timeout 30 --retries 2 --no-input --disable-pip-vers
 const OUTPUT_LINES_MAX: usize = 6;
 
 /// The command that fetches the wheel into the current folder, for people.
-pub(crate) fn command_for_people() -> String {
+pub(crate) fn fetch_command() -> String {
     format!("python3 -m pip download procgen==0.10.7 {PIP_SELECTION}")
 }
 
 /// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. pip
 /// takes the wheel from the folder `provided`, else from the package index, and checks its hash.
 pub(crate) fn unpack(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
-    let [all, pins] = ["wheel", "txt"].map(|extension| to.with_extension(extension));
+    let [target, pins] = ["wheel", "txt"].map(|extension| to.with_extension(extension));
     let text = format!("procgen==0.10.7 --hash=sha256:{WHEEL_SHA256}\n");
     fs::write(&pins, text).map_err(ProcgenError::io("writing", &pins))?;
-    let [all_text, pins] = [&all, &pins].map(|path| path.display().to_string());
+    let [target_text, pins] = [&target, &pins].map(|path| path.display().to_string());
     let mut arguments = vec!["install", "--no-compile", "--require-hashes", "-r", &pins];
-    arguments.extend(["--target", &all_text]);
+    arguments.extend(["--target", &target_text]);
     arguments.extend(PIP_SELECTION.split(' ').chain(PIP_LIMITS.split(' ')));
     let provided = provided.map(|folder| folder.display().to_string());
     if let Some(folder) = &provided {
         arguments.extend(["--no-index", "--find-links", folder]);
     }
-    let output = pip(python, &arguments)?;
+    let output = run_pip(python, &arguments)?;
     if output.status.success() {
         make_folder(to)?;
-        for (path, name) in NEEDED {
-            let path = all.join(path);
+        for (path, name) in ENGINE_FILES {
+            let path = target.join(path);
             fs::rename(&path, to.join(name)).map_err(ProcgenError::io("moving", &path))?;
         }
         return Ok(());
     }
-    let said = String::from_utf8_lossy(&output.stderr);
-    let lines = said.lines().filter(|line| !line.trim().is_empty());
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    let lines = stderr.lines().filter(|line| !line.trim().is_empty());
     let lines: Vec<&str> = lines.collect();
     let last = &lines[lines.len().saturating_sub(OUTPUT_LINES_MAX)..];
     Err(ProcgenError::Fetch(format!(
@@ -79,7 +79,7 @@ pub(crate) fn unpack(python: &str, to: &Path, provided: Option<&Path>) -> Result
 }
 
 /// Runs pip with these arguments and returns its output. Returns an error if Python or pip is missing.
-pub(crate) fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
+pub(crate) fn run_pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
     // Other users must not be able to change the files that pip writes, whatever the caller's umask.
     let mut command = Command::new("sh");
     command.args(["-c", "umask 022; exec \"$@\"", "sh", python, "-m", "pip"]);
@@ -118,8 +118,8 @@ pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), ProcgenError
 
 /// Makes a folder, and its parents, in which other users cannot change anything.
 pub(crate) fn make_folder(path: &Path) -> Result<(), ProcgenError> {
-    let made = DirBuilder::new().recursive(true).mode(0o755).create(path);
-    made.map_err(ProcgenError::io("making", path))
+    let created = DirBuilder::new().recursive(true).mode(0o755).create(path);
+    created.map_err(ProcgenError::io("making", path))
 }
 
 #[cfg(test)]

@@ -187,7 +187,7 @@ fn time_limits_are_the_engines() {
     use DistributionMode::{Easy, Extreme, Hard, Memory};
     for game in Game::ALL {
         let modes = [Easy, Hard, Extreme, Memory].into_iter();
-        for mode in modes.filter(|mode| game.has(*mode)) {
+        for mode in modes.filter(|mode| game.has_mode(*mode)) {
             let options = Options {
                 num_envs: 1,
                 distribution_mode: mode,

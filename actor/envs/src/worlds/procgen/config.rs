@@ -60,7 +60,7 @@ impl ProcgenConfig {
     /// Returns the engine: the build that `library` names, or the published one, which is fetched if it is not installed.
     pub(super) fn engine(&self, progress: &mut dyn FnMut(&str)) -> Result<Engine, EnvError> {
         let engine = match &self.library {
-            Some(library) => Engine::other(Path::new(library)),
+            Some(library) => Engine::from_library(Path::new(library)),
             None => Engine::install(progress),
         };
         Ok(engine?)
