@@ -104,7 +104,7 @@ impl Collector {
             )));
         }
         let rng = ChaCha8Rng::from_seed(incarnation.seed(spec, "exploration"));
-        let world = RestrictedWorld::of(world, actions, sent).map_err(no_world)?;
+        let world = RestrictedWorld::wrap(world, actions, sent).map_err(no_world)?;
         let enlarge = settings.input.resizer(sent, &settings.model)?;
         let policy = NetworkPolicy::new(&settings.model, enlarge, safetensors, config.precision)?;
         Ok(Self {

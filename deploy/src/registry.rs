@@ -15,13 +15,13 @@ pub struct Registry {
 }
 
 impl Registry {
-    /// Adds the world with settings `S`, for `--env NAME`. `preset` is its layer of settings in TOML (see [`CustomKind::of`]).
+    /// Adds the world with settings `S`, for `--env NAME`. `preset` is its layer of settings in TOML (see [`CustomKind::new`]).
     #[must_use]
     pub fn world<S>(mut self, name: &'static str, preset: &'static str) -> Self
     where
         S: WorldSettings + DeserializeOwned + Send + Sync + 'static,
     {
-        self.worlds.push(CustomKind::of::<S>(name, preset));
+        self.worlds.push(CustomKind::new::<S>(name, preset));
         self
     }
 

@@ -11,36 +11,36 @@ use crate::saved;
 use crate::settings::WorldSettings;
 
 /// One environment of a world whose environments are stepped one by one.
-pub trait Env: Send + Sized {
+pub trait SingleEnv: Send + Sized {
     /// The settings that all environments of a world share.
     type Config: WorldSettings + Clone + Send;
 
     /// The state of an environment that does not follow from the settings.
-    type Saved: Serialize + DeserializeOwned;
+    type State: Serialize + DeserializeOwned;
 
     /// Creates environment number `env` of a world with this seed, at its first frame. The settings must be valid.
     fn new(config: &Self::Config, seed: u64, env: usize) -> Result<Self, EnvError>;
 
     /// Writes the current frame [H, W, C].
-    fn draw(&self, config: &Self::Config, frame: &mut [u8]);
+    fn render(&self, config: &Self::Config, frame: &mut [u8]);
 
     /// Takes a valid action and returns its reward and end. Resets the environment if its episode ended.
     fn act(&mut self, config: &Self::Config, action: u8) -> (f32, StepEnd);
 
     /// Returns the state to save.
-    fn saved(&self) -> Self::Saved;
+    fn state(&self) -> Self::State;
 
     /// Restores the state that another environment saved.
-    fn restore(&mut self, config: &Self::Config, saved: Self::Saved) -> Result<(), EnvError>;
+    fn restore(&mut self, config: &Self::Config, state: Self::State) -> Result<(), EnvError>;
 }
 
 /// A world of environments that are stepped one by one.
-pub struct Envs<E: Env> {
+pub struct SerialWorld<E: SingleEnv> {
     config: E::Config,
     pub(crate) envs: Vec<E>,
 }
 
-impl<E: Env> Envs<E> {
+impl<E: SingleEnv> SerialWorld<E> {
     /// Creates `num_envs` environments; environment i depends on (`seed`, i) and its actions only.
     ///
     /// # Errors
@@ -56,7 +56,7 @@ impl<E: Env> Envs<E> {
     }
 }
 
-impl<E: Env> Environment for Envs<E> {
+impl<E: SingleEnv> Environment for SerialWorld<E> {
     fn frame_shape(&self) -> FrameShape {
         self.config.frame_shape()
     }
@@ -74,7 +74,7 @@ impl<E: Env> Environment for Envs<E> {
         check_frames(frames, self.num_envs(), shape);
         let frames = frames.chunks_exact_mut(shape.bytes());
         for (env, frame) in self.envs.iter().zip(frames) {
-            env.draw(&self.config, frame);
+            env.render(&self.config, frame);
         }
     }
 
@@ -92,15 +92,15 @@ impl<E: Env> Environment for Envs<E> {
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        let envs: Vec<_> = self.envs.iter().map(E::saved).collect();
+        let envs: Vec<_> = self.envs.iter().map(E::state).collect();
         saved::encode(&envs)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let saved: Vec<E::Saved> = saved::decode(state)?;
-        saved::check_env_count(saved.len(), self.num_envs())?;
-        let mut envs = self.envs.iter_mut().zip(saved);
-        envs.try_for_each(|(env, saved)| env.restore(&self.config, saved))
+        let states: Vec<E::State> = saved::decode(state)?;
+        saved::check_env_count(states.len(), self.num_envs())?;
+        let mut envs = self.envs.iter_mut().zip(states);
+        envs.try_for_each(|(env, state)| env.restore(&self.config, state))
     }
 }
 
@@ -123,9 +123,9 @@ pub(crate) enum RngUse {
 }
 
 /// Returns the generator of environment `env` in a world seeded with `seed`: ChaCha8 keyed by the seed, one stream per environment and use.
-pub(crate) fn env_rng(seed: u64, env: usize, used_for: RngUse) -> ChaCha8Rng {
+pub(crate) fn env_rng(seed: u64, env: usize, rng_use: RngUse) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(2 * env as u64 + used_for as u64);
+    rng.set_stream(2 * env as u64 + rng_use as u64);
     rng
 }
 
@@ -153,8 +153,8 @@ pub(crate) fn check_step(
             )));
         }
     }
-    let mut numbered = actions.iter().enumerate();
-    match numbered.find(|(_, action)| usize::from(**action) >= num_actions) {
+    let mut by_env = actions.iter().enumerate();
+    match by_env.find(|(_, action)| usize::from(**action) >= num_actions) {
         Some((env, action)) => Err(EnvError::Step(format!(
             "action {action} of environment {env} is out of range: this world has {num_actions} actions"
         ))),

@@ -13,7 +13,7 @@ const STACK_MAX: usize = 64;
 /// A pixel's channels are those of the oldest frame first: [oldest C, ..., newest C]. At the first frame of an episode or
 /// level every slot holds that frame, so a stack never reaches across an end.
 pub struct FrameStack {
-    frame: FrameShape,
+    shape: FrameShape,
     stack: usize,
     num_envs: usize,
     stacked: Vec<u8>,
@@ -28,7 +28,7 @@ impl FrameStack {
         let why = format!("a frame stack holds 1 to {STACK_MAX} frames, got {stack}");
         require((1..=STACK_MAX).contains(&stack), why)?;
         Ok(Self {
-            frame: shape,
+            shape,
             stack,
             num_envs,
             stacked: vec![0; shape.bytes() * stack * num_envs],
@@ -42,7 +42,7 @@ impl FrameStack {
     pub fn push(&mut self, frames: &[u8], first: &[bool]) {
         assert_eq!(
             frames.len(),
-            self.frame.bytes() * self.num_envs,
+            self.shape.bytes() * self.num_envs,
             "frames must be [N, H, W, C]"
         );
         assert_eq!(first.len(), self.num_envs, "first must be [N]");
@@ -50,13 +50,13 @@ impl FrameStack {
             self.stacked.copy_from_slice(frames);
             return;
         }
-        let channels = self.frame.channels;
-        let deep = channels * self.stack;
+        let channels = self.shape.channels;
+        let stacked_channels = channels * self.stack;
         let envs = self
             .stacked
-            .chunks_exact_mut(self.frame.bytes() * self.stack);
+            .chunks_exact_mut(self.shape.bytes() * self.stack);
         for ((stacked, frame), &first) in
-            envs.zip(frames.chunks_exact(self.frame.bytes())).zip(first)
+            envs.zip(frames.chunks_exact(self.shape.bytes())).zip(first)
         {
             let pixels = frame.chunks_exact(channels);
             if first {
@@ -67,8 +67,8 @@ impl FrameStack {
             } else {
                 // One move shifts every pixel; what spills into a pixel's last slot is overwritten right after.
                 stacked.copy_within(channels.., 0);
-                for (out, pixel) in stacked.chunks_exact_mut(deep).zip(pixels) {
-                    out[deep - channels..].copy_from_slice(pixel);
+                for (out, pixel) in stacked.chunks_exact_mut(stacked_channels).zip(pixels) {
+                    out[stacked_channels - channels..].copy_from_slice(pixel);
                 }
             }
         }
@@ -81,7 +81,7 @@ impl FrameStack {
 
     /// Restores the stacked observations [N, H, W, C * stack] of another stack of the same sizes.
     pub fn load(&mut self, stacked: &[u8]) -> Result<(), EnvError> {
-        saved::check(stacked.len() == self.stacked.len(), "a stack of frames")?;
+        saved::ensure_fits(stacked.len() == self.stacked.len(), "a stack of frames")?;
         self.stacked.copy_from_slice(stacked);
         Ok(())
     }

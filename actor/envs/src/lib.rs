@@ -19,7 +19,7 @@
 //!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
 //! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`],
-//! and the world itself, which implements [`Environment`] (or, if its environments are stepped one by one, `Env` for one of them);
+//! and the world itself, which implements [`Environment`] (or, if its environments are stepped one by one, `SingleEnv` for one of them);
 //! then give it a line in `registry.rs`.
 //!
 //! ```
@@ -68,9 +68,9 @@ pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
 pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
 pub use registry::{WorldConfig, WorldName, WorldNameError};
 pub use restricted::{ActionSet, RestrictedWorld};
-pub use settings::{Built, Levels, Variants, WorldSettings};
+pub use settings::{BuildResult, Levels, Variants, WorldSettings};
 pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return};
-pub use worlds::exec::{ExecConfig, ExecWorld, declaration as exec_declaration};
+pub use worlds::exec::{ExecConfig, ExecWorld, probe_command as probe_exec_command};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};
 pub use worlds::procgen::{ProcgenConfig, ProcgenWorld, visible_actions};

@@ -18,10 +18,10 @@ type Settings = Arc<dyn WorldSettings + Send + Sync>;
 pub struct CustomKind {
     name: &'static str,
     preset: &'static str,
-    read: fn(Table) -> Result<Settings, toml::de::Error>,
+    parse: fn(Table) -> Result<Settings, toml::de::Error>,
 }
 
-static CUSTOM: OnceLock<Vec<CustomKind>> = OnceLock::new();
+static REGISTERED: OnceLock<Vec<CustomKind>> = OnceLock::new();
 
 impl CustomKind {
     /// Creates a kind of world: `--env NAME` trains in it, and the settings of `kind = "NAME"` are read as an `S`.
@@ -29,14 +29,14 @@ impl CustomKind {
     /// `preset` is the world's layer of settings, TOML as in `deploy/settings/presets/world/`: at least `run.frame_stack`,
     /// `input.height`, `input.width` and the table `[world]` with the fields of `S`. A name of one of this crate's
     /// worlds keeps its meaning. If two kinds have the same name, the first counts.
-    pub fn of<S>(name: &'static str, preset: &'static str) -> Self
+    pub fn new<S>(name: &'static str, preset: &'static str) -> Self
     where
         S: WorldSettings + DeserializeOwned + Send + Sync + 'static,
     {
         Self {
             name,
             preset,
-            read: |table| Ok(Arc::new(table.try_into::<S>()?)),
+            parse: |table| Ok(Arc::new(table.try_into::<S>()?)),
         }
     }
 }
@@ -46,22 +46,22 @@ impl CustomKind {
 /// # Panics
 /// If it was called before.
 pub fn register(kinds: Vec<CustomKind>) {
-    let first = CUSTOM.set(kinds);
-    first.expect("a program registers its worlds once");
+    let result = REGISTERED.set(kinds);
+    result.expect("a program registers its worlds once");
 }
 
-fn custom() -> &'static [CustomKind] {
-    CUSTOM.get().map_or(&[], Vec::as_slice)
+fn registered() -> &'static [CustomKind] {
+    REGISTERED.get().map_or(&[], Vec::as_slice)
 }
 
 /// The names of all registered worlds.
-pub(crate) fn kinds() -> impl Iterator<Item = &'static str> {
-    custom().iter().map(|kind| kind.name)
+pub(crate) fn registered_names() -> impl Iterator<Item = &'static str> {
+    registered().iter().map(|kind| kind.name)
 }
 
 /// Returns the layer of settings (TOML) of a registered world.
 pub fn preset(name: &str) -> Option<&'static str> {
-    let kind = custom().iter().find(|kind| kind.name == name);
+    let kind = registered().iter().find(|kind| kind.name == name);
     kind.map(|kind| kind.preset)
 }
 
@@ -79,13 +79,13 @@ pub struct CustomWorld {
 
 impl CustomWorld {
     /// Reads the settings of a registered world. `table` holds `kind` and the `fields`. Returns `None` if `kind` is not registered.
-    pub(crate) fn read(
+    pub(crate) fn parse(
         kind: &str,
         fields: Table,
         table: Table,
     ) -> Option<Result<Self, toml::de::Error>> {
-        let kind = custom().iter().find(|it| it.name == kind)?;
-        let settings = (kind.read)(fields);
+        let kind = registered().iter().find(|it| it.name == kind)?;
+        let settings = (kind.parse)(fields);
         Some(settings.map(|settings| Self {
             kind: kind.name,
             table,

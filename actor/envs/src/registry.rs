@@ -32,11 +32,11 @@ macro_rules! worlds {
             $($(#[$doc])* #[serde(rename = $kind)] $World($Settings),)+
             /// A world that the program registered.
             #[serde(untagged)]
-            Own(CustomWorld),
+            Custom(CustomWorld),
         }
 
         /// The `kind` of each world of this crate in a settings file.
-        const NAMES: &[&str] = &[$($kind),+];
+        const KIND_NAMES: &[&str] = &[$($kind),+];
 
         /// Every world of this crate: its kind, and a function that returns its variants.
         const KINDS: &[(&str, fn() -> Variants)] = &[$(($kind, <$Settings>::variants)),+];
@@ -45,12 +45,12 @@ macro_rules! worlds {
             fn settings(&self) -> (&'static str, &(dyn WorldSettings + 'static)) {
                 match self {
                     $(Self::$World(settings) => ($kind, settings),)+
-                    Self::Own(own) => (own.kind(), own.settings()),
+                    Self::Custom(custom) => (custom.kind(), custom.settings()),
                 }
             }
 
             /// Reads the settings of this crate's world `kind`; `None` if the crate has no such world.
-            fn ours(kind: &str, fields: &Table) -> Option<Result<Self, toml::de::Error>> {
+            fn parse_built_in(kind: &str, fields: &Table) -> Option<Result<Self, toml::de::Error>> {
                 match kind {
                     $($kind => Some(fields.clone().try_into().map(Self::$World)),)+
                     _ => None,
@@ -74,7 +74,7 @@ worlds! {
 }
 
 /// The prefix of `libenv:PATH:GAME`: one of Procgen's games, run by another build of its library.
-const LIBENV: &str = "libenv";
+const LIBENV_PREFIX: &str = "libenv";
 
 /// The kind of world whose games `libenv:PATH:GAME` names.
 const LIBENV_KIND: &str = "procgen";
@@ -85,14 +85,14 @@ impl<'de> Deserialize<'de> for WorldConfig {
         let mut fields = table.clone();
         let kind = fields.remove("kind");
         let kind = kind.ok_or_else(|| D::Error::missing_field("kind"))?;
-        let why = |e: toml::de::Error| D::Error::custom(e.message());
-        let kind: String = kind.try_into().map_err(why)?;
-        if let Some(ours) = Self::ours(&kind, &fields) {
-            return ours.map_err(why);
+        let invalid = |e: toml::de::Error| D::Error::custom(e.message());
+        let kind: String = kind.try_into().map_err(invalid)?;
+        if let Some(built_in) = Self::parse_built_in(&kind, &fields) {
+            return built_in.map_err(invalid);
         }
-        let own = CustomWorld::read(&kind, fields, table);
-        let own = own.ok_or_else(|| D::Error::unknown_variant(&kind, NAMES))?;
-        own.map(Self::Own).map_err(D::Error::custom)
+        let custom = CustomWorld::parse(&kind, fields, table);
+        let custom = custom.ok_or_else(|| D::Error::unknown_variant(&kind, KIND_NAMES))?;
+        custom.map(Self::Custom).map_err(D::Error::custom)
     }
 }
 
@@ -102,8 +102,8 @@ impl WorldConfig {
         let (kind, settings) = self.settings();
         WorldName {
             kind,
-            variant: settings.variant().map(kept),
-            library: settings.library().map(kept),
+            variant: settings.variant().map(intern),
+            library: settings.library().map(intern),
         }
     }
 
@@ -186,14 +186,14 @@ pub struct WorldName {
 }
 
 /// Leaks a text that the user chose, so that [`WorldName`] is small and `Copy`. A run has one or two such texts; equal ones are shared.
-fn kept(text: &str) -> &'static str {
-    static KEPT: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
-    let mut all = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(known) = all.get(text) {
+fn intern(text: &str) -> &'static str {
+    static INTERNED: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
+    let mut texts = INTERNED.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(known) = texts.get(text) {
         return known;
     }
     let new: &'static str = Box::leak(text.into());
-    all.insert(new);
+    texts.insert(new);
     new
 }
 
@@ -201,15 +201,15 @@ impl WorldName {
     /// All names without a text that the user chooses: each of Procgen's games, then the other worlds, then the registered ones.
     pub fn all() -> impl Iterator<Item = WorldName> {
         let ours = KINDS.iter().flat_map(|(kind, variants)| {
-            let Variants { names, is_open, .. } = variants();
-            let one = (names.is_empty() && !is_open).then_some(None);
-            let variants = one.into_iter().chain(names.iter().copied().map(Some));
-            variants.map(|variant| Self::of(kind, variant))
+            let all = variants();
+            let bare = (all.names.is_empty() && !all.is_free_text).then_some(None);
+            let variants = bare.into_iter().chain(all.names.iter().copied().map(Some));
+            variants.map(|variant| Self::new(kind, variant))
         });
-        ours.chain(plugin::kinds().map(|kind| Self::of(kind, None)))
+        ours.chain(plugin::registered_names().map(|kind| Self::new(kind, None)))
     }
 
-    const fn of(kind: &'static str, variant: Option<&'static str>) -> Self {
+    const fn new(kind: &'static str, variant: Option<&'static str>) -> Self {
         Self {
             kind,
             variant,
@@ -218,25 +218,25 @@ impl WorldName {
     }
 
     /// Reads a name with a text that the user chooses, such as a command or the path of a library.
-    fn open(text: &str) -> Option<Self> {
+    fn parse_free_text(text: &str) -> Option<Self> {
         let (first, rest) = text.split_once(':')?;
-        if first == LIBENV {
+        if first == LIBENV_PREFIX {
             let (library, game) = rest.rsplit_once(':')?;
             let known = Self::all().find(|it| it.kind == LIBENV_KIND && it.variant == Some(game));
             return known.filter(|_| !library.is_empty()).map(|known| Self {
-                library: Some(kept(library)),
+                library: Some(intern(library)),
                 ..known
             });
         }
         let (kind, _) = KINDS
             .iter()
-            .find(|(kind, variants)| *kind == first && variants().is_open)?;
-        (!rest.trim().is_empty()).then(|| Self::of(kind, Some(kept(rest))))
+            .find(|(kind, variants)| *kind == first && variants().is_free_text)?;
+        (!rest.trim().is_empty()).then(|| Self::new(kind, Some(intern(rest))))
     }
 
     /// The command that starts the world, if the world runs in its own process.
     pub fn command(self) -> Option<&'static str> {
-        self.variant.filter(|_| self.variants().is_open)
+        self.variant.filter(|_| self.variants().is_free_text)
     }
 
     /// The variants of the world's kind.
@@ -251,7 +251,7 @@ impl WorldName {
     }
 
     /// Returns the same world with its own engine: what is known of it also holds for other builds.
-    pub const fn with_own_library(self) -> Self {
+    pub const fn without_library(self) -> Self {
         Self {
             library: None,
             ..self
@@ -279,7 +279,7 @@ impl WorldName {
 impl fmt::Display for WorldName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.library {
-            Some(library) => write!(f, "{LIBENV}:{library}")?,
+            Some(library) => write!(f, "{LIBENV_PREFIX}:{library}")?,
             None => f.write_str(self.kind)?,
         }
         self.variant.map_or(Ok(()), |name| write!(f, ":{name}"))
@@ -291,10 +291,10 @@ impl FromStr for WorldName {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let known = WorldName::all().find(|name| name.to_string() == text);
-        let known = known.or_else(|| WorldName::open(text));
+        let known = known.or_else(|| WorldName::parse_free_text(text));
         known.ok_or_else(|| WorldNameError {
             text: text.into(),
-            nearest: nearest(text),
+            nearest: nearest_world(text),
         })
     }
 }
@@ -325,22 +325,22 @@ impl fmt::Display for WorldNameError {
             )?;
         }
         let mut names = Vec::new();
-        let mut variants = String::new();
-        for (kind, of) in KINDS {
-            let of = of();
-            let key = of.key.to_uppercase();
-            if of.is_open {
+        let mut listed = String::new();
+        for (kind, variants) in KINDS {
+            let variants = variants();
+            let key = variants.key.to_uppercase();
+            if variants.is_free_text {
                 names.push(format!("{kind}:{key}"));
-            } else if of.names.is_empty() {
+            } else if variants.names.is_empty() {
                 names.push((*kind).to_owned());
             } else {
                 names.push(format!("{kind}:{key}"));
-                variants += &format!("; {key} is one of {}", of.names.join(", "));
+                listed += &format!("; {key} is one of {}", variants.names.join(", "));
             }
         }
-        names.push(format!("{LIBENV}:PATH:GAME"));
-        names.extend(plugin::kinds().map(str::to_owned));
-        write!(f, " (the worlds: {}{variants})", names.join(", "))
+        names.push(format!("{LIBENV_PREFIX}:PATH:GAME"));
+        names.extend(plugin::registered_names().map(str::to_owned));
+        write!(f, " (the worlds: {}{listed})", names.join(", "))
     }
 }
 
@@ -355,7 +355,7 @@ fn is_gymnasium_name(text: &str) -> bool {
 }
 
 /// Returns the world whose name is nearest to `text`: at most 3 edits, and a third of its letters, away. `text` may lack the kind.
-fn nearest(text: &str) -> Option<WorldName> {
+fn nearest_world(text: &str) -> Option<WorldName> {
     // Names are short: a long text cannot be near one.
     if text.chars().count() > 40 {
         return None;
@@ -370,8 +370,8 @@ fn nearest(text: &str) -> Option<WorldName> {
     };
     let name = WorldName::all().min_by_key(|&name| distance(name))?;
     // Three edits may replace most of a short name: pong is not ising.
-    let most = (text.chars().count() / 3).min(3);
-    (distance(name) <= most).then_some(name)
+    let distance_max = (text.chars().count() / 3).min(3);
+    (distance(name) <= distance_max).then_some(name)
 }
 
 #[cfg(test)]

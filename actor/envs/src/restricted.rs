@@ -24,11 +24,11 @@ pub struct RestrictedWorld {
     world: Box<dyn Environment>,
     actions: Vec<u8>,
     /// The actions of the step in progress [N], as `world` numbers them.
-    step: Vec<u8>,
-    whole: FrameShape,
+    step_actions: Vec<u8>,
+    whole_shape: FrameShape,
     shape: FrameShape,
     /// Whole frames of all environments: a reused buffer.
-    frames: Vec<u8>,
+    whole_frames: Vec<u8>,
 }
 
 impl RestrictedWorld {
@@ -36,21 +36,21 @@ impl RestrictedWorld {
     ///
     /// # Errors
     /// No action, or one that the world does not have; frames larger than the world's, or without a pixel.
-    pub fn of(
+    pub fn wrap(
         world: Box<dyn Environment>,
         actions: Vec<u8>,
         (height, width): (usize, usize),
     ) -> Result<Box<dyn Environment>, EnvError> {
-        let (whole, count) = (world.frame_shape(), world.num_actions());
-        let shape = FrameShape::new(height, width, whole.channels);
-        let has_all = actions.iter().map(|&it| usize::from(it)).eq(0..count);
-        if shape == whole && has_all {
+        let (whole_shape, count) = (world.frame_shape(), world.num_actions());
+        let shape = FrameShape::new(height, width, whole_shape.channels);
+        let has_all_actions = actions.iter().map(|&it| usize::from(it)).eq(0..count);
+        if shape == whole_shape && has_all_actions {
             return Ok(world);
         }
         let mut known = actions.iter().map(|&it| usize::from(it) < count);
         let why = format!("{actions:?} are not actions of a world that has {count}");
         require(!actions.is_empty() && known.all(|known| known), why)?;
-        let (rows, columns) = (whole.height, whole.width);
+        let (rows, columns) = (whole_shape.height, whole_shape.width);
         let why =
             format!("frames of {height} x {width} cannot be cut from frames of {rows} x {columns}");
         require(
@@ -61,10 +61,10 @@ impl RestrictedWorld {
         Ok(Box::new(Self {
             world,
             actions,
-            step: Vec::with_capacity(envs),
-            whole,
+            step_actions: Vec::with_capacity(envs),
+            whole_shape,
             shape,
-            frames: vec![0; envs * whole.bytes()],
+            whole_frames: vec![0; envs * whole_shape.bytes()],
         }))
     }
 }
@@ -84,9 +84,9 @@ impl Environment for RestrictedWorld {
 
     fn observe(&mut self, frames: &mut [u8]) {
         check_frames(frames, self.num_envs(), self.shape);
-        self.world.observe(&mut self.frames);
-        let [whole_row, row] = [self.whole, self.shape].map(|shape| shape.width * shape.channels);
-        let whole = self.frames.chunks_exact(self.whole.bytes());
+        self.world.observe(&mut self.whole_frames);
+        let [whole_row, row] = [self.whole_shape, self.shape].map(|it| it.width * it.channels);
+        let whole = self.whole_frames.chunks_exact(self.whole_shape.bytes());
         for (part, whole) in frames.chunks_exact_mut(self.shape.bytes()).zip(whole) {
             let rows = whole.chunks_exact(whole_row);
             for (part, whole) in part.chunks_exact_mut(row).zip(rows) {
@@ -101,15 +101,15 @@ impl Environment for RestrictedWorld {
         rewards: &mut [f32],
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
-        self.step.clear();
+        self.step_actions.clear();
         for &action in actions {
-            let Some(&own) = self.actions.get(usize::from(action)) else {
+            let Some(&raw) = self.actions.get(usize::from(action)) else {
                 let count = self.actions.len();
                 return Err(EnvError::Step(format!("action {action} of {count}")));
             };
-            self.step.push(own);
+            self.step_actions.push(raw);
         }
-        self.world.step(&self.step, rewards, ends)
+        self.world.step(&self.step_actions, rewards, ends)
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
@@ -129,7 +129,7 @@ mod tests {
     use crate::worlds::chain::{ChainConfig, tests::config};
 
     /// Two corridors with frames of 4 x 6.
-    fn part(actions: &[u8], size: (usize, usize)) -> Result<Box<dyn Environment>, EnvError> {
+    fn restricted(actions: &[u8], size: (usize, usize)) -> Result<Box<dyn Environment>, EnvError> {
         let config = ChainConfig {
             cells: 3,
             height: 4,
@@ -137,12 +137,12 @@ mod tests {
             reward_left: -1.0,
             ..config()
         };
-        RestrictedWorld::of(config.build(2, 1, 0)?, actions.to_vec(), size)
+        RestrictedWorld::wrap(config.build(2, 1, 0)?, actions.to_vec(), size)
     }
 
     #[test]
     fn actions_and_frames_are_the_world_s_own() {
-        let mut world = part(&[2, 1], (2, 3)).unwrap();
+        let mut world = restricted(&[2, 1], (2, 3)).unwrap();
         assert_eq!((world.num_envs(), world.num_actions()), (2, 2));
         assert_eq!(world.frame_shape().bytes(), 6);
         // The agent's cell is the middle one: columns 2 and 3.
@@ -153,7 +153,7 @@ mod tests {
         assert_eq!(ends, [StepEnd::Terminal; 2]);
         assert!(world.step(&[0, 2], &mut rewards, &mut ends).is_err());
         // No-op is 0, and left is not among these.
-        let mut world = part(&[0, 2], (2, 3)).unwrap();
+        let mut world = restricted(&[0, 2], (2, 3)).unwrap();
         let (rewards, ends) = step(&mut *world, &[1, 0]);
         assert_eq!(rewards, [1.0, 0.0]);
         assert_eq!(ends, [StepEnd::Terminal, StepEnd::Running]);
@@ -161,13 +161,13 @@ mod tests {
 
     #[test]
     fn the_whole_is_the_world_as_it_is_and_what_it_has_not_is_refused() {
-        let all = part(&[0, 1, 2], (4, 6)).unwrap();
+        let all = restricted(&[0, 1, 2], (4, 6)).unwrap();
         assert_eq!((all.num_actions(), all.frame_shape().bytes()), (3, 24));
         for wrong in [&[][..], &[3], &[0, 1, 2, 3]] {
-            assert!(part(wrong, (4, 6)).is_err(), "{wrong:?}");
+            assert!(restricted(wrong, (4, 6)).is_err(), "{wrong:?}");
         }
         for size in [(5, 6), (4, 7), (0, 6), (4, 0)] {
-            assert!(part(&[0, 1, 2], size).is_err(), "{size:?}");
+            assert!(restricted(&[0, 1, 2], size).is_err(), "{size:?}");
         }
     }
 }

@@ -27,7 +27,7 @@ pub(crate) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
         .map_err(|e| EnvError::State(e.to_string()))?;
     match bytes.len() - used {
         0 => Ok(state),
-        over => Err(EnvError::State(format!("{over} bytes after its end"))),
+        excess => Err(EnvError::State(format!("{excess} bytes after its end"))),
     }
 }
 
@@ -42,7 +42,7 @@ pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvEr
 }
 
 /// Returns an error unless `holds`; `what` names the part of the state that does not fit the settings.
-pub(crate) fn check(holds: bool, what: &str) -> Result<(), EnvError> {
+pub(crate) fn ensure_fits(holds: bool, what: &str) -> Result<(), EnvError> {
     let wrong = || EnvError::State(format!("{what} is none of these settings"));
     holds.then_some(()).ok_or_else(wrong)
 }
@@ -62,7 +62,7 @@ pub(crate) mod tests {
 
     /// Checks that a second world from `make`, stepped before, continues as the first after it loads the first's state.
     /// Returns the number of ends since the state was saved.
-    pub(crate) fn continues(
+    pub(crate) fn check_restore(
         name: &str,
         steps: usize,
         mut make: impl FnMut() -> Box<dyn Environment>,
@@ -104,20 +104,20 @@ pub(crate) mod tests {
             lattice_size,
             patch_size: 5,
             temperature: 2.0,
-            ..ising::tests::paper()
+            ..ising::tests::paper_config()
         })
     }
 
     #[test]
     fn worlds_go_on_where_they_were_saved() {
         for (name, config) in [("chain", chain()), ("ising", ising(9))] {
-            assert!(continues(name, 60, || config.build(ENVS, 3, 0).unwrap()) > 3);
+            assert!(check_restore(name, 60, || config.build(ENVS, 3, 0).unwrap()) > 3);
         }
         let part = || {
             let whole = chain().build(ENVS, 3, 0).unwrap();
-            RestrictedWorld::of(whole, vec![1, 2], (6, 11)).unwrap()
+            RestrictedWorld::wrap(whole, vec![1, 2], (6, 11)).unwrap()
         };
-        assert!(continues("a part of the chain", 60, part) > 3);
+        assert!(check_restore("a part of the chain", 60, part) > 3);
     }
 
     #[test]

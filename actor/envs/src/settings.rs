@@ -16,7 +16,7 @@ pub enum Levels {
 }
 
 /// The result of [`WorldSettings::build`].
-pub type Built = Result<Box<dyn Environment>, EnvError>;
+pub type BuildResult = Result<Box<dyn Environment>, EnvError>;
 
 /// The settings of one world.
 ///
@@ -39,7 +39,7 @@ pub trait WorldSettings {
     }
 
     /// Builds `num_envs` environments; environment i depends on (`seed`, i) and its actions only. The world may start `threads` threads.
-    fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built;
+    fn build(&self, num_envs: usize, seed: u64, threads: usize) -> BuildResult;
 
     /// The variants of this world that have their own names on a command line, such as a suite's games.
     fn variants() -> Variants
@@ -87,5 +87,5 @@ pub struct Variants {
     /// The names of the variants; empty for a world without variants.
     pub names: &'static [&'static str],
     /// Whether any other text is a variant too, such as a command.
-    pub is_open: bool,
+    pub is_free_text: bool,
 }

@@ -68,7 +68,7 @@ impl Recording {
         let run = &config.run;
         let sent = (run.frame_height as usize, run.frame_width as usize);
         let whole = config.world.build(STREAMS, 1, 0)?;
-        let world = RestrictedWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
+        let world = RestrictedWorld::wrap(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut policy = RandomPolicy::new(world.num_actions() as u8);
         let mut acting = Acting::new(world, 1, ChaCha8Rng::seed_from_u64(1))?;

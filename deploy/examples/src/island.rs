@@ -1,6 +1,6 @@
 //! A custom world: an island with a treasure on it, at another place in each episode.
 
-use driml_envs::{Built, EnvError, Environment, FrameShape, StepEnd, WorldSettings};
+use driml_envs::{BuildResult, EnvError, Environment, FrameShape, StepEnd, WorldSettings};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -41,7 +41,7 @@ impl WorldSettings for IslandConfig {
         vec!["up", "down", "left", "right"]
     }
 
-    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> BuildResult {
         self.validate()?;
         let islands = (0..num_envs).map(|env| Island::new(seed, env, self.side));
         Ok(Box::new(Islands {

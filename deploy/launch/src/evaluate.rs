@@ -221,7 +221,7 @@ fn play_episodes(
         steps_max: episodes.div_ceil(envs) as u64 * STEPS_PER_ROUND_MAX,
     };
     let actions = world.actions(config.actor.actions);
-    let world = RestrictedWorld::of(world.build(envs, seed, 0)?, actions, frame_size(config))?;
+    let world = RestrictedWorld::wrap(world.build(envs, seed, 0)?, actions, frame_size(config))?;
     episode_returns(world, policy, evaluation, policy_rng(seed), watch)
         .with_context(|| format!("playing {}", config.run.world))
 }

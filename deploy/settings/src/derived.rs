@@ -37,7 +37,7 @@ pub(crate) const FRAME: &str = "input.frame";
 pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
     let limits = ["world.start_timeout_ms", "world.step_timeout_ms"];
     let [start, step] = limits.map(|limit| whole_size(table, limit));
-    let declared = driml_envs::exec_declaration(command, start? as u64, step? as u64)
+    let declared = driml_envs::probe_exec_command(command, start? as u64, step? as u64)
         .map_err(|e| usage!("--env: {e}"))?;
     for (path, side) in [
         ("input.height", declared.height),

@@ -84,7 +84,7 @@ pub fn sourced(
     let table = source.resolve(&Flags::default(), &machine)?.to_table();
     let mut sources = BTreeMap::new();
     for layer in stack(preset, world, agent) {
-        note_sources(&layer, &world.with_own_library().to_string(), &mut sources);
+        note_sources(&layer, &world.without_library().to_string(), &mut sources);
     }
     let mut text = format!(
         "# {} in {world}, preset {}: every setting and its source. `driml train --config` takes this file.\n",

@@ -207,7 +207,7 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
             preset.families.join(", ")
         ));
     }
-    let name = world.with_own_library().to_string();
+    let name = world.without_library().to_string();
     let mut table = Table::new();
     for layer in stack(preset, world, agent) {
         for part in layer.parts().into_iter().filter(|it| it.is_for(&name)) {

@@ -70,7 +70,7 @@ fn names_may_hold_a_person_s_own_code() {
     let found: Vec<_> = name.settings().collect();
     let library = ("library", "/builds/a:b/libenv.so");
     assert_eq!(found, [("game", "coinrun"), library]);
-    assert_eq!(name.with_own_library(), "procgen:coinrun".parse().unwrap());
+    assert_eq!(name.without_library(), "procgen:coinrun".parse().unwrap());
     for wrong in [
         "exec:",
         "exec: ",
@@ -138,7 +138,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     let text = "kind = 'flat'\nreward = 3.5\n";
     assert!(toml::from_str::<WorldConfig>(text).is_err());
     // A registered kind does not replace this crate's world of the same name.
-    let kinds = ["flat", "chain"].map(|name| CustomKind::of::<Flat>(name, "# preset"));
+    let kinds = ["flat", "chain"].map(|name| CustomKind::new::<Flat>(name, "# preset"));
     plugin::register(kinds.into());
     let config: WorldConfig = toml::from_str(text).unwrap();
     assert_eq!(config.name(), "flat".parse().unwrap());
@@ -204,7 +204,7 @@ fn configs() -> [WorldConfig; 4] {
     [
         WorldConfig::Exec(exec::tests::config(numbered)),
         WorldConfig::Chain(chain::tests::config()),
-        WorldConfig::Ising(ising::tests::paper()),
+        WorldConfig::Ising(ising::tests::paper_config()),
         WorldConfig::MsPacman(pacman::tests::config()),
     ]
 }

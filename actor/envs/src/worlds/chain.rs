@@ -4,10 +4,10 @@
 use serde::{Deserialize, Serialize};
 
 use crate::environment::{FrameShape, StepEnd};
-use crate::envs::{Env, Envs};
+use crate::envs::{SerialWorld, SingleEnv};
 use crate::error::EnvError;
 use crate::saved;
-use crate::settings::{Built, WorldSettings};
+use crate::settings::{BuildResult, WorldSettings};
 
 /// The cell in which every episode starts: beside the near end.
 const START_CELL: usize = 1;
@@ -49,7 +49,7 @@ pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
 ///
 /// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows. The
 /// seed has no effect, as nothing is random.
-pub type ChainWorld = Envs<Corridor>;
+pub type ChainWorld = SerialWorld<Corridor>;
 
 /// The agent's cell in one corridor, and the step of the episode. The saved state is this struct.
 #[derive(Clone, Copy, Serialize, Deserialize)]
@@ -95,20 +95,20 @@ impl WorldSettings for ChainConfig {
         vec!["no-op", "left", "right"]
     }
 
-    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> BuildResult {
         Ok(Box::new(ChainWorld::new(self, num_envs, seed)?))
     }
 }
 
-impl Env for Corridor {
+impl SingleEnv for Corridor {
     type Config = ChainConfig;
-    type Saved = Self;
+    type State = Self;
 
     fn new(_: &ChainConfig, _seed: u64, _env: usize) -> Result<Self, EnvError> {
         Ok(Self::START)
     }
 
-    fn draw(&self, config: &ChainConfig, frame: &mut [u8]) {
+    fn render(&self, config: &ChainConfig, frame: &mut [u8]) {
         let (cell, cells, width) = (self.cell, config.cells, config.width);
         frame.fill(0);
         for row in frame.chunks_exact_mut(width) {
@@ -135,13 +135,13 @@ impl Env for Corridor {
         (reward, end)
     }
 
-    fn saved(&self) -> Self {
+    fn state(&self) -> Self {
         *self
     }
 
-    fn restore(&mut self, config: &ChainConfig, saved: Self) -> Result<(), EnvError> {
-        saved::check((1..config.cells - 1).contains(&saved.cell), "a cell")?;
-        *self = saved;
+    fn restore(&mut self, config: &ChainConfig, state: Self) -> Result<(), EnvError> {
+        saved::ensure_fits((1..config.cells - 1).contains(&state.cell), "a cell")?;
+        *self = state;
         Ok(())
     }
 }

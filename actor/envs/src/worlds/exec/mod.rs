@@ -7,4 +7,4 @@ pub(crate) mod tests;
 mod world;
 
 pub use self::protocol::ExecConfig;
-pub use self::world::{ExecWorld, declaration};
+pub use self::world::{ExecWorld, probe_command};

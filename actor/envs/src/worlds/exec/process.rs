@@ -24,25 +24,25 @@ const SHELL: &str = "/bin/sh";
 const GUARD: &str = "read -r line; sleep 1; kill -KILL 0";
 
 /// The most lines of stderr that an error quotes.
-const WORDS_MAX: usize = 12;
+const STDERR_TAIL_MAX: usize = 12;
 
 /// The most lines of stderr that are logged per second; the log then says how many were left out.
-const LINES_A_SECOND_MAX: usize = 50;
+const LOG_LINES_PER_SECOND_MAX: usize = 50;
 
 /// The most characters of such a line; the rest is cut off.
-const WORD_LENGTH_MAX: usize = 400;
+const LINE_CHARS_MAX: usize = 400;
 
 /// The most bytes of a line that declares a world; a longer line is cut off, and so invalid. Limits lines of stderr too.
-const LINE_MAX: usize = 64 * 1024;
+const LINE_BYTES_MAX: usize = 64 * 1024;
 
 /// How long a process may take to end once its stdin is closed, or once it closed its stdout.
-const END_MAX: Duration = Duration::from_secs(2);
+const EXIT_WAIT_MAX: Duration = Duration::from_secs(2);
 
 /// How often to check whether a process that does not reply still exists.
-const WATCH: Duration = Duration::from_millis(500);
+const POLL_MAX: Duration = Duration::from_millis(500);
 
 /// How often to check whether a process has ended, once it should.
-const LOOK: Duration = Duration::from_millis(5);
+const EXIT_CHECK_INTERVAL: Duration = Duration::from_millis(5);
 
 /// The current exchange with a process: its description in errors, and its time-out.
 #[derive(Clone, Copy, Debug)]
@@ -50,9 +50,9 @@ pub(super) struct Exchange {
     /// The description, such as "in the middle of a step".
     pub(super) doing: &'static str,
     /// The time-out of each reply.
-    pub(super) limit: Duration,
-    /// The setting that changes `limit`.
-    pub(super) setting: &'static str,
+    pub(super) timeout: Duration,
+    /// The setting that changes `timeout`.
+    pub(super) timeout_setting: &'static str,
 }
 
 /// A world's process, with its guard.
@@ -65,11 +65,11 @@ pub(super) struct WorldProcess {
     guard: Child,
     child: Child,
     /// The process's stdin; `None` once the process was told to end.
-    to: Option<ChildStdin>,
-    from: ChildStdout,
-    words: Arc<Mutex<VecDeque<String>>>,
+    stdin: Option<ChildStdin>,
+    stdout: ChildStdout,
+    stderr_tail: Arc<Mutex<VecDeque<String>>>,
     /// Disconnected once stderr has ended.
-    spoken: Receiver<()>,
+    stderr_closed: Receiver<()>,
 }
 
 impl WorldProcess {
@@ -98,145 +98,146 @@ impl WorldProcess {
             }
         };
         let pipe = "it was asked for as a pipe";
-        let (to, from) = (child.stdin.take(), child.stdout.take().expect(pipe));
-        let words = Arc::new(Mutex::new(VecDeque::new()));
-        let (speaks, spoken) = channel();
-        let (stderr, log) = (child.stderr.take().expect(pipe), Arc::clone(&words));
-        let keeper = thread::Builder::new().name("world-stderr".into());
-        keeper.spawn(move || {
-            keep(BufReader::new(stderr), &log, |text| match level {
+        let (stdin, stdout) = (child.stdin.take(), child.stdout.take().expect(pipe));
+        let stderr_tail = Arc::new(Mutex::new(VecDeque::new()));
+        let (stderr_open, stderr_closed) = channel();
+        let (stderr, log) = (child.stderr.take().expect(pipe), Arc::clone(&stderr_tail));
+        let builder = thread::Builder::new().name("world-stderr".into());
+        builder.spawn(move || {
+            log_stderr(BufReader::new(stderr), &log, |text| match level {
                 Level::INFO => tracing::info!("world: {text}"),
                 _ => tracing::debug!("world: {text}"),
             });
-            // Disconnects `spoken`.
-            drop(speaks);
+            // Disconnects `stderr_closed`.
+            drop(stderr_open);
         })?;
         Ok(Self {
             command: command.into(),
             exchange,
             guard,
             child,
-            to,
-            from,
-            words,
-            spoken,
+            stdin,
+            stdout,
+            stderr_tail,
+            stderr_closed,
         })
     }
 
     /// Writes to the process. A closed pipe is not reported here but when the reply is read, as a reply may precede the end.
-    pub(super) fn say(&mut self, text: &str) -> Result<(), EnvError> {
-        let to = self.to.as_mut();
-        match to.map_or(Ok(()), |to| to.write_all(text.as_bytes())) {
-            Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(self.system(&e)),
+    pub(super) fn write(&mut self, text: &str) -> Result<(), EnvError> {
+        let stdin = self.stdin.as_mut();
+        match stdin.map_or(Ok(()), |it| it.write_all(text.as_bytes())) {
+            Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(self.io_error(&e)),
             _ => Ok(()),
         }
     }
 
     /// Writes to a process that has sent all its replies; any more output is an error.
-    pub(super) fn ask(&mut self, text: &str) -> Result<(), EnvError> {
-        let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
+    pub(super) fn request(&mut self, text: &str) -> Result<(), EnvError> {
+        let mut polled = [PollFd::new(self.stdout.as_fd(), PollFlags::POLLIN)];
         // If `poll` fails, so does reading the reply. A closed stdout has nothing to read, and reading the reply reports it.
         let _ = poll(&mut polled, PollTimeout::ZERO);
         let found = polled[0].revents();
         if found.is_some_and(|it| it.contains(PollFlags::POLLIN)) {
             let why = "wrote to stdout between two steps: print to stderr instead";
-            return Err(self.fail(why));
+            return Err(self.error(why));
         }
-        self.say(text)
+        self.write(text)
     }
 
-    pub(super) fn line(&mut self) -> Result<Vec<u8>, EnvError> {
-        let deadline = Instant::now() + self.exchange.limit;
+    pub(super) fn read_line(&mut self) -> Result<Vec<u8>, EnvError> {
+        let deadline = Instant::now() + self.exchange.timeout;
         let mut line = Vec::new();
         loop {
             // Reads a byte at a time, as later bytes do not belong to the line.
-            match self.byte_until(deadline)? {
+            match self.read_byte_until(deadline)? {
                 b'\n' => return Ok(line),
-                _ if line.len() == LINE_MAX => return Ok(line),
+                _ if line.len() == LINE_BYTES_MAX => return Ok(line),
                 byte => line.push(byte),
             }
         }
     }
 
-    pub(super) fn byte(&mut self) -> Result<u8, EnvError> {
-        self.byte_until(Instant::now() + self.exchange.limit)
+    pub(super) fn read_byte(&mut self) -> Result<u8, EnvError> {
+        self.read_byte_until(Instant::now() + self.exchange.timeout)
     }
 
-    fn byte_until(&mut self, deadline: Instant) -> Result<u8, EnvError> {
+    fn read_byte_until(&mut self, deadline: Instant) -> Result<u8, EnvError> {
         let mut byte = [0];
         match self.read_until(&mut byte, deadline) {
-            Ok(0) => Err(self.ended()),
+            Ok(0) => Err(self.exit_error()),
             Ok(_) => Ok(byte[0]),
             Err(e) if e.kind() == ErrorKind::TimedOut => {
                 self.kill();
-                let (doing, setting) = (self.exchange.doing, self.exchange.setting);
-                let seconds = self.exchange.limit.as_secs_f64();
-                Err(self.dead(&format!(
+                let (doing, setting) = (self.exchange.doing, self.exchange.timeout_setting);
+                let seconds = self.exchange.timeout.as_secs_f64();
+                Err(self.dead_error(&format!(
                     "has not answered for {seconds} s {doing}, and was killed: if it needs longer, --set {setting}=N"
                 )))
             }
-            Err(source) => Err(self.system(&source)),
+            Err(source) => Err(self.io_error(&source)),
         }
     }
 
     fn read_until(&mut self, bytes: &mut [u8], deadline: Instant) -> io::Result<usize> {
         loop {
-            let left = deadline.saturating_duration_since(Instant::now());
-            let left = PollTimeout::try_from(left.min(WATCH)).unwrap_or(PollTimeout::ZERO);
-            let mut polled = [PollFd::new(self.from.as_fd(), PollFlags::POLLIN)];
-            match poll(&mut polled, left) {
+            let wait = deadline.saturating_duration_since(Instant::now());
+            let wait = PollTimeout::try_from(wait.min(POLL_MAX)).unwrap_or(PollTimeout::ZERO);
+            let mut polled = [PollFd::new(self.stdout.as_fd(), PollFlags::POLLIN)];
+            match poll(&mut polled, wait) {
                 // The process has ended; one that it started may still hold its stdout open.
                 Ok(0) if matches!(self.child.try_wait(), Ok(Some(_))) => return Ok(0),
                 Ok(0) if Instant::now() >= deadline => return Err(ErrorKind::TimedOut.into()),
                 Ok(0) | Err(nix::errno::Errno::EINTR) => {}
-                Ok(_) => return self.from.read(bytes),
+                Ok(_) => return self.stdout.read(bytes),
                 Err(e) => return Err(e.into()),
             }
         }
     }
 
     /// Kills what is left of a process that has ended, and returns the error that says so.
-    fn ended(&mut self) -> EnvError {
-        self.to = None;
+    fn exit_error(&mut self) -> EnvError {
+        self.stdin = None;
         let doing = self.exchange.doing;
-        let how = match self.end_within(END_MAX) {
-            Some(status) => format!("ended {doing} ({})", describe(status)),
+        let how = match self.wait_for_exit(EXIT_WAIT_MAX) {
+            Some(status) => format!("ended {doing} ({})", describe_status(status)),
             None => format!("closed its stdout {doing} without ending, and was killed"),
         };
         self.kill();
-        self.dead(&how)
+        self.dead_error(&how)
     }
 
     /// Returns the error of a dead process, after waiting for the rest of its stderr.
-    fn dead(&self, how: &str) -> EnvError {
+    fn dead_error(&self, how: &str) -> EnvError {
         // Nothing is sent on this channel: this waits until it is disconnected.
-        let _ = self.spoken.recv_timeout(END_MAX);
-        self.fail(how)
+        let _ = self.stderr_closed.recv_timeout(EXIT_WAIT_MAX);
+        self.error(how)
     }
 
     /// Returns the error `how`, with the last lines of the process's stderr.
-    pub(super) fn fail(&self, how: &str) -> EnvError {
-        let words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
-        let words: String = words.iter().map(|line| format!("\n  {line}")).collect();
-        let words = match words.is_empty() {
-            true => words,
-            false => format!(". Its last words:{words}"),
+    pub(super) fn error(&self, how: &str) -> EnvError {
+        let tail = self.stderr_tail.lock();
+        let tail = tail.unwrap_or_else(PoisonError::into_inner);
+        let tail: String = tail.iter().map(|line| format!("\n  {line}")).collect();
+        let tail = match tail.is_empty() {
+            true => tail,
+            false => format!(". Its last words:{tail}"),
         };
-        EnvError::Exec(format!("the world `{}` {how}{words}", self.command))
+        EnvError::Exec(format!("the world `{}` {how}{tail}", self.command))
     }
 
     /// Returns the error for an error of the operating system.
-    pub(super) fn system(&self, source: &io::Error) -> EnvError {
+    pub(super) fn io_error(&self, source: &io::Error) -> EnvError {
         let doing = self.exchange.doing;
-        self.fail(&format!("cannot be used: {doing}: {source}"))
+        self.error(&format!("cannot be used: {doing}: {source}"))
     }
 
-    fn end_within(&mut self, limit: Duration) -> Option<ExitStatus> {
-        let deadline = Instant::now() + limit;
+    fn wait_for_exit(&mut self, wait_max: Duration) -> Option<ExitStatus> {
+        let deadline = Instant::now() + wait_max;
         loop {
             match self.child.try_wait() {
                 Ok(Some(status)) => return Some(status),
-                Ok(None) if Instant::now() < deadline => thread::sleep(LOOK),
+                Ok(None) if Instant::now() < deadline => thread::sleep(EXIT_CHECK_INTERVAL),
                 Ok(None) | Err(_) => return None,
             }
         }
@@ -265,54 +266,54 @@ impl WorldProcess {
 
 impl Drop for WorldProcess {
     fn drop(&mut self) {
-        self.to = None;
-        self.end_within(END_MAX);
+        self.stdin = None;
+        self.wait_for_exit(EXIT_WAIT_MAX);
         self.kill();
     }
 }
 
-fn describe(status: ExitStatus) -> String {
+fn describe_status(status: ExitStatus) -> String {
     match status.code() {
         Some(127) => "exit status 127: the shell found no such command".into(),
         _ => status.to_string(),
     }
 }
 
-/// Logs the lines of a world's stderr, up to the limit per second, and keeps the last ones in `words`.
-pub(super) fn keep(
+/// Logs the lines of a world's stderr, up to the limit per second, and keeps the last ones in `tail`.
+pub(super) fn log_stderr(
     mut stderr: impl BufRead,
-    words: &Mutex<VecDeque<String>>,
+    tail: &Mutex<VecDeque<String>>,
     mut log: impl FnMut(&str),
 ) {
     let mut line = Vec::new();
     let (mut began, mut lines) = (Instant::now(), 0);
     loop {
         line.clear();
-        let mut rest = (&mut stderr).take(LINE_MAX as u64);
-        let is_over = !matches!(rest.read_until(b'\n', &mut line), Ok(1..));
-        if is_over || began.elapsed() >= Duration::from_secs(1) {
-            let more = usize::saturating_sub(lines, LINES_A_SECOND_MAX);
+        let mut rest = (&mut stderr).take(LINE_BYTES_MAX as u64);
+        let has_ended = !matches!(rest.read_until(b'\n', &mut line), Ok(1..));
+        if has_ended || began.elapsed() >= Duration::from_secs(1) {
+            let more = usize::saturating_sub(lines, LOG_LINES_PER_SECOND_MAX);
             if more > 0 {
                 log(&format!("{more} more lines left out"));
             }
             (began, lines) = (Instant::now(), 0);
         }
-        if is_over {
+        if has_ended {
             return;
         }
         let text = String::from_utf8_lossy(&line);
-        let text: String = text.trim_end().chars().take(WORD_LENGTH_MAX).collect();
+        let text: String = text.trim_end().chars().take(LINE_CHARS_MAX).collect();
         if text.is_empty() {
             continue;
         }
         lines += 1;
-        if lines <= LINES_A_SECOND_MAX {
+        if lines <= LOG_LINES_PER_SECOND_MAX {
             log(&text);
         }
-        let mut words = words.lock().unwrap_or_else(PoisonError::into_inner);
-        if words.len() == WORDS_MAX {
-            words.pop_front();
+        let mut tail = tail.lock().unwrap_or_else(PoisonError::into_inner);
+        if tail.len() == STDERR_TAIL_MAX {
+            tail.pop_front();
         }
-        words.push_back(text);
+        tail.push_back(text);
     }
 }

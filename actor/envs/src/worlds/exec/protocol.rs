@@ -88,7 +88,7 @@ impl ExecConfig {
 pub(super) const VERSION: u64 = 1;
 
 /// The most characters of a line that a message quotes.
-const SHOWN_MAX: usize = 200;
+const QUOTED_CHARS_MAX: usize = 200;
 
 /// The declaration of a world: its copies, shapes and actions.
 #[derive(Debug, Deserialize)]
@@ -105,27 +105,27 @@ pub(super) struct Declaration {
 
 impl Declaration {
     pub(super) fn parse(line: &[u8]) -> Result<Self, String> {
-        let no_world = |why: String| {
+        let not_a_world = |why: String| {
             let line = String::from_utf8_lossy(line);
-            let line: String = line.chars().take(SHOWN_MAX).collect();
+            let line: String = line.chars().take(QUOTED_CHARS_MAX).collect();
             format!(
                 "does not declare itself as a world: its first line on stdout is {line:?} and not JSON with \"driml_env\" and the shapes ({why}); \
                  deploy/python/driml_env.py makes a Gymnasium environment such a world"
             )
         };
-        let value: Value = serde_json::from_slice(line).map_err(|e| no_world(e.to_string()))?;
+        let value: Value = serde_json::from_slice(line).map_err(|e| not_a_world(e.to_string()))?;
         let found = value.get("driml_env").and_then(Value::as_u64);
         match found {
-            Some(VERSION) => serde_json::from_value(value).map_err(|e| no_world(e.to_string())),
+            Some(VERSION) => serde_json::from_value(value).map_err(|e| not_a_world(e.to_string())),
             Some(found) => Err(format!(
                 "speaks version {found} of the protocol, and this driml speaks version {VERSION}: take the driml_env.py that came with it"
             )),
-            None => Err(no_world("\"driml_env\" is missing".into())),
+            None => Err(not_a_world("\"driml_env\" is missing".into())),
         }
     }
 
     /// Returns `config` with the declared shapes and actions.
-    pub(super) fn over(self, config: &ExecConfig) -> ExecConfig {
+    pub(super) fn applied_to(self, config: &ExecConfig) -> ExecConfig {
         ExecConfig {
             height: self.height,
             width: self.width,
@@ -189,10 +189,10 @@ impl Block {
     }
 
     /// The message that says where the memory is, and its layout.
-    pub(super) fn opening(&self) -> Value {
-        let mut opening = json!(self.layout);
-        opening["block"] = path(&self.file).into();
-        opening
+    pub(super) fn open_message(&self) -> Value {
+        let mut message = json!(self.layout);
+        message["block"] = fd_path(&self.file).into();
+        message
     }
 
     /// Writes the actions [N].
@@ -224,14 +224,14 @@ impl Block {
 }
 
 /// Creates memory that holds exactly `state`. It is freed once the file is closed.
-pub(super) fn state_memory(state: &[u8]) -> io::Result<File> {
+pub(super) fn state_file(state: &[u8]) -> io::Result<File> {
     let file = File::from(memfd_create(c"driml-world-state", MFdFlags::MFD_CLOEXEC)?);
     file.write_all_at(state, 0)?;
     Ok(file)
 }
 
 /// The path by which another process of the same user opens a file without a name, as long as this process lives.
-pub(super) fn path(file: &File) -> String {
+pub(super) fn fd_path(file: &File) -> String {
     format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
 }
 
@@ -240,7 +240,7 @@ pub(super) const WORLD_STATE_BYTES_MAX: u64 = 64 << 20;
 
 /// A saved state of a world, with the settings that identify the world.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct SavedExec {
+pub(super) struct ExecState {
     pub(super) config: ExecConfig,
     pub(super) copies: usize,
     /// The frames in which the next actions are taken [N, H, W, C].
@@ -248,27 +248,27 @@ pub(super) struct SavedExec {
     pub(super) state: Vec<u8>,
 }
 
-impl SavedExec {
+impl ExecState {
     pub(super) fn from_bytes(
         bytes: &[u8],
         config: &ExecConfig,
         num_envs: usize,
     ) -> Result<Self, EnvError> {
         let this: Self = saved::decode(bytes)?;
-        let of = &this.config;
-        if of.command != config.command {
+        let found = &this.config;
+        if found.command != config.command {
             return Err(EnvError::State(format!(
                 "it is of the world `{}`, and this is `{}`: give the command as it was",
-                of.command, config.command
+                found.command, config.command
             )));
         }
         saved::check_env_count(this.copies, num_envs)?;
-        saved::check(
-            of.frame_shape() == config.frame_shape() && of.actions == config.actions,
+        saved::ensure_fits(
+            found.frame_shape() == config.frame_shape() && found.actions == config.actions,
             "the shape of its frames or its actions",
         )?;
         let frame_bytes = num_envs * config.frame_shape().bytes();
-        saved::check(this.frames.len() == frame_bytes, "the number of its frames")?;
+        saved::ensure_fits(this.frames.len() == frame_bytes, "the number of its frames")?;
         Ok(this)
     }
 }

@@ -5,14 +5,14 @@ use std::fs;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use super::process::keep;
-use super::protocol::SavedExec;
+use super::process::log_stderr;
+use super::protocol::ExecState;
 use super::world::seeds;
 use super::*;
 use crate::environment::{Environment, StepEnd};
 use crate::error::EnvError;
 use crate::playing::{fails, frames, step};
-use crate::saved::tests::continues;
+use crate::saved::tests::check_restore;
 use crate::settings::WorldSettings;
 
 /// The command of the world that numbers its frames.
@@ -46,7 +46,7 @@ fn declares(line: &str) -> String {
 #[test]
 fn a_command_declares_what_it_is() {
     let command = numbered("");
-    let declared = declaration(&command, 60_000, 60_000).unwrap();
+    let declared = probe_command(&command, 60_000, 60_000).unwrap();
     assert_eq!(declared, config(command));
     assert_eq!(declared.action_names(), ["no-op", "left", "right"]);
     assert!(declared.is_resumable());
@@ -179,7 +179,7 @@ fn each_way_a_start_can_fail_has_its_sentence() {
     let says = |command: &str, sentences: &[&str]| {
         // Long enough for every command that replies at all.
         let limit = if command == "sleep 60" { 500 } else { 60_000 };
-        fails(declaration(command, limit, 1000), sentences);
+        fails(probe_command(command, limit, 1000), sentences);
     };
     for (command, sentences) in rows(NO_WORLDS) {
         says(command, &sentences);
@@ -230,12 +230,12 @@ fn what_is_printed_into_the_protocol_is_named() {
 #[test]
 fn a_flood_on_stderr_is_logged_in_part_and_its_last_lines_are_kept() {
     let flood: String = (0..1000).map(|number| format!("{number}\n")).collect();
-    let (kept, mut logged) = (Mutex::default(), Vec::new());
-    keep(flood.as_bytes(), &kept, |line| logged.push(line.to_owned()));
+    let (tail, mut logged) = (Mutex::default(), Vec::new());
+    log_stderr(flood.as_bytes(), &tail, |line| logged.push(line.to_owned()));
     assert_eq!(logged[49], "49");
     assert_eq!(logged[50..], ["950 more lines left out"]);
-    let kept = kept.into_inner().unwrap();
-    assert!(kept.into_iter().eq((988..1000).map(|it| it.to_string())));
+    let tail = tail.into_inner().unwrap();
+    assert!(tail.into_iter().eq((988..1000).map(|it| it.to_string())));
 }
 
 #[test]
@@ -243,7 +243,7 @@ fn a_world_that_offers_it_continues_where_it_was_saved() {
     let config = config(numbered("saves"));
     let mut worlds = Vec::new();
     // Each world has another seed: its state alone must determine how it continues.
-    let ended = continues("a process", 60, || {
+    let ended = check_restore("a process", 60, || {
         worlds.push(());
         Box::new(ExecWorld::new(&config, 3, worlds.len() as u64).unwrap())
     });
@@ -293,7 +293,7 @@ fn a_state_of_another_world_is_refused_by_name() {
         ..config(numbered("saves"))
     };
     let sentence = "the shape of its frames or its actions";
-    fails(SavedExec::from_bytes(&state, &config, 2), &[sentence]);
+    fails(ExecState::from_bytes(&state, &config, 2), &[sentence]);
 }
 
 /// Returns the processes with `mark` in their command line.
@@ -322,10 +322,10 @@ fn nothing_is_left_of_a_world_and_of_what_it_started() {
 
     // A process that leads another group ends as well.
     let command = "exec timeout 600 sleep 590.5";
-    fails(declaration(command, 200, 1000), &["start_timeout_ms=N"]);
+    fails(probe_command(command, 200, 1000), &["start_timeout_ms=N"]);
     assert_eq!(alive("590.5"), [""; 0]);
 
     let command = format!("sh -c 'sleep 600; : {mark}' & exit 5");
-    declaration(&command, 60_000, 1000).unwrap_err();
+    probe_command(&command, 60_000, 1000).unwrap_err();
     assert_eq!(alive(&mark), [""; 0]);
 }

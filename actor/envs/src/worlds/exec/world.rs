@@ -1,5 +1,5 @@
 //! Implements the world traits with a process that steps copies of a game: each step sends it one byte and reads one byte back.
-//! `protocol` defines the messages. The function `declaration` asks a command what world it is.
+//! `protocol` defines the messages. `probe_command` asks a command what world it is.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -11,13 +11,13 @@ use tracing::Level;
 
 use super::process::{Exchange, WorldProcess};
 use super::protocol::{
-    Block, Declaration, ExecConfig, SavedExec, VERSION, WORLD_STATE_BYTES_MAX, path, state_memory,
+    Block, Declaration, ExecConfig, ExecState, VERSION, WORLD_STATE_BYTES_MAX, fd_path, state_file,
 };
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
 use crate::error::{EnvError, require};
 use crate::saved;
-use crate::settings::{Built, Variants, WorldSettings};
+use crate::settings::{BuildResult, Variants, WorldSettings};
 
 /// Longest side of a frame, in pixels.
 const SIDE_MAX: usize = 4096;
@@ -29,7 +29,7 @@ const CHANNELS_MAX: usize = 16;
 const ACTIONS_MAX: usize = 255;
 
 /// Longest time limit, in milliseconds: a day.
-const LIMIT_MS_MAX: u64 = 86_400_000;
+const TIMEOUT_MS_MAX: u64 = 86_400_000;
 
 /// Request for a step: the actions lie in the block.
 const STEP: &str = "s";
@@ -53,7 +53,7 @@ pub struct ExecWorld {
     config: ExecConfig,
     num_envs: usize,
     /// Whether the process offers to save its state.
-    saves: bool,
+    can_save: bool,
 }
 
 impl ExecWorld {
@@ -64,130 +64,130 @@ impl ExecWorld {
     pub fn new(config: &ExecConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;
-        let (mut process, declared) = introduce(config, &seeds(seed, num_envs), Level::INFO)?;
-        let (copies, saves) = (declared.copies, declared.saves);
-        let found = declared.over(config);
+        let (mut process, declared) = start_process(config, &seeds(seed, num_envs), Level::INFO)?;
+        let (copies, can_save) = (declared.copies, declared.saves);
+        let found = declared.applied_to(config);
         if found != *config {
-            return Err(process.fail(&format!(
+            return Err(process.error(&format!(
                 "declares {}, but the run's settings say {}: start the run anew, or the command as it was",
                 found.describe(),
                 config.describe()
             )));
         }
         if copies != num_envs {
-            return Err(process.fail(&format!(
+            return Err(process.error(&format!(
                 "has {copies} copies where {num_envs} were asked for: it has to make as many as \"copies\" says"
             )));
         }
-        process.exchange = config.starting("making the memory that it shares");
+        process.exchange = config.start_wait("making the memory that it shares");
         let block = Block::new(num_envs, config.frame_shape());
-        let block = block.map_err(|e| process.system(&e))?;
-        process.exchange = config.starting("before its first frames");
-        process.say(&format!("{}\n", block.opening()))?;
+        let block = block.map_err(|e| process.io_error(&e))?;
+        process.exchange = config.start_wait("before its first frames");
+        process.write(&format!("{}\n", block.open_message()))?;
         let mut world = Self {
             process,
             block,
             config: config.clone(),
             num_envs,
-            saves,
+            can_save,
         };
-        world.hear_done()?;
+        world.expect_done()?;
         Ok(world)
     }
 
-    fn hear_done(&mut self) -> Result<(), EnvError> {
-        match self.process.byte()? {
+    fn expect_done(&mut self) -> Result<(), EnvError> {
+        match self.process.read_byte()? {
             DONE => Ok(()),
-            byte => Err(self.other_byte(byte)),
+            byte => Err(self.unexpected_byte(byte)),
         }
     }
 
-    fn other_byte(&self, byte: u8) -> EnvError {
+    fn unexpected_byte(&self, byte: u8) -> EnvError {
         let doing = self.process.exchange.doing;
-        self.process.fail(&format!(
+        self.process.error(&format!(
             "answered {doing} with the byte {byte:#04x} and not with `.`: does it print to stdout? That belongs to the protocol"
         ))
     }
 
-    /// Sends the request `what`, to save or load a state, with the path of its memory.
-    fn say_state(&mut self, what: &str, memory: &File) -> Result<(), EnvError> {
-        let place = json!({"state": path(memory), "bytes_max": WORLD_STATE_BYTES_MAX});
-        self.process.ask(&format!("{what}{place}\n"))
+    /// Sends the request `request`, to save or load a state, with the path of its memory.
+    fn request_state(&mut self, request: &str, memory: &File) -> Result<(), EnvError> {
+        let place = json!({"state": fd_path(memory), "bytes_max": WORLD_STATE_BYTES_MAX});
+        self.process.request(&format!("{request}{place}\n"))
     }
 
     /// Returns the state of the process's copies, in the process's format.
     fn save_process(&mut self) -> Result<Vec<u8>, EnvError> {
-        self.process.exchange = self.config.stepping("in the middle of saving its state");
-        let memory = state_memory(&[]).map_err(|e| self.process.system(&e))?;
-        self.say_state(SAVE, &memory)?;
-        match self.process.byte()? {
+        self.process.exchange = self.config.step_wait("in the middle of saving its state");
+        let memory = state_file(&[]).map_err(|e| self.process.io_error(&e))?;
+        self.request_state(SAVE, &memory)?;
+        match self.process.read_byte()? {
             DONE => {}
             NOT_SAVED => {
-                let line = self.process.line()?;
+                let line = self.process.read_line()?;
                 let why = String::from_utf8_lossy(&line);
                 // The process continues: its reply is complete.
                 let (command, why) = (&self.config.command, why.trim());
                 let text = format!("the world `{command}` cannot save its state: {why}");
                 return Err(EnvError::NotSaved(text));
             }
-            byte => return Err(self.other_byte(byte)),
+            byte => return Err(self.unexpected_byte(byte)),
         }
-        let written = memory.metadata().map_err(|e| self.process.system(&e))?;
+        let written = memory.metadata().map_err(|e| self.process.io_error(&e))?;
         let bytes = written.len();
         if bytes == 0 {
-            return Err(self.process.fail(&format!(
+            return Err(self.process.error(&format!(
                 "wrote no state: where it says `.` {}, the bytes have to lie in \"state\"",
                 self.process.exchange.doing
             )));
         }
         if bytes > WORLD_STATE_BYTES_MAX {
-            return Err(self.process.fail(&format!(
+            return Err(self.process.error(&format!(
                 "wrote a state of {bytes} bytes; {WORLD_STATE_BYTES_MAX} are possible for all its copies together"
             )));
         }
         let mut state = vec![0; bytes as usize];
         let read = memory.read_exact_at(&mut state, 0);
-        read.map_err(|e| self.process.system(&e))?;
+        read.map_err(|e| self.process.io_error(&e))?;
         Ok(state)
     }
 }
 
 /// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
-fn introduce(
+fn start_process(
     config: &ExecConfig,
     seeds: &[u32],
     level: Level,
 ) -> Result<(WorldProcess, Declaration), EnvError> {
     let command = &config.command;
-    let exchange = config.starting("before it declared itself");
+    let exchange = config.start_wait("before it declared itself");
     let process = WorldProcess::start(command, exchange, level);
     let mut process = process.map_err(|e| {
         let text = format!("the world `{command}` cannot be used: starting it: {e}");
         EnvError::Exec(text)
     })?;
     let request = json!({"driml_env": VERSION, "copies": seeds.len(), "seeds": seeds});
-    process.say(&format!("{request}\n"))?;
-    let line = process.line()?;
-    let declaration = Declaration::parse(&line).map_err(|why| process.fail(&why))?;
+    process.write(&format!("{request}\n"))?;
+    let line = process.read_line()?;
+    let declaration = Declaration::parse(&line).map_err(|why| process.error(&why))?;
     Ok((process, declaration))
 }
 
 impl ExecConfig {
     /// An exchange with the start's time-out: the process declares itself, makes its first frames or loads a state.
-    const fn starting(&self, doing: &'static str) -> Exchange {
+    const fn start_wait(&self, doing: &'static str) -> Exchange {
         Exchange {
             doing,
-            limit: Duration::from_millis(self.start_timeout_ms),
-            setting: "world.start_timeout_ms",
+            timeout: Duration::from_millis(self.start_timeout_ms),
+            timeout_setting: "world.start_timeout_ms",
         }
     }
 
     /// An exchange with a step's time-out: a step of all copies, or saving their state.
-    const fn stepping(&self, doing: &'static str) -> Exchange {
+    const fn step_wait(&self, doing: &'static str) -> Exchange {
         Exchange {
             doing,
-            limit: Duration::from_millis(self.step_timeout_ms),
-            setting: "world.step_timeout_ms",
+            timeout: Duration::from_millis(self.step_timeout_ms),
+            timeout_setting: "world.step_timeout_ms",
         }
     }
 }
@@ -196,12 +196,12 @@ impl ExecConfig {
 ///
 /// # Errors
 /// The command cannot be started, does not declare a world in time, or declares one that no run can use.
-pub fn declaration(
+pub fn probe_command(
     command: &str,
     start_timeout_ms: u64,
     step_timeout_ms: u64,
 ) -> Result<ExecConfig, EnvError> {
-    let asked = ExecConfig {
+    let undeclared = ExecConfig {
         command: command.into(),
         height: 0,
         width: 0,
@@ -210,9 +210,9 @@ pub fn declaration(
         start_timeout_ms,
         step_timeout_ms,
     };
-    let (process, declared) = introduce(&asked, &[0], Level::DEBUG)?;
+    let (process, declared) = start_process(&undeclared, &[0], Level::DEBUG)?;
     drop(process);
-    let config = declared.over(&asked);
+    let config = declared.applied_to(&undeclared);
     config.validate()?;
     Ok(config)
 }
@@ -249,8 +249,8 @@ impl WorldSettings for ExecConfig {
             ("step_timeout_ms", self.step_timeout_ms),
         ] {
             let why =
-                format!("world.{name} = {value}; 1 to {LIMIT_MS_MAX} milliseconds are possible");
-            require((1..=LIMIT_MS_MAX).contains(&value), why)?;
+                format!("world.{name} = {value}; 1 to {TIMEOUT_MS_MAX} milliseconds are possible");
+            require((1..=TIMEOUT_MS_MAX).contains(&value), why)?;
         }
         Ok(())
     }
@@ -264,7 +264,7 @@ impl WorldSettings for ExecConfig {
         self.actions.iter().map(String::as_str).collect()
     }
 
-    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> BuildResult {
         Ok(Box::new(ExecWorld::new(self, num_envs, seed)?))
     }
 
@@ -272,7 +272,7 @@ impl WorldSettings for ExecConfig {
         Variants {
             key: "command",
             names: &[],
-            is_open: true,
+            is_free_text: true,
         }
     }
 
@@ -308,13 +308,13 @@ impl Environment for ExecWorld {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
         check_step(self.num_envs, self.num_actions(), actions, rewards, ends)?;
-        self.process.exchange = self.config.stepping("in the middle of a step");
+        self.process.exchange = self.config.step_wait("in the middle of a step");
         let written = self.block.write_actions(actions);
-        written.map_err(|e| self.process.system(&e))?;
-        self.process.ask(STEP)?;
-        self.hear_done()?;
+        written.map_err(|e| self.process.io_error(&e))?;
+        self.process.request(STEP)?;
+        self.expect_done()?;
         let numbers = self.block.read_results(rewards);
-        let numbers = numbers.map_err(|e| self.process.system(&e))?;
+        let numbers = numbers.map_err(|e| self.process.io_error(&e))?;
         for (copy, (end, &number)) in ends.iter_mut().zip(numbers).enumerate() {
             *end = match number {
                 0 => StepEnd::Running,
@@ -322,7 +322,7 @@ impl Environment for ExecWorld {
                 2 => StepEnd::TimedOut,
                 3 => StepEnd::Terminal,
                 number => {
-                    return Err(self.process.fail(&format!(
+                    return Err(self.process.error(&format!(
                         "ended the step of copy {copy} with {number}; 0 runs on, 1 is the next level, 2 timed out, 3 terminal"
                     )));
                 }
@@ -330,19 +330,19 @@ impl Environment for ExecWorld {
         }
         if let Some(copy) = rewards.iter().position(|reward| !reward.is_finite()) {
             let wrong = format!("gave copy {copy} the reward {}", rewards[copy]);
-            return Err(self.process.fail(&wrong));
+            return Err(self.process.error(&wrong));
         }
         Ok(())
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        if !self.saves {
+        if !self.can_save {
             return Err(EnvError::not_saved());
         }
         let state = self.save_process()?;
         let mut frames = vec![0; self.num_envs * self.config.frame_shape().bytes()];
         self.observe(&mut frames);
-        saved::encode(&SavedExec {
+        saved::encode(&ExecState {
             config: self.config.clone(),
             copies: self.num_envs,
             frames,
@@ -351,17 +351,17 @@ impl Environment for ExecWorld {
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let SavedExec { frames, state, .. } =
-            SavedExec::from_bytes(state, &self.config, self.num_envs)?;
-        if !self.saves {
+        let ExecState { frames, state, .. } =
+            ExecState::from_bytes(state, &self.config, self.num_envs)?;
+        if !self.can_save {
             return Err(EnvError::not_saved());
         }
         // Loading has the start's time-out, as a world may have to replay an episode.
-        self.process.exchange = self.config.starting("in the middle of loading its state");
-        let memory = state_memory(&state)
+        self.process.exchange = self.config.start_wait("in the middle of loading its state");
+        let memory = state_file(&state)
             .and_then(|memory| self.block.write_frames(&frames).map(|()| memory))
-            .map_err(|e| self.process.system(&e))?;
-        self.say_state(LOAD, &memory)?;
-        self.hear_done()
+            .map_err(|e| self.process.io_error(&e))?;
+        self.request_state(LOAD, &memory)?;
+        self.expect_done()
     }
 }

@@ -75,11 +75,11 @@ impl IsingLattice {
             "an Ising lattice with {boundary:?} boundary needs sides of {side_min} to {SIDE_MAX} sites, got {height} x {width}"
         );
         require(sides.all(|side| (side_min..=SIDE_MAX).contains(&side)), why)?;
-        let (all, given) = (height * width, present.len());
+        let (expected, found) = (height * width, present.len());
         let why = format!(
-            "the mask of a {height} x {width} Ising lattice needs {all} entries and at least one site, got {given} entries"
+            "the mask of a {height} x {width} Ising lattice needs {expected} entries and at least one site, got {found} entries"
         );
-        require(given == all && present.contains(&true), why)?;
+        require(found == expected && present.contains(&true), why)?;
         let sites_of = |colour: usize| {
             (0..height * width)
                 .filter(move |i| present[*i] && (i / width + i % width) % 2 == colour)
@@ -114,12 +114,12 @@ impl IsingLattice {
     /// # Errors
     /// Spins that are not -1 or +1 exactly where there is a site, and 0 elsewhere.
     pub fn set_spins(&mut self, spins: &[i8]) -> Result<(), EnvError> {
-        let own = &mut self.spins[..self.height * self.width];
+        let current = &mut self.spins[..self.height * self.width];
         // 1 where there is a site, else 0.
-        let site = |spin: &i8| spin.unsigned_abs();
-        let fits = spins.iter().map(site).eq(own.iter().map(site));
-        saved::check(fits, "a lattice")?;
-        own.copy_from_slice(spins);
+        let mask = |spin: &i8| spin.unsigned_abs();
+        let fits = spins.iter().map(mask).eq(current.iter().map(mask));
+        saved::ensure_fits(fits, "a lattice")?;
+        current.copy_from_slice(spins);
         Ok(())
     }
 
@@ -142,9 +142,9 @@ impl IsingLattice {
         &self.spins[..self.height * self.width]
     }
 
-    fn field(&self, site: usize) -> i32 {
-        let beside = self.neighbours[site].iter();
-        beside.map(|&n| i32::from(self.spins[n as usize])).sum()
+    fn neighbour_sum(&self, site: usize) -> i32 {
+        let neighbours = self.neighbours[site].iter();
+        neighbours.map(|&n| i32::from(self.spins[n as usize])).sum()
     }
 
     /// Flips `site` with probability min(1, exp(-dE / T)), dE = 2 s h, h the sum of its neighbours.
@@ -152,7 +152,7 @@ impl IsingLattice {
     fn propose(&mut self, site: u32, rng: &mut impl Rng) {
         let site = site as usize;
         let spin = i32::from(self.spins[site]);
-        let aligned = spin * self.field(site);
+        let aligned = spin * self.neighbour_sum(site);
         if aligned <= 0
             || rng.random::<u64>() < self.accept_below[(aligned + NEIGHBOURS as i32) as usize]
         {
@@ -163,7 +163,7 @@ impl IsingLattice {
     /// Total energy E, in units of J.
     #[cfg(test)]
     pub(super) fn energy(&self) -> i64 {
-        let bonds = |site: usize| i64::from(self.spins[site]) * i64::from(self.field(site));
+        let bonds = |site: usize| i64::from(self.spins[site]) * i64::from(self.neighbour_sum(site));
         let twice: i64 = self.sites.iter().map(|&site| bonds(site as usize)).sum();
         -twice / 2
     }

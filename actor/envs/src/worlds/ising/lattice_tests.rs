@@ -175,7 +175,7 @@ fn unusable_settings_are_errors() {
 }
 
 /// Mean of s(now) s(earlier) over the sites of a large lattice, for states one and two sweeps apart.
-fn overlaps(temperature: f64) -> [f64; 2] {
+fn mean_overlaps(temperature: f64) -> [f64; 2] {
     let rng = &mut ChaCha8Rng::seed_from_u64(9);
     let periodic = Boundary::Periodic;
     let mut lattice = IsingLattice::random(64, 64, temperature, periodic, rng).unwrap();
@@ -199,7 +199,7 @@ fn overlaps(temperature: f64) -> [f64; 2] {
 #[test]
 fn a_lattice_at_the_hottest_temperature_does_not_blink() {
     for temperature in [2.5, 4.0, 5.0] {
-        let [one, two] = overlaps(temperature);
+        let [one, two] = mean_overlaps(temperature);
         assert!(one > -0.5 && two < 0.5, "T = {temperature}: {one}, {two}");
     }
 }
@@ -247,7 +247,7 @@ fn critical_temperature() -> f64 {
 }
 
 /// Means of energy and |magnetisation| per site over `sweeps`, after a tenth as many to settle.
-fn sampled(side: usize, temperature: f64, sweeps: usize, seed: u64) -> (f64, f64) {
+fn sample_means(side: usize, temperature: f64, sweeps: usize, seed: u64) -> (f64, f64) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let periodic = Boundary::Periodic;
     let mut lattice = IsingLattice::random(side, side, temperature, periodic, &mut rng).unwrap();
@@ -286,7 +286,7 @@ fn the_exact_torus_is_what_enumeration_and_onsager_say() {
 fn large_lattices_have_onsager_s_critical_point() {
     let critical = critical_temperature();
     for (temperature, seed) in [(0.9 * critical, 6), (critical, 7), (1.2 * critical, 8)] {
-        let (energy, magnetisation) = sampled(32, temperature, 40_000, seed);
+        let (energy, magnetisation) = sample_means(32, temperature, 40_000, seed);
         let exact = energy_of_a_torus(32, temperature);
         let off = energy - exact;
         assert!(off.abs() < 0.02, "T = {temperature}: {energy}, not {exact}");

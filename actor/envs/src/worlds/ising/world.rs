@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use super::lattice::{Boundary, IsingLattice, check_temperature};
 use crate::environment::{FrameShape, StepEnd};
-use crate::envs::{Env, Envs, RngUse, env_rng};
+use crate::envs::{RngUse, SerialWorld, SingleEnv, env_rng};
 use crate::error::{EnvError, require};
 use crate::saved;
-use crate::settings::{Built, WorldSettings};
+use crate::settings::{BuildResult, WorldSettings};
 
 /// The settings of the Ising world. The paper: lattice 84, patch 42, temperature 0.4.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,17 +35,17 @@ pub struct IsingConfig {
 ///
 /// The patch's place is uniform in each episode: for 42 in 84 its centre, row and column, is uniform on 21..=63.
 /// Source: the paper's appendix on the Ising model, with the place fixed for an episode, as the main text says.
-pub type IsingWorld = Envs<Field>;
+pub type IsingWorld = SerialWorld<SpinField>;
 
 /// One field, and the lattice that is its patch.
-pub struct Field {
-    now: Now,
+pub struct SpinField {
+    state: FieldState,
     patch: IsingLattice,
 }
 
-/// The state of a [`Field`] that does not follow from the settings, except the patch's spins.
+/// The state of a [`SpinField`] that does not follow from the settings, except the patch's spins.
 #[derive(Clone, Serialize, Deserialize)]
-pub struct Now {
+pub struct FieldState {
     rng: ChaCha8Rng,
     /// Row and column of the patch's first site.
     origin: (usize, usize),
@@ -56,7 +56,7 @@ pub struct Now {
 impl IsingWorld {
     /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if `env` is out of range.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
-        self.envs.get(env).map(|field| field.now.origin)
+        self.envs.get(env).map(|field| field.state.origin)
     }
 }
 
@@ -87,90 +87,90 @@ impl WorldSettings for IsingConfig {
         vec!["no-op"]
     }
 
-    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> BuildResult {
         Ok(Box::new(IsingWorld::new(self, num_envs, seed)?))
     }
 }
 
-impl Env for Field {
+impl SingleEnv for SpinField {
     type Config = IsingConfig;
 
     /// The state and the patch's spins.
-    type Saved = (Now, Vec<i8>);
+    type State = (FieldState, Vec<i8>);
 
     fn new(config: &IsingConfig, seed: u64, env: usize) -> Result<Self, EnvError> {
         let mut rng = env_rng(seed, env, RngUse::Game);
         let (side, temperature, boundary) =
             (config.patch_size, config.temperature, config.boundary);
         let patch = IsingLattice::random(side, side, temperature, boundary, &mut rng)?;
-        let now = Now {
+        let state = FieldState {
             rng,
             origin: (0, 0),
             frame: vec![0; config.frame_shape().bytes()],
             episode_step: 0,
         };
-        let mut field = Self { now, patch };
+        let mut field = Self { state, patch };
         field.reset(config);
         Ok(field)
     }
 
-    fn draw(&self, _: &IsingConfig, frame: &mut [u8]) {
-        frame.copy_from_slice(&self.now.frame);
+    fn render(&self, _: &IsingConfig, frame: &mut [u8]) {
+        frame.copy_from_slice(&self.state.frame);
     }
 
     fn act(&mut self, config: &IsingConfig, _: u8) -> (f32, StepEnd) {
-        self.now.episode_step += 1;
-        if self.now.episode_step >= config.episode_steps {
+        self.state.episode_step += 1;
+        if self.state.episode_step >= config.episode_steps {
             self.reset(config);
             return (0.0, StepEnd::TimedOut);
         }
         for _ in 0..config.sweeps_per_step {
-            self.patch.sweep(&mut self.now.rng);
+            self.patch.sweep(&mut self.state.rng);
         }
         self.paint(config);
         (0.0, StepEnd::Running)
     }
 
-    fn saved(&self) -> Self::Saved {
-        (self.now.clone(), self.patch.spins().to_vec())
+    fn state(&self) -> Self::State {
+        (self.state.clone(), self.patch.spins().to_vec())
     }
 
-    fn restore(&mut self, config: &IsingConfig, (now, spins): Self::Saved) -> Result<(), EnvError> {
-        let (row, col) = now.origin;
+    fn restore(&mut self, config: &IsingConfig, saved: Self::State) -> Result<(), EnvError> {
+        let (state, spins) = saved;
+        let (row, col) = state.origin;
         let origin_max = config.lattice_size - config.patch_size;
-        saved::check(row.max(col) <= origin_max, "the patch's place")?;
-        let frame_bytes = config.frame_shape().bytes();
-        saved::check(now.frame.len() == frame_bytes, "a frame")?;
+        saved::ensure_fits(row.max(col) <= origin_max, "the patch's place")?;
+        saved::ensure_fits(state.frame.len() == config.frame_shape().bytes(), "a frame")?;
         self.patch.set_spins(&spins)?;
-        self.now = now;
+        self.state = state;
         Ok(())
     }
 }
 
-impl Field {
+impl SpinField {
     fn reset(&mut self, config: &IsingConfig) {
         let origin_max = config.lattice_size - config.patch_size;
-        self.now.origin = (
-            self.now.rng.random_range(0..=origin_max),
-            self.now.rng.random_range(0..=origin_max),
+        self.state.origin = (
+            self.state.rng.random_range(0..=origin_max),
+            self.state.rng.random_range(0..=origin_max),
         );
-        self.patch.randomise(&mut self.now.rng);
-        self.now.episode_step = 0;
+        self.patch.randomise(&mut self.state.rng);
+        self.state.episode_step = 0;
         self.paint(config);
     }
 
     /// Draws the noise afresh, and the patch over it.
     fn paint(&mut self, config: &IsingConfig) {
-        for pixels in self.now.frame.chunks_mut(64) {
-            let bits: u64 = self.now.rng.random();
+        for pixels in self.state.frame.chunks_mut(64) {
+            let bits: u64 = self.state.rng.random();
             for (bit, pixel) in pixels.iter_mut().enumerate() {
                 *pixel = (bits >> bit & 1) as u8 * 255;
             }
         }
-        let ((top, left), side) = (self.now.origin, config.patch_size);
+        let ((top, left), side) = (self.state.origin, config.patch_size);
         for (row, spins) in self.patch.spins().chunks_exact(side).enumerate() {
             let start = (top + row) * config.lattice_size + left;
-            let pixels = &mut self.now.frame[start..start + side];
+            let pixels = &mut self.state.frame[start..start + side];
             for (pixel, &spin) in pixels.iter_mut().zip(spins) {
                 *pixel = if spin > 0 { 255 } else { 0 };
             }
@@ -185,7 +185,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::playing::{play, step};
 
-    pub(crate) fn paper() -> IsingConfig {
+    pub(crate) fn paper_config() -> IsingConfig {
         IsingConfig {
             lattice_size: 84,
             patch_size: 42,
@@ -198,7 +198,7 @@ pub(crate) mod tests {
 
     #[test]
     fn noise_is_fresh_and_the_patch_persists() {
-        let mut world = IsingWorld::new(&paper(), 1, 7).unwrap();
+        let mut world = IsingWorld::new(&paper_config(), 1, 7).unwrap();
         let (top, left) = world.patch_origin(0).unwrap();
         let seen = play(&mut world, 12, &mut ChaCha8Rng::seed_from_u64(0));
         assert!(seen.iter().all(|(_, rewards, _)| *rewards == [0.0]));
@@ -221,7 +221,7 @@ pub(crate) mod tests {
             episode_steps: 1,
             patch_size: 3,
             lattice_size: 6,
-            ..paper()
+            ..paper_config()
         };
         let mut world = IsingWorld::new(&config, 1, 8).unwrap();
         let mut counts = [0i32; 16];
@@ -235,7 +235,7 @@ pub(crate) mod tests {
         let chi = squares.iter().sum::<f64>() / 1000.0;
         // On 15 degrees of freedom, p = 0.001.
         assert!(chi < 37.7, "chi-square {chi}");
-        let mut world = IsingWorld::new(&paper(), 1, 8).unwrap();
+        let mut world = IsingWorld::new(&paper_config(), 1, 8).unwrap();
         let seen = play(&mut world, 32, &mut ChaCha8Rng::seed_from_u64(0));
         let times_out = |&t: &usize| seen[t].2 == [StepEnd::TimedOut];
         let timed_out: Vec<usize> = (0..32).filter(times_out).collect();
@@ -252,7 +252,7 @@ pub(crate) mod tests {
             |it| it.episode_steps = 0,
         ];
         for change in changes {
-            let mut bad = paper();
+            let mut bad = paper_config();
             change(&mut bad);
             assert!(IsingWorld::new(&bad, 1, 0).is_err(), "{bad:?}");
         }

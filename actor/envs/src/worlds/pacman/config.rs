@@ -65,7 +65,7 @@ pub struct IsingOverlay {
 }
 
 impl PacmanConfig {
-    pub(super) fn check(&self) -> Result<(), EnvError> {
+    pub(super) fn check_ranges(&self) -> Result<(), EnvError> {
         for (name, value) in [
             ("epsilon", self.epsilon),
             ("switch_probability", self.switch_probability),
@@ -109,7 +109,7 @@ impl PacmanConfig {
     }
 
     /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0; the schedule must be a valid one.
-    pub(super) fn lethal_in(&self, episode: u64) -> [bool; GHOSTS] {
+    pub(super) fn lethal_ghosts(&self, episode: u64) -> [bool; GHOSTS] {
         let Some(schedule) = &self.lethal_schedule else {
             return self.lethal;
         };

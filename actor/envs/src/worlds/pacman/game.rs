@@ -10,7 +10,7 @@ use super::{
     maze::{DIRECTIONS, GHOSTS, Item, MAZE, Place},
     render,
 };
-use crate::{environment::StepEnd, error::EnvError, saved::check};
+use crate::{environment::StepEnd, error::EnvError, saved::ensure_fits};
 
 /// One game. The saved state is this struct: it leaves out the maze and the settings, which never change.
 #[derive(Clone, Serialize, Deserialize)]
@@ -37,7 +37,7 @@ impl Game {
             rng,
             agent: MAZE.agent_start,
             ghosts: MAZE.ghost_starts.map(Ghost::at),
-            lethal: config.lethal_in(episodes),
+            lethal: config.lethal_ghosts(episodes),
             boost_left: 0,
             items: MAZE.items.clone(),
             pellets_left: MAZE.pellets,
@@ -48,18 +48,18 @@ impl Game {
     }
 
     /// Returns an error if no game can be in this state.
-    pub(super) fn check(&self) -> Result<(), EnvError> {
+    pub(super) fn check_state(&self) -> Result<(), EnvError> {
         let places = MAZE.items.len();
         let is_place = |place: Place| usize::from(place) < places;
-        check(is_place(self.agent), "the agent's place")?;
+        ensure_fits(is_place(self.agent), "the agent's place")?;
         for ghost in self.ghosts {
-            let heads = ghost.heading.is_none_or(|it| usize::from(it) < DIRECTIONS);
-            check(is_place(ghost.place) && heads, "a ghost's place")?;
+            let is_heading = ghost.heading.is_none_or(|it| usize::from(it) < DIRECTIONS);
+            ensure_fits(is_place(ghost.place) && is_heading, "a ghost's place")?;
         }
         let pellets = self.items.iter().filter(|&&it| it == Item::Pellet).count();
         let fits = self.items.len() == places && self.pellets_left as usize == pellets;
-        check(fits, "the food")?;
-        check(self.background.len() == render::FRAME_BYTES, "a frame")
+        ensure_fits(fits, "the food")?;
+        ensure_fits(self.background.len() == render::FRAME_BYTES, "a frame")
     }
 
     /// Plays one step, without a reset. Returns its reward and its end.
@@ -82,9 +82,9 @@ impl Game {
             return (reward + config.reward_cleared, StepEnd::Terminal);
         }
         for (index, before) in ghosts_before.into_iter().enumerate() {
-            let here = self.ghosts[index].place;
-            let crossed = here == agent_before && before == self.agent;
-            if here != self.agent && !crossed {
+            let place = self.ghosts[index].place;
+            let crossed = place == agent_before && before == self.agent;
+            if place != self.agent && !crossed {
                 continue;
             }
             if boosted {
@@ -105,7 +105,7 @@ impl Game {
     fn eat(&mut self, config: &PacmanConfig, item: Item) -> f32 {
         if item != Item::Nothing {
             let pixel = MAZE.pixel(self.agent);
-            render::paint(&mut self.background, pixel, render::FLOOR);
+            render::paint_pixel(&mut self.background, pixel, render::FLOOR);
         }
         match item {
             Item::Nothing => 0.0,

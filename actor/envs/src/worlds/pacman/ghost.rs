@@ -9,7 +9,7 @@ use super::{
     maze::{DIRECTIONS, Direction, MAZE, Place},
 };
 
-/// A ghost's behaviour. `wanted` says which one the situation asks for.
+/// A ghost's behaviour. `wanted_mode` says which one the situation asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Mode {
     /// Continue at random, turning back only where there is no other way.
@@ -46,18 +46,18 @@ impl Ghost {
         boosted: bool,
         rng: &mut impl Rng,
     ) {
-        let wanted = wanted(MAZE.in_sight(self.place, agent), boosted);
+        let wanted = wanted_mode(MAZE.in_sight(self.place, agent), boosted);
         if wanted != self.mode && rng.random::<f64>() < config.switch_probability {
             self.mode = wanted;
         }
         let direction = if rng.random::<f64>() < config.epsilon {
-            Some(draw(MAZE.open(self.place), rng))
+            Some(draw_direction(MAZE.exits(self.place), rng))
         } else {
             match self.mode {
                 Mode::Wander => Some(self.wander(rng)),
                 Mode::Follow if self.place == agent => None,
-                Mode::Follow => self.best(|place| -i32::from(MAZE.distance(place, agent))),
-                Mode::Avoid => self.best(|place| MAZE.distance(place, agent).into()),
+                Mode::Follow => self.best_move(|place| -i32::from(MAZE.distance(place, agent))),
+                Mode::Avoid => self.best_move(|place| MAZE.distance(place, agent).into()),
             }
         };
         if let Some(direction) = direction {
@@ -67,23 +67,23 @@ impl Ghost {
     }
 
     fn wander(&self, rng: &mut impl Rng) -> Direction {
-        let open = MAZE.open(self.place);
+        let open = MAZE.exits(self.place);
         let back = self.heading.map_or(0, |heading| 1 << (heading ^ 1));
         let onward = open & !back;
-        draw(if onward == 0 { open } else { onward }, rng)
+        draw_direction(if onward == 0 { open } else { onward }, rng)
     }
 
     /// Returns the open direction with the highest score; of equals, the first in the order up, down, left, right.
-    fn best(&self, score: impl Fn(Place) -> i32) -> Option<Direction> {
+    fn best_move(&self, score: impl Fn(Place) -> i32) -> Option<Direction> {
         (0..DIRECTIONS as Direction)
             .rev()
-            .filter(|d| MAZE.open(self.place) >> d & 1 == 1)
+            .filter(|d| MAZE.exits(self.place) >> d & 1 == 1)
             .max_by_key(|&d| score(MAZE.next(self.place, d)))
     }
 }
 
 /// The paper's three behaviours: out of sight wander; in sight follow, or avoid an agent with a boost.
-fn wanted(visible: bool, boosted: bool) -> Mode {
+fn wanted_mode(visible: bool, boosted: bool) -> Mode {
     match (visible, boosted) {
         (false, _) => Mode::Wander,
         (true, false) => Mode::Follow,
@@ -92,12 +92,12 @@ fn wanted(visible: bool, boosted: bool) -> Mode {
 }
 
 /// A uniform draw among the directions whose bit is set in `open`, which must not be 0.
-fn draw(open: u8, rng: &mut impl Rng) -> Direction {
-    let mut left = open;
+fn draw_direction(open: u8, rng: &mut impl Rng) -> Direction {
+    let mut remaining = open;
     for _ in 0..rng.random_range(0..open.count_ones()) {
-        left &= left - 1;
+        remaining &= remaining - 1;
     }
-    left.trailing_zeros() as Direction
+    remaining.trailing_zeros() as Direction
 }
 
 #[cfg(test)]
@@ -174,7 +174,7 @@ mod tests {
     #[test]
     fn random_moves_are_uniform() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let crossing = MAZE.places().find(|&p| MAZE.open(p) == 0b1111).unwrap();
+        let crossing = MAZE.places().find(|&p| MAZE.exits(p) == 0b1111).unwrap();
         let mut counts = [0i32; 4];
         for _ in 0..40_000 {
             let mut ghost = Ghost {
@@ -203,7 +203,7 @@ mod tests {
             let back = before
                 .heading
                 .is_some_and(|heading| ghost.heading == Some(heading ^ 1));
-            assert!(!back || MAZE.open(before.place).count_ones() == 1);
+            assert!(!back || MAZE.exits(before.place).count_ones() == 1);
         }
         // A wanderer gets everywhere.
         assert_eq!(visited.len(), MAZE.items.len());

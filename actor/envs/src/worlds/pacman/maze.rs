@@ -62,7 +62,7 @@ pub(crate) struct Maze {
     /// Open cell and direction -> the open cell there, or the same one where a wall is.
     next: Vec<[Place; DIRECTIONS]>,
     /// Open cell -> bit d is set where direction d is open.
-    open: Vec<u8>,
+    exits: Vec<u8>,
     /// Open cell -> first pixel of its unbroken run of open cells in its row, and in its column.
     runs: Vec<(u16, u16)>,
     /// [places, places]: moves on the shortest way between two open cells.
@@ -92,7 +92,7 @@ impl Maze {
             place(pixel).expect("a start is an open cell")
         };
         let next_of = |from: usize| {
-            beside(pixels[from].into()).map(|pixel| place(pixel).unwrap_or(from as Place))
+            adjacent_pixels(pixels[from].into()).map(|pixel| place(pixel).unwrap_or(from as Place))
         };
         let next: Vec<_> = (0..pixels.len()).map(next_of).collect();
         let open = |from: usize| {
@@ -106,8 +106,8 @@ impl Maze {
         };
         let items: Vec<Item> = pixels.iter().map(item).collect();
         Self {
-            open: (0..pixels.len()).map(open).collect(),
-            runs: pixels.iter().map(|&pixel| runs(pixel.into())).collect(),
+            exits: (0..pixels.len()).map(open).collect(),
+            runs: pixels.iter().map(|&it| run_starts(it.into())).collect(),
             distances: (0..pixels.len())
                 .flat_map(|from| distances_from(from, &next))
                 .collect(),
@@ -136,8 +136,8 @@ impl Maze {
     }
 
     /// The ways out of a cell: bit d for direction d. Never 0.
-    pub(crate) fn open(&self, place: Place) -> u8 {
-        self.open[usize::from(place)]
+    pub(crate) fn exits(&self, place: Place) -> u8 {
+        self.exits[usize::from(place)]
     }
 
     /// Whether two open cells are in one row or column with no wall between. The tunnel cannot be looked through.
@@ -159,7 +159,7 @@ impl Maze {
 }
 
 /// The pixels up, down, left and right of `pixel`, wrapping around the rim.
-fn beside(pixel: usize) -> [usize; DIRECTIONS] {
+fn adjacent_pixels(pixel: usize) -> [usize; DIRECTIONS] {
     let (row, column) = (pixel / WIDTH, pixel % WIDTH);
     let at = |row: usize, column: usize| row % HEIGHT * WIDTH + column % WIDTH;
     [
@@ -171,7 +171,7 @@ fn beside(pixel: usize) -> [usize; DIRECTIONS] {
 }
 
 /// The pixel in which the run of open cells through `pixel` begins: along its row, and along its column.
-fn runs(pixel: usize) -> (u16, u16) {
+fn run_starts(pixel: usize) -> (u16, u16) {
     let (row, column) = (pixel / WIDTH, pixel % WIDTH);
     let left = (0..column).rev().find(|&c| LAYOUT[row][c] == b'#');
     let top = (0..row).rev().find(|&r| LAYOUT[r][column] == b'#');
@@ -230,7 +230,7 @@ pub(crate) mod tests {
         let house = MAZE.ghost_starts;
         for place in MAZE.places() {
             let a = MAZE.pixel(place);
-            let is_dead_end = MAZE.open(place).count_ones() < 2;
+            let is_dead_end = MAZE.exits(place).count_ones() < 2;
             assert!(!is_dead_end || house.contains(&place), "pixel {a}");
             for direction in 0..4 {
                 let there = MAZE.next(place, direction);

@@ -23,27 +23,27 @@ use maze::{HEIGHT, MAZE, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
 use crate::environment::{FrameShape, StepEnd};
-use crate::envs::{Env, Envs, RngUse, env_rng};
+use crate::envs::{RngUse, SerialWorld, SingleEnv, env_rng};
 use crate::error::EnvError;
-use crate::saved::check;
-use crate::settings::{Built, WorldSettings};
+use crate::saved::ensure_fits;
+use crate::settings::{BuildResult, WorldSettings};
 use crate::worlds::ising::{Boundary, IsingLattice};
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
 /// A move into a wall is a no-op. The no-op is a separate action so that an agent can wait for a ghost to pass.
-pub type PacmanWorld = Envs<Board>;
+pub type PacmanWorld = SerialWorld<Board>;
 
 /// One game, and the Ising model in its walls.
 pub struct Board {
     game: Game,
     /// The spins in the walls, if walls flicker. Their separate generator keeps the ghosts' moves the same with and without spins.
-    walls: Option<(IsingLattice, ChaCha8Rng)>,
+    wall_spins: Option<(IsingLattice, ChaCha8Rng)>,
 }
 
 impl WorldSettings for PacmanConfig {
     fn validate(&self) -> Result<(), EnvError> {
-        self.check()
+        self.check_ranges()
     }
 
     /// 21 x 19 x 3.
@@ -55,7 +55,7 @@ impl WorldSettings for PacmanConfig {
         vec!["no-op", "up", "down", "left", "right"]
     }
 
-    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> BuildResult {
         Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
     }
 
@@ -65,34 +65,34 @@ impl WorldSettings for PacmanConfig {
     }
 }
 
-impl Env for Board {
+impl SingleEnv for Board {
     type Config = PacmanConfig;
 
     /// A game; and, if walls flicker, the spins in its walls with their generator.
-    type Saved = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
+    type State = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
 
     fn new(config: &PacmanConfig, seed: u64, env: usize) -> Result<Self, EnvError> {
-        let mut walls = None;
+        let mut wall_spins = None;
         if let Some(overlay) = &config.ising {
             let (sites, temperature, free) = (MAZE.walls(), overlay.temperature, Boundary::Free);
             let mut rng = env_rng(seed, env, RngUse::Overlay);
             let mut lattice =
                 IsingLattice::masked(HEIGHT, WIDTH, &sites, temperature, free, &mut rng)?;
             lattice.randomise(&mut rng);
-            walls = Some((lattice, rng));
+            wall_spins = Some((lattice, rng));
         }
         let game = Game::start(config, env_rng(seed, env, RngUse::Game), 0);
-        Ok(Self { game, walls })
+        Ok(Self { game, wall_spins })
     }
 
-    fn draw(&self, _: &PacmanConfig, frame: &mut [u8]) {
+    fn render(&self, _: &PacmanConfig, frame: &mut [u8]) {
         let game = &self.game;
         frame.copy_from_slice(&game.background);
-        if let Some((lattice, _)) = &self.walls {
-            render::overlay(lattice.spins(), frame);
+        if let Some((lattice, _)) = &self.wall_spins {
+            render::paint_spins(lattice.spins(), frame);
         }
         let ghosts = game.ghosts.map(|ghost| ghost.place);
-        render::actors(ghosts, game.agent, game.boost_left > 0, frame);
+        render::paint_actors(ghosts, game.agent, game.boost_left > 0, frame);
     }
 
     fn act(&mut self, config: &PacmanConfig, action: u8) -> (f32, StepEnd) {
@@ -101,7 +101,7 @@ impl Env for Board {
         if end != StepEnd::Running {
             *game = Game::start(config, game.rng.clone(), game.episodes + 1);
         }
-        if let (Some((lattice, rng)), Some(overlay)) = (&mut self.walls, &config.ising) {
+        if let (Some((lattice, rng)), Some(overlay)) = (&mut self.wall_spins, &config.ising) {
             match end {
                 StepEnd::Running => (0..overlay.sweeps_per_step).for_each(|_| lattice.sweep(rng)),
                 _ => lattice.randomise(rng),
@@ -110,21 +110,21 @@ impl Env for Board {
         (reward, end)
     }
 
-    fn saved(&self) -> Self::Saved {
-        let walls = self.walls.as_ref();
-        let walls = walls.map(|(lattice, rng)| (lattice.spins().to_vec(), rng.clone()));
-        (self.game.clone(), walls)
+    fn state(&self) -> Self::State {
+        let spins = self.wall_spins.as_ref();
+        let spins = spins.map(|(lattice, rng)| (lattice.spins().to_vec(), rng.clone()));
+        (self.game.clone(), spins)
     }
 
-    fn restore(&mut self, _: &PacmanConfig, (game, walls): Self::Saved) -> Result<(), EnvError> {
-        game.check()?;
-        match (&mut self.walls, walls) {
+    fn restore(&mut self, _: &PacmanConfig, (game, walls): Self::State) -> Result<(), EnvError> {
+        game.check_state()?;
+        match (&mut self.wall_spins, walls) {
             (Some((lattice, own)), Some((spins, rng))) => {
                 lattice.set_spins(&spins)?;
                 *own = rng;
             }
             (None, None) => {}
-            _ => check(false, "the walls' flicker")?,
+            _ => ensure_fits(false, "the walls' flicker")?,
         }
         self.game = game;
         Ok(())

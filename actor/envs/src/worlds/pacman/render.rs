@@ -19,7 +19,8 @@ pub(crate) const AGENT: Colour = [255, 255, 0];
 /// The agent while a boost lasts: paler, so that the frame tells whether it is invincible.
 pub(crate) const AGENT_BOOSTED: Colour = [255, 255, 150];
 /// Red, cyan, orange, green.
-pub(crate) const GHOST: [Colour; GHOSTS] = [[255, 0, 0], [0, 255, 255], [255, 128, 0], [0, 255, 0]];
+pub(crate) const GHOST_COLOURS: [Colour; GHOSTS] =
+    [[255, 0, 0], [0, 255, 255], [255, 128, 0], [0, 255, 0]];
 /// A wall whose Ising spin is +1; one with spin -1 is unchanged.
 pub(crate) const FUCHSIA: Colour = [255, 0, 255];
 
@@ -34,13 +35,13 @@ fn background() -> Vec<u8> {
             Item::Pellet => PELLET,
             Item::Boost => BOOST,
         };
-        paint(&mut frame, MAZE.pixel(place), colour);
+        paint_pixel(&mut frame, MAZE.pixel(place), colour);
     }
     frame
 }
 
 /// Paints the walls by their spins [21 * 19]: fuchsia +1, wall -1; 0 (open cells) is left alone.
-pub(crate) fn overlay(spins: &[i8], frame: &mut [u8]) {
+pub(crate) fn paint_spins(spins: &[i8], frame: &mut [u8]) {
     for (pixel, &spin) in frame.chunks_exact_mut(CHANNELS).zip(spins) {
         match spin {
             1 => pixel.copy_from_slice(&FUCHSIA),
@@ -51,15 +52,15 @@ pub(crate) fn overlay(spins: &[i8], frame: &mut [u8]) {
 }
 
 /// Paints the ghosts, the first on top, and the agent over them.
-pub(crate) fn actors(ghosts: [Place; GHOSTS], agent: Place, boosted: bool, frame: &mut [u8]) {
-    for (place, colour) in ghosts.into_iter().zip(GHOST).rev() {
-        paint(frame, MAZE.pixel(place), colour);
+pub(crate) fn paint_actors(ghosts: [Place; GHOSTS], agent: Place, boosted: bool, frame: &mut [u8]) {
+    for (place, colour) in ghosts.into_iter().zip(GHOST_COLOURS).rev() {
+        paint_pixel(frame, MAZE.pixel(place), colour);
     }
     let colour = if boosted { AGENT_BOOSTED } else { AGENT };
-    paint(frame, MAZE.pixel(agent), colour);
+    paint_pixel(frame, MAZE.pixel(agent), colour);
 }
 
-pub(crate) fn paint(frame: &mut [u8], pixel: usize, colour: Colour) {
+pub(crate) fn paint_pixel(frame: &mut [u8], pixel: usize, colour: Colour) {
     frame[pixel * CHANNELS..][..CHANNELS].copy_from_slice(&colour);
 }
 
@@ -70,7 +71,7 @@ mod tests {
     #[test]
     fn colours_are_distinct() {
         let mut colours = vec![WALL, FLOOR, PELLET, BOOST, AGENT, AGENT_BOOSTED, FUCHSIA];
-        colours.extend(GHOST);
+        colours.extend(GHOST_COLOURS);
         let count = colours.len();
         colours.sort_unstable();
         colours.dedup();
@@ -80,8 +81,8 @@ mod tests {
     #[test]
     fn the_agent_is_over_the_ghosts_and_the_first_ghost_over_the_rest() {
         let mut frame = background();
-        actors([5, 5, 7, 7], 7, false, &mut frame);
+        paint_actors([5, 5, 7, 7], 7, false, &mut frame);
         let at = |place| frame[MAZE.pixel(place) * CHANNELS..][..CHANNELS].to_vec();
-        assert_eq!((at(5), at(7)), (GHOST[0].to_vec(), AGENT.to_vec()));
+        assert_eq!((at(5), at(7)), (GHOST_COLOURS[0].to_vec(), AGENT.to_vec()));
     }
 }

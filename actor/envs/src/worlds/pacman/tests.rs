@@ -8,7 +8,7 @@ use super::maze::{Item, tests::at};
 use super::*;
 use crate::environment::Environment;
 use crate::playing::{self, fails, frames, play};
-use crate::saved::tests::continues;
+use crate::saved::tests::check_restore;
 
 pub(crate) fn config() -> PacmanConfig {
     PacmanConfig {
@@ -77,7 +77,7 @@ fn the_first_frame_shows_everything() {
     let count = |colour: render::Colour| frame.chunks_exact(3).filter(|&p| p == colour).count();
     let counts = [render::AGENT, render::PELLET, render::BOOST].map(count);
     assert_eq!(counts, [1, 187, 4]);
-    assert_eq!(render::GHOST.map(count), [1; 4]);
+    assert_eq!(render::GHOST_COLOURS.map(count), [1; 4]);
     assert_eq!(count(render::WALL), 21 * 19 - 196);
 }
 
@@ -365,7 +365,7 @@ fn a_game_continues_where_it_was_saved() {
         };
         let make =
             || -> Box<dyn Environment> { Box::new(PacmanWorld::new(&config, 3, 5).unwrap()) };
-        assert!(continues("Ms. PacMan", 100, make) > 3);
+        assert!(check_restore("Ms. PacMan", 100, make) > 3);
     }
 }
 
@@ -374,7 +374,7 @@ fn a_state_that_no_game_has_is_refused() {
     let refuse = |what: &str, change: fn(&mut Game)| {
         let mut wrong = PacmanWorld::new(&config(), 1, 5).unwrap().envs.remove(0);
         change(&mut wrong.game);
-        fails(wrong.game.check(), &[what]);
+        fails(wrong.game.check_state(), &[what]);
     };
     refuse("the agent's place", |game| game.agent = 10_000);
     refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));

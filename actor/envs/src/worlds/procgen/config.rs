@@ -41,7 +41,7 @@ pub struct ProcgenConfig {
     pub restrict_themes: bool,
     /// Side of a frame in pixels, 8 to 64, as it is sent, stored and learned from. The engine draws 64; smaller frames
     /// are means over areas of its picture. Settings of earlier versions lack this field and mean 64.
-    #[serde(default = "whole_side")]
+    #[serde(default = "engine_side")]
     pub frame_side: u32,
     /// Whether frames are grey, one byte per pixel, rather than in colour. Settings of earlier versions lack this field and mean false.
     #[serde(default)]
@@ -52,7 +52,7 @@ pub struct ProcgenConfig {
     pub library: Option<String>,
 }
 
-pub(super) const fn whole_side() -> u32 {
+pub(super) const fn engine_side() -> u32 {
     FRAME_SIDE as u32
 }
 

@@ -39,9 +39,9 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{check_frames, check_step};
 use crate::error::{EnvError, require};
 use crate::saved;
-use crate::settings::{Built, Variants, WorldSettings};
-use config::whole_side;
-use shrink::{RGB, Shrink};
+use crate::settings::{BuildResult, Variants, WorldSettings};
+use config::engine_side;
+use shrink::{FrameShrinker, RGB};
 
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
@@ -61,16 +61,16 @@ pub struct ProcgenWorld {
     /// Steps after which the engine ends an episode.
     time_limit_steps: u32,
     /// Keeps sequential levels in their set; `None` without sequential levels, where the engine does so itself.
-    levels: Option<LevelSet>,
+    level_set: Option<LevelSet>,
     /// The shape of this world's frames.
     shape: FrameShape,
     /// Makes frames smaller or grey; `None` if this world's frames are the engine's.
-    shrink: Option<Shrink>,
+    shrinker: Option<FrameShrinker>,
 }
 
 /// The set of levels, and the spare environment in which an environment that has left it is reset.
 struct LevelSet {
-    levels: std::ops::Range<i32>,
+    range: std::ops::Range<i32>,
     spare: VecGame,
 }
 
@@ -87,7 +87,7 @@ impl ProcgenWorld {
         config.validate()?;
         let options = config.options(num_envs, seed, threads)?;
         let engine = config.engine(&mut |_| {})?;
-        let levels = if config.use_sequential_levels {
+        let level_set = if config.use_sequential_levels {
             let spare = procgen_sys::Options {
                 num_envs: 1,
                 num_threads: 0,
@@ -98,7 +98,7 @@ impl ProcgenWorld {
                 levels => options.start_level + levels,
             };
             Some(LevelSet {
-                levels: options.start_level..end,
+                range: options.start_level..end,
                 spare: VecGame::new(&engine, &spare)?,
             })
         } else {
@@ -109,14 +109,14 @@ impl ProcgenWorld {
             game: VecGame::new(&engine, &options)?,
             steps_taken: vec![0; num_envs],
             time_limit_steps: config.game.time_limit_steps(config.distribution_mode),
-            levels,
+            level_set,
             shape,
-            shrink: (shape.bytes() < FRAME_BYTES).then(|| Shrink::new(shape)),
+            shrinker: (shape.bytes() < FRAME_BYTES).then(|| FrameShrinker::new(shape)),
         })
     }
 
     /// What the last step ended in environment `env`; `steps_taken` must already count that step.
-    fn end_of(&self, env: usize) -> StepEnd {
+    fn step_end(&self, env: usize) -> StepEnd {
         let completed = self.game.prev_level_complete()[env] != 0;
         match (self.game.first()[env] != 0, completed) {
             (false, false) => StepEnd::Running,
@@ -133,13 +133,13 @@ impl LevelSet {
         self.spare.set_state(0, &game.state(env)?)?;
         for _ in 0..REDRAWS_MAX {
             self.spare.act(&[RESET])?;
-            if self.levels.contains(&self.spare.level_seed()[0]) {
+            if self.range.contains(&self.spare.level_seed()[0]) {
                 return game.set_state(env, &self.spare.state(0)?);
             }
         }
         let text = format!(
             "{REDRAWS_MAX} resets in a row drew no level of {:?}",
-            self.levels
+            self.range
         );
         Err(ProcgenError::Unexpected(text))
     }
@@ -148,7 +148,7 @@ impl LevelSet {
 impl WorldSettings for ProcgenConfig {
     /// Needs no engine.
     fn validate(&self) -> Result<(), EnvError> {
-        let (side, whole) = (self.frame_side, whole_side());
+        let (side, whole) = (self.frame_side, engine_side());
         let why = format!(
             "frame_side = {side}; the engine draws {whole} pixels a side, and {SIDE_MIN} of them are the fewest; `input.height` and \
              `input.width` enlarge"
@@ -173,7 +173,7 @@ impl WorldSettings for ProcgenConfig {
         names.split(' ').collect()
     }
 
-    fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built {
+    fn build(&self, num_envs: usize, seed: u64, threads: usize) -> BuildResult {
         Ok(Box::new(ProcgenWorld::new(self, num_envs, seed, threads)?))
     }
 
@@ -181,7 +181,7 @@ impl WorldSettings for ProcgenConfig {
         Variants {
             key: "game",
             names: &Game::NAMES,
-            is_open: false,
+            is_free_text: false,
         }
     }
 
@@ -218,9 +218,9 @@ impl Environment for ProcgenWorld {
 
     fn observe(&mut self, frames: &mut [u8]) {
         check_frames(frames, self.num_envs(), self.shape);
-        match &self.shrink {
+        match &self.shrinker {
             None => frames.copy_from_slice(self.game.frames()),
-            Some(shrink) => shrink.apply(self.game.frames(), frames),
+            Some(shrinker) => shrinker.apply(self.game.frames(), frames),
         }
     }
 
@@ -236,14 +236,14 @@ impl Environment for ProcgenWorld {
         rewards.copy_from_slice(self.game.rewards());
         for (env, end) in ends.iter_mut().enumerate() {
             self.steps_taken[env] += 1;
-            *end = self.end_of(env);
+            *end = self.step_end(env);
             if *end != StepEnd::Running {
                 self.steps_taken[env] = 0;
             }
-            if let Some(levels) = &mut self.levels
-                && !levels.levels.contains(&self.game.level_seed()[env])
+            if let Some(level_set) = &mut self.level_set
+                && !level_set.range.contains(&self.game.level_seed()[env])
             {
-                levels.redraw(&mut self.game, env)?;
+                level_set.redraw(&mut self.game, env)?;
             }
         }
         Ok(())

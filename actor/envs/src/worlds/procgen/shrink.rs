@@ -15,29 +15,29 @@ const LUMA_SUM: u32 = 1000;
 ///
 /// A pixel is the mean over the area that it covers, pixels at its edges counted in proportion, rounded to the nearest number, halves
 /// up; its grey is the luma of that mean before rounding. The arithmetic is exact in 32 bits.
-pub(super) struct Shrink {
+pub(super) struct FrameShrinker {
     shape: FrameShape,
     /// For each pixel along a side, the first engine pixel that it covers, and how much of each it covers, in units of `1 / side`.
-    covers: Vec<(usize, Vec<u32>)>,
+    coverage: Vec<(usize, Vec<u32>)>,
 }
 
-impl Shrink {
+impl FrameShrinker {
     /// Shrinks to frames of this shape: a side of 1 to 64 pixels, and 3 bytes per pixel, or 1 if they are grey.
     pub(super) fn new(shape: FrameShape) -> Self {
         let side = shape.height;
         assert!((1..=FRAME_SIDE).contains(&side), "a side of {side} pixels");
         // In units of 1 / side of the engine's pixels, ours is FRAME_SIDE wide and the engine's is side wide.
-        let covers = (0..side).map(|at| {
-            let (start, end) = (at * FRAME_SIDE, (at + 1) * FRAME_SIDE);
+        let coverage = (0..side).map(|index| {
+            let (start, end) = (index * FRAME_SIDE, (index + 1) * FRAME_SIDE);
             let first = start / side;
-            let parts = (first..end.div_ceil(side)).map(|pixel| {
+            let overlaps = (first..end.div_ceil(side)).map(|pixel| {
                 let overlap = end.min((pixel + 1) * side) - start.max(pixel * side);
                 overlap as u32
             });
-            (first, parts.collect())
+            (first, overlaps.collect())
         });
         Self {
-            covers: covers.collect(),
+            coverage: coverage.collect(),
             shape,
         }
     }
@@ -46,21 +46,21 @@ impl Shrink {
     pub(super) fn apply(&self, frames: &[u8], out: &mut [u8]) {
         let frames = frames.chunks_exact(FRAME_BYTES);
         for (frame, out) in frames.zip(out.chunks_exact_mut(self.shape.bytes())) {
-            self.one(frame, out);
+            self.shrink_frame(frame, out);
         }
     }
 
-    fn one(&self, frame: &[u8], out: &mut [u8]) {
+    fn shrink_frame(&self, frame: &[u8], out: &mut [u8]) {
         let mut pixels = out.chunks_exact_mut(self.shape.channels);
-        for (top, rows) in &self.covers {
-            for (left, cols) in &self.covers {
+        for (top, rows) in &self.coverage {
+            for (left, cols) in &self.coverage {
                 // At most 255 * 64 * 64.
                 let mut sums = [0u32; RGB];
-                for (row, &high) in rows.iter().enumerate() {
+                for (row, &row_weight) in rows.iter().enumerate() {
                     let line = &frame[((top + row) * FRAME_SIDE + left) * RGB..];
-                    for (pixel, &wide) in line.chunks_exact(RGB).zip(cols) {
+                    for (pixel, &col_weight) in line.chunks_exact(RGB).zip(cols) {
                         for (sum, &value) in sums.iter_mut().zip(pixel) {
-                            *sum += high * wide * u32::from(value);
+                            *sum += row_weight * col_weight * u32::from(value);
                         }
                     }
                 }
@@ -68,10 +68,10 @@ impl Shrink {
                 let area = (FRAME_SIDE * FRAME_SIDE) as u32;
                 if self.shape.channels == 1 {
                     let luma: u32 = sums.iter().zip(LUMA).map(|(sum, share)| sum * share).sum();
-                    pixel[0] = rounded(luma, area * LUMA_SUM);
+                    pixel[0] = rounded_ratio(luma, area * LUMA_SUM);
                 } else {
                     for (value, sum) in pixel.iter_mut().zip(sums) {
-                        *value = rounded(sum, area);
+                        *value = rounded_ratio(sum, area);
                     }
                 }
             }
@@ -79,9 +79,9 @@ impl Shrink {
     }
 }
 
-/// `sum / of` to the nearest number, halves up; it must be below 256.
-const fn rounded(sum: u32, of: u32) -> u8 {
-    ((sum + of / 2) / of) as u8
+/// `sum / divisor` to the nearest number, halves up; it must be below 256.
+const fn rounded_ratio(sum: u32, divisor: u32) -> u8 {
+    ((sum + divisor / 2) / divisor) as u8
 }
 
 #[cfg(test)]
@@ -94,7 +94,7 @@ mod tests {
     fn shrunk(side: usize, grey: bool, frame: &[u8]) -> Vec<u8> {
         let shape = FrameShape::new(side, side, if grey { 1 } else { RGB });
         let mut out = vec![0; frame.len() / FRAME_BYTES * shape.bytes()];
-        Shrink::new(shape).apply(frame, &mut out);
+        FrameShrinker::new(shape).apply(frame, &mut out);
         out
     }
 

@@ -58,7 +58,7 @@ fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f32>, Vec<Ste
 
 /// Makes one environment at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
 /// was taken before: the engine aims shots with it, and does not forget it when a level starts.
-fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> VecGame {
+fn game_at_level(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> VecGame {
     let options = config.options(1, 0, 0).unwrap();
     let options = Options {
         num_levels: 1,
@@ -91,7 +91,7 @@ fn another_build_of_the_library_is_played_by_its_path() {
     fails(made(&nowhere), &["No such file"]);
     std::os::unix::fs::symlink(engine.assets(), folder.path().join("assets")).unwrap();
 
-    crate::saved::tests::continues("another build", 50, || {
+    crate::saved::tests::check_restore("another build", 50, || {
         Box::new(ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap())
     });
     let mut published = ProcgenWorld::new(&config(Game::Coinrun), 2, 3, 0).unwrap();
@@ -126,7 +126,7 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
             let (seen, own_rewards, own_ends) = step(other, &actions);
             assert_eq!((&own_rewards, &own_ends), (&rewards, &ends));
             let mut expected = vec![0; seen.len()];
-            Shrink::new(other.frame_shape()).apply(&frames, &mut expected);
+            FrameShrinker::new(other.frame_shape()).apply(&frames, &mut expected);
             assert_eq!(seen, expected);
         }
     }
@@ -303,13 +303,13 @@ fn visible_actions_are_what_the_engine_does() {
 
 #[test]
 fn every_game_continues_where_it_was_saved() {
-    use crate::saved::tests::continues;
+    use crate::saved::tests::check_restore;
 
     let Some(_engine) = engine() else { return };
     let mut ended = 0;
     for game in Game::ALL {
         let config = config(game);
-        ended += continues(game.name(), 200, || {
+        ended += check_restore(game.name(), 200, || {
             Box::new(ProcgenWorld::new(&config, 2, 5, 0).unwrap())
         });
     }
@@ -317,8 +317,8 @@ fn every_game_continues_where_it_was_saved() {
 }
 
 fn redraw(world: &mut ProcgenWorld, env: usize) {
-    let levels = world.levels.as_mut().unwrap();
-    levels.redraw(&mut world.game, env).unwrap();
+    let level_set = world.level_set.as_mut().unwrap();
+    level_set.redraw(&mut world.game, env).unwrap();
 }
 
 #[test]
@@ -381,7 +381,7 @@ fn a_redrawn_level_is_the_level_itself() {
             redraw(&mut world, 1);
             let unchanged = [0, 2].map(|env| world.game.state(env).unwrap());
             assert!(others == unchanged, "{game}");
-            let mut alone = alone(engine, &config, world.game.level_seed()[1], last_move);
+            let mut alone = game_at_level(engine, &config, world.game.level_seed()[1], last_move);
             let frame = |frames: &[u8]| frames[FRAME_BYTES..2 * FRAME_BYTES].to_vec();
             let at = format!("{game}, round {round}");
             assert!(frame(world.game.frames()) == alone.frames(), "{at}");

@@ -11,7 +11,7 @@ use procgen_sys::{Game, NUM_ACTIONS};
 /// It could also be coarser: in leaper 0 and 2 do what 1 does, and 6 and 8 what 7 does; in starpilot 11 to 14 do what 9
 /// does. In caveflyer, dodgeball, fruitbot and ninja the effect of action 9 shows only after the next frame.
 pub fn visible_actions(game: Game) -> [u8; NUM_ACTIONS] {
-    let [left, still, right]: [&[usize]; 3] = match game {
+    let [left, no_op, right]: [&[usize]; 3] = match game {
         Game::Bigfish | Game::Chaser | Game::Coinrun | Game::Heist | Game::Leaper => {
             [&[], &[9, 10, 11, 12, 13, 14], &[]]
         }
@@ -23,7 +23,7 @@ pub fn visible_actions(game: Game) -> [u8; NUM_ACTIONS] {
         Game::Starpilot => [&[], &[], &[]],
     };
     let mut table: [u8; NUM_ACTIONS] = std::array::from_fn(|action| action as u8);
-    for (raw, visible) in [(left, 1), (still, 4), (right, 7)] {
+    for (raw, visible) in [(left, 1), (no_op, 4), (right, 7)] {
         raw.iter().for_each(|&action| table[action] = visible);
     }
     table

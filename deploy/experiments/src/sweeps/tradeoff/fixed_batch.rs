@@ -94,7 +94,7 @@ fn history(
     let world = config.world.build(ENVS, SEED, 0);
     let world = world.context("building the world")?;
     let actions = config.world.actions(config.actor.actions);
-    let world = RestrictedWorld::of(world, actions, sent)?;
+    let world = RestrictedWorld::wrap(world, actions, sent)?;
     let rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut acting = Acting::new(world, run.frame_stack as usize, rng)?;
     let enlarge = || config.input.resizer(sent, model);
