@@ -23,7 +23,7 @@ pub struct Step<'a> {
 }
 
 /// A running world, its frame stack, and the generator for exploration.
-pub struct Acting {
+pub struct ActingLoop {
     world: Box<dyn Environment>,
     stack: FrameStack,
     rng: ChaCha8Rng,
@@ -34,7 +34,7 @@ pub struct Acting {
     first: Vec<bool>,
 }
 
-/// The state of an [`Acting`] between two steps.
+/// The state of an [`ActingLoop`] between two steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActingState {
     world: Vec<u8>,
@@ -44,7 +44,7 @@ pub struct ActingState {
     rng: ChaCha8Rng,
 }
 
-impl Acting {
+impl ActingLoop {
     /// Starts `world` with stacks of `frame_stack` frames; `rng` is for exploration alone.
     pub fn new(
         world: Box<dyn Environment>,
@@ -95,7 +95,7 @@ impl Acting {
     }
 
     /// Restores a state saved with the same world.
-    pub fn go_on_from(&mut self, state: ActingState) -> Result<(), EnvError> {
+    pub fn restore(&mut self, state: ActingState) -> Result<(), EnvError> {
         if state.first.len() != self.first.len() {
             let (found, own) = (state.first.len(), self.first.len());
             return Err(EnvError::State(format!("{found} environments, not {own}")));

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    acting::{Acting, ActingState},
+    acting::{ActingLoop, ActingState},
     config::ActorSettings,
     error::ActError,
     policy::NetworkPolicy,
@@ -30,27 +30,27 @@ pub struct Incarnation {
 }
 
 impl Incarnation {
-    /// Returns the seed of the generator for `used_for`. Incarnations that differ in `actor`, `after_updates` or
+    /// Returns the seed of the generator for `purpose`. Incarnations that differ in `actor`, `after_updates` or
     /// `earlier_incarnations` get different seeds, whatever the values of these fields.
-    pub fn seed(&self, spec: &RunSpec, used_for: &str) -> [u8; 32] {
+    pub fn seed(&self, spec: &RunSpec, purpose: &str) -> [u8; 32] {
         let index = u64::from(self.actor) | self.after_updates << u32::BITS;
-        let mut used_for = used_for.to_owned();
+        let mut purpose = purpose.to_owned();
         if self.earlier_incarnations > 0 {
-            used_for += &format!(" after {} lives", self.earlier_incarnations);
+            purpose += &format!(" after {} lives", self.earlier_incarnations);
         }
         // The high bits of `after_updates`, which do not fit into the index.
-        let beyond = self.after_updates >> u32::BITS;
-        if beyond > 0 {
-            used_for += &format!(" after {beyond} times 2^32 updates");
+        let high_bits = self.after_updates >> u32::BITS;
+        if high_bits > 0 {
+            purpose += &format!(" after {high_bits} times 2^32 updates");
         }
-        spec.seed_for(&used_for, index)
+        spec.seed_for(&purpose, index)
     }
 }
 
 /// Steps a world with a policy and returns the transitions in chunks.
 pub struct Collector {
     schedule: Schedule,
-    acting: Acting,
+    acting: ActingLoop,
     recorder: ChunkRecorder,
     policy: NetworkPolicy,
     weights_version: u64,
@@ -83,32 +83,32 @@ impl Collector {
         let world_seed = incarnation.seed(spec, "world");
         let world_seed = u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes"));
         let (envs, threads) = (config.envs as usize, config.world_threads as usize);
-        let no_world = |source| ActError::NoWorld {
+        let build_error = |source| ActError::BuildWorld {
             world: spec.world.clone(),
             source,
         };
         let actions = settings.world.actions(config.actions);
         let world = settings.world.build(envs, world_seed, threads);
-        let world = world.map_err(no_world)?;
+        let world = world.map_err(build_error)?;
         let shape = world.frame_shape();
-        let sent = (spec.frame_height as usize, spec.frame_width as usize);
-        let (height, width) = settings.input.whole_frame(sent);
+        let sent_size = (spec.frame_height as usize, spec.frame_width as usize);
+        let (height, width) = settings.input.whole_frame(sent_size);
         let (channels, num_actions) = (spec.frame_channels as usize, spec.num_actions as usize);
-        let promised = (height, width, channels, num_actions);
-        let given = (shape.height, shape.width, shape.channels, actions.len());
-        if promised != given {
+        let expected = (height, width, channels, num_actions);
+        let found = (shape.height, shape.width, shape.channels, actions.len());
+        if expected != found {
             return Err(ActError::Other(format!(
-                "the world {} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \
+                "the world {} gives (height, width, channels, actions) {found:?}, the run spec promises {expected:?}: \
                  write the run's settings anew with `driml train`",
                 spec.world
             )));
         }
         let rng = ChaCha8Rng::from_seed(incarnation.seed(spec, "exploration"));
-        let world = RestrictedWorld::wrap(world, actions, sent).map_err(no_world)?;
-        let enlarge = settings.input.resizer(sent, &settings.model)?;
+        let world = RestrictedWorld::wrap(world, actions, sent_size).map_err(build_error)?;
+        let enlarge = settings.input.resizer(sent_size, &settings.model)?;
         let policy = NetworkPolicy::new(&settings.model, enlarge, safetensors, config.precision)?;
         Ok(Self {
-            acting: Acting::new(world, spec.frame_stack as usize, rng)?,
+            acting: ActingLoop::new(world, spec.frame_stack as usize, rng)?,
             recorder: ChunkRecorder::new(pool, actor, id, config.envs, spec.frame_bytes() as u32),
             policy: policy.with_noise(),
             weights_version,
@@ -118,14 +118,14 @@ impl Collector {
 
     /// Replaces the weights from the next chunk on. On an error, the old weights stay.
     pub fn set_weights(&mut self, version: u64, safetensors: &[u8]) -> Result<(), ActError> {
-        self.policy.load(safetensors)?;
+        self.policy.set_weights(safetensors)?;
         self.weights_version = version;
         Ok(())
     }
 
     /// The number of transitions in all chunks so far.
-    pub const fn produced(&self) -> u64 {
-        self.recorder.produced()
+    pub const fn transitions_recorded(&self) -> u64 {
+        self.recorder.transitions_recorded()
     }
 
     /// Acts until one chunk of `steps` steps is full. `frames`, the run's frame count so far, sets epsilon for the whole chunk.
@@ -134,17 +134,17 @@ impl Collector {
         Ok(chunk.expect("it is never over"))
     }
 
-    /// Like `collect`, but returns `None` once `is_over` is true. The chunk stays unfinished: do not collect again.
+    /// Like `collect`, but returns `None` once `is_stopped` is true. The chunk stays unfinished: do not collect again.
     pub(crate) fn collect_unless(
         &mut self,
-        is_over: impl Fn() -> bool,
+        is_stopped: impl Fn() -> bool,
         frames: u64,
         steps: u32,
     ) -> Result<Option<Chunk>, ActError> {
         let recorder = &mut self.recorder;
-        recorder.begin(self.weights_version, steps);
+        recorder.begin_chunk(self.weights_version, steps);
         let epsilon = self.schedule.epsilon(frames);
-        while !is_over() {
+        while !is_stopped() {
             let step = self.acting.step(&mut self.policy, epsilon)?;
             let chunk = recorder.record(step.frames, step.actions, step.rewards, step.ends);
             if chunk.is_some() {
@@ -158,14 +158,14 @@ impl Collector {
     pub fn state(&mut self) -> Result<CollectorState, ActError> {
         Ok(CollectorState {
             acting: self.acting.state()?,
-            next_chunk: self.recorder.next_chunk(),
+            next_chunk: self.recorder.next_chunk_numbers(),
         })
     }
 
     /// Restores a state saved with the same settings. With the same weights, the next chunks are the same.
-    pub fn go_on_from(&mut self, state: CollectorState) -> Result<(), ActError> {
-        self.acting.go_on_from(state.acting)?;
-        self.recorder.go_on_at(state.next_chunk);
+    pub fn restore(&mut self, state: CollectorState) -> Result<(), ActError> {
+        self.acting.restore(state.acting)?;
+        self.recorder.resume_at(state.next_chunk);
         Ok(())
     }
 }
@@ -249,11 +249,11 @@ mod tests {
     #[test]
     fn a_chunk_that_is_broken_off_is_dropped_and_not_counted() {
         let mut collector = collector(settings(0.0), FIRST).unwrap();
-        let looks = std::cell::Cell::new(0);
-        let is_over = || looks.replace(looks.get() + 1) == 3;
-        let chunk = collector.collect_unless(is_over, 0, STEPS).unwrap();
-        assert!(chunk.is_none() && looks.get() == 4);
-        assert_eq!(collector.produced(), 0);
+        let checks = std::cell::Cell::new(0);
+        let is_stopped = || checks.replace(checks.get() + 1) == 3;
+        let chunk = collector.collect_unless(is_stopped, 0, STEPS).unwrap();
+        assert!(chunk.is_none() && checks.get() == 4);
+        assert_eq!(collector.transitions_recorded(), 0);
     }
 
     /// The actions of an incarnation's first chunk.
@@ -274,7 +274,7 @@ mod tests {
             earlier_incarnations,
             ..FIRST
         };
-        let lives = [
+        let incarnations = [
             FIRST,
             at(0, 1),
             at(0, 2),
@@ -288,18 +288,18 @@ mod tests {
         ];
         let spec = settings(1.0).spec;
         let mut seen = Vec::new();
-        for incarnation in lives {
-            let new = (
+        for incarnation in incarnations {
+            let seeded = (
                 random(incarnation),
                 incarnation.seed(&spec, "world"),
                 incarnation.seed(&spec, "exploration"),
             );
-            assert_ne!(new.1, new.2);
-            let repeats = |old: &(Vec<u8>, [u8; 32], [u8; 32])| {
-                old.0 == new.0 || old.1 == new.1 || old.2 == new.2
+            assert_ne!(seeded.1, seeded.2);
+            let repeats = |earlier: &(Vec<u8>, [u8; 32], [u8; 32])| {
+                earlier.0 == seeded.0 || earlier.1 == seeded.1 || earlier.2 == seeded.2
             };
             assert!(!seen.iter().any(repeats), "{incarnation:?}");
-            seen.push(new);
+            seen.push(seeded);
         }
         // The first incarnation seeds its world by the actor's number as the index, as in earlier versions.
         assert_eq!(FIRST.seed(&spec, "world"), spec.seed_for("world", 3));
@@ -319,8 +319,8 @@ mod tests {
         };
         assert_ne!(actions(ladder(0.999, 8), FIRST), greedy);
         assert_eq!(actions(ladder(1e-12, 8), FIRST), greedy);
-        let said = collector(ladder(0.5, 3), FIRST).err().unwrap().to_string();
+        let message = collector(ladder(0.5, 3), FIRST).err().unwrap().to_string();
         let what_to_do = "--set actor.epsilon_ladder.actors=4";
-        assert!(said.contains(what_to_do), "{said}");
+        assert!(message.contains(what_to_do), "{message}");
     }
 }

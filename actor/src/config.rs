@@ -92,7 +92,7 @@ pub struct ActorSettings {
 
 /// The part of the launcher's `[local]` table that an actor reads.
 #[derive(Deserialize)]
-struct Planned {
+struct LocalTable {
     actors: u32,
 }
 
@@ -107,12 +107,12 @@ impl ActorSettings {
             model: settings.table("model")?,
             actor: settings.table("actor")?,
             transport: settings.table("transport")?,
-            actors_planned: settings.table("local").map_or(1, |it: Planned| it.actors),
+            actors_planned: settings.table("local").map_or(1, |t: LocalTable| t.actors),
         };
         this.spec.validate()?;
         this.model.validate()?;
         this.actor.validate()?;
-        this.check_chunk()?;
+        this.check_chunk_bytes()?;
         Ok(this)
     }
 
@@ -121,13 +121,13 @@ impl ActorSettings {
     /// # Errors
     /// Too many environments, or chunks longer than this run allows; the message says what to do.
     pub fn set_envs(&mut self, envs: u32) -> Result<(), ConfigError> {
-        let (steps, round) = (self.actor.steps_per_chunk, self.actor.round_transitions_max);
-        let most = transitions_max(self.actor.envs, steps, round);
+        let (steps, round_max) = (self.actor.steps_per_chunk, self.actor.round_transitions_max);
+        let allowed = transitions_max(self.actor.envs, steps, round_max);
         self.actor.envs = envs;
         self.actor.validate()?;
-        self.check_chunk()?;
+        self.check_chunk_bytes()?;
         let longest = u64::from(envs) * u64::from(self.actor.chunk_steps(1));
-        check(longest <= most, "actor.envs", envs, || {
+        check(longest <= allowed, "actor.envs", envs, || {
             "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
              actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)"
         })
@@ -137,7 +137,7 @@ impl ActorSettings {
     ///
     /// # Errors
     /// The world needs code outside this program and `world` is `None`, or `world` names another world.
-    pub fn set_world(&mut self, world: Option<WorldName>) -> Result<(), EnvError> {
+    pub fn set_world_code(&mut self, world: Option<WorldName>) -> Result<(), EnvError> {
         let name = self.world.name();
         match world {
             Some(world) => self.world = self.world.with_code_of(world)?,
@@ -154,7 +154,7 @@ impl ActorSettings {
     }
 
     /// Checks that the longest chunk fits a message.
-    pub fn check_chunk(&self) -> Result<(), ConfigError> {
+    pub fn check_chunk_bytes(&self) -> Result<(), ConfigError> {
         let transitions = u64::from(self.actor.envs) * u64::from(self.actor.chunk_steps(1));
         let bytes = transitions * self.transition_bytes() as u64;
         check(
@@ -171,7 +171,7 @@ impl ActorSettings {
 
     /// Returns the buffers for an actor's chunks: one being filled, and those not yet acknowledged. Buffers in shared
     /// memory have the chunk size for `actors_planned` actors; longer chunks use the process's own memory.
-    pub fn chunk_memory(&self) -> BufferPool {
+    pub fn chunk_buffers(&self) -> BufferPool {
         let count = self.actor.chunks_in_flight_max as usize + 1;
         let steps = self.actor.chunk_steps(self.actors_planned);
         let transitions = self.actor.envs as usize * steps as usize;
@@ -186,42 +186,42 @@ impl ActorSettings {
 impl Config {
     /// Returns the number of steps of the next chunk when `actors` actors are connected to the run.
     pub fn chunk_steps(&self, actors: u32) -> u32 {
-        let Some(round) = self.round_transitions_max else {
+        let Some(round_max) = self.round_transitions_max else {
             return self.steps_per_chunk;
         };
         let transitions_a_step = u64::from(self.envs) * u64::from(actors.max(1));
-        let steps = (round / transitions_a_step).clamp(1, self.steps_per_chunk.into());
+        let steps = (round_max / transitions_a_step).clamp(1, self.steps_per_chunk.into());
         u32::try_from(steps).unwrap_or(self.steps_per_chunk)
     }
 
     /// Checks every field's range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let why = "an actor steps 1 to 4096 environments";
-        within("envs", self.envs, 1..=4096, why)?;
+        check_range("envs", self.envs, 1..=4096, why)?;
         let why = "a chunk has 1 to 4096 steps";
-        within("steps_per_chunk", self.steps_per_chunk, 1..=4096, why)?;
+        check_range("steps_per_chunk", self.steps_per_chunk, 1..=4096, why)?;
         let (key, why) = ("chunks_in_flight_max", "1 to 64 chunks may wait");
-        within(key, self.chunks_in_flight_max, 1..=64, why)?;
+        check_range(key, self.chunks_in_flight_max, 1..=64, why)?;
         let why = "a probability lies between 0 and 1";
-        within("epsilon_start", self.epsilon_start, 0.0..=1.0, why)?;
-        within("epsilon_end", self.epsilon_end, 0.0..=1.0, why)?;
+        check_range("epsilon_start", self.epsilon_start, 0.0..=1.0, why)?;
+        check_range("epsilon_end", self.epsilon_end, 0.0..=1.0, why)?;
         if let Some(ladder) = &self.epsilon_ladder {
             let why = "the first actor's probability lies between 0 and 1, without the two";
             let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
-            within("epsilon_ladder.base", ladder.base, open, why)?;
+            check_range("epsilon_ladder.base", ladder.base, open, why)?;
             let why = "epsilons fall from actor to actor, so it is a number of at least 0";
-            within("epsilon_ladder.alpha", ladder.alpha, 0.0..=f64::MAX, why)?;
+            check_range("epsilon_ladder.alpha", ladder.alpha, 0.0..=f64::MAX, why)?;
             let why = "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand";
-            within("epsilon_ladder.actors", ladder.actors, 2..=ACTORS_MAX, why)?;
+            check_range("epsilon_ladder.actors", ladder.actors, 2..=ACTORS_MAX, why)?;
         }
-        let (why, waits) = ("a wait lasts 100 ms to one day", 100..=86_400_000);
-        within("ack_timeout_ms", self.ack_timeout_ms, waits.clone(), why)?;
-        within("unreachable_max_ms", self.unreachable_max_ms, waits, why)
+        let (why, range) = ("a wait lasts 100 ms to one day", 100..=86_400_000);
+        check_range("ack_timeout_ms", self.ack_timeout_ms, range.clone(), why)?;
+        check_range("unreachable_max_ms", self.unreachable_max_ms, range, why)
     }
 }
 
 /// Checks that the value of a key of the `[actor]` table lies in `range`.
-fn within<T: PartialOrd + Display>(
+fn check_range<T: PartialOrd + Display>(
     key: &str,
     value: T,
     range: impl RangeBounds<T>,

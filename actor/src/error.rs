@@ -18,7 +18,7 @@ pub enum ActError {
     World(#[from] EnvError),
     /// The world cannot be built.
     #[error("making the world {world}")]
-    NoWorld {
+    BuildWorld {
         /// The world's name in the settings.
         world: String,
         /// The world's error.

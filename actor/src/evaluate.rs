@@ -7,7 +7,7 @@ use driml_envs::{Environment, StepEnd};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    acting::{Acting, Step},
+    acting::{ActingLoop, Step},
     error::ActError,
     policy::Policy,
 };
@@ -26,10 +26,10 @@ pub struct Evaluation {
 }
 
 /// A callback that gets every step and the returns so far, and decides whether to continue.
-pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]) -> ControlFlow<()>;
+pub type OnStep<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]) -> ControlFlow<()>;
 
 /// Plays whole episodes of `policy` in `world`. Returns their returns in the order in which they ended, fewer of them
-/// if `watch` breaks. `rng` is for exploration alone.
+/// if `on_step` breaks. `rng` is for exploration alone.
 ///
 /// Each environment contributes the same number of episodes (the last round's surplus is dropped by environment order),
 /// so that short episodes do not count more because they end first.
@@ -41,14 +41,14 @@ pub fn episode_returns(
     policy: &mut dyn Policy,
     evaluation: Evaluation,
     rng: ChaCha8Rng,
-    watch: Watch<'_>,
+    on_step: OnStep<'_>,
 ) -> Result<Vec<f64>, ActError> {
     let (episodes, steps_max) = (evaluation.episodes, evaluation.steps_max);
     let envs = world.num_envs();
     let quota = |env: usize| episodes / envs + usize::from(env < episodes % envs);
-    let mut acting = Acting::new(world, evaluation.frame_stack, rng)?;
-    let mut running = vec![0.0; envs];
-    let mut ended = vec![0; envs];
+    let mut acting = ActingLoop::new(world, evaluation.frame_stack, rng)?;
+    let mut episode_return = vec![0.0; envs];
+    let mut episodes_ended = vec![0; envs];
     let mut returns = Vec::with_capacity(episodes);
     for _ in 0..steps_max {
         if returns.len() == episodes {
@@ -56,16 +56,16 @@ pub fn episode_returns(
         }
         let step = acting.step(policy, evaluation.epsilon)?;
         for env in 0..envs {
-            running[env] += f64::from(step.rewards[env]);
+            episode_return[env] += f64::from(step.rewards[env]);
             if matches!(step.ends[env], StepEnd::Terminal | StepEnd::TimedOut) {
-                if ended[env] < quota(env) {
-                    returns.push(running[env]);
-                    ended[env] += 1;
+                if episodes_ended[env] < quota(env) {
+                    returns.push(episode_return[env]);
+                    episodes_ended[env] += 1;
                 }
-                running[env] = 0.0;
+                episode_return[env] = 0.0;
             }
         }
-        if watch(&step, &returns).is_break() {
+        if on_step(&step, &returns).is_break() {
             return Ok(returns);
         }
     }
@@ -221,9 +221,9 @@ mod tests {
     #[test]
     fn episodes_that_do_not_end_are_an_error() {
         assert_eq!(play(&[LONG], 1, 4).unwrap(), [100.0]);
-        let said = play(&[LONG], 2, 7).unwrap_err().to_string();
+        let message = play(&[LONG], 2, 7).unwrap_err().to_string();
         assert_eq!(
-            said,
+            message,
             "only 1 of 2 episodes ended within 7 steps of each environment: the world may need a step limit"
         );
         let endless: &[_] = &[(1.0, StepEnd::LevelChange)];

@@ -52,10 +52,10 @@ pub struct NetworkPolicy {
     network: PolicyNetwork,
     enlarge: Option<Resizer>,
     num_actions: u8,
-    noise: bool,
+    has_noise: bool,
     /// Reused buffers: the environments in which the network chooses the action; their states, if these are not all;
     /// those states enlarged, if the network's input is larger; and the chosen actions.
-    deciding: Vec<usize>,
+    greedy_envs: Vec<usize>,
     states: Vec<u8>,
     enlarged: Vec<u8>,
     greedy: Vec<u8>,
@@ -77,8 +77,8 @@ impl NetworkPolicy {
                 let actions = model.num_actions;
                 ActError::Other(format!("{actions} actions: a world has at most 255"))
             })?,
-            noise: false,
-            deciding: Vec::new(),
+            has_noise: false,
+            greedy_envs: Vec::new(),
             states: Vec::new(),
             enlarged: Vec::new(),
             greedy: Vec::new(),
@@ -91,12 +91,12 @@ impl NetworkPolicy {
     /// Source: Fortunato et al. 2018, section 3.2 (a) and algorithm 1: a new sample before every action.
     #[must_use]
     pub const fn with_noise(mut self) -> Self {
-        self.noise = true;
+        self.has_noise = true;
         self
     }
 
     /// Replaces the weights; on an error the old ones stay.
-    pub fn load(&mut self, safetensors: &[u8]) -> Result<(), ActError> {
+    pub fn set_weights(&mut self, safetensors: &[u8]) -> Result<(), ActError> {
         Ok(self.network.load(safetensors)?)
     }
 }
@@ -109,20 +109,20 @@ impl Policy for NetworkPolicy {
         rng: &mut ChaCha8Rng,
         actions: &mut [u8],
     ) -> Result<(), ActError> {
-        self.deciding.clear();
+        self.greedy_envs.clear();
         for (env, action) in actions.iter_mut().enumerate() {
             if rng.random_bool(epsilon) {
                 *action = rng.random_range(0..self.num_actions);
             } else {
-                self.deciding.push(env);
+                self.greedy_envs.push(env);
             }
         }
-        let count = self.deciding.len();
+        let count = self.greedy_envs.len();
         let mut input = states;
         if count < actions.len() {
             let state_bytes = states.len() / actions.len();
             self.states.clear();
-            for &env in &self.deciding {
+            for &env in &self.greedy_envs {
                 let state = &states[env * state_bytes..][..state_bytes];
                 self.states.extend_from_slice(state);
             }
@@ -133,12 +133,12 @@ impl Policy for NetworkPolicy {
             enlarge.apply(input, &mut self.enlarged);
             input = &self.enlarged;
         }
-        if self.noise && count > 0 {
+        if self.has_noise && count > 0 {
             self.network.draw_noise(rng);
         }
         self.greedy.resize(count, 0);
         self.network.greedy_actions(input, &mut self.greedy)?;
-        for (&env, &action) in self.deciding.iter().zip(&self.greedy) {
+        for (&env, &action) in self.greedy_envs.iter().zip(&self.greedy) {
             actions[env] = action;
         }
         Ok(())
@@ -249,7 +249,7 @@ pub(crate) mod tests {
             policy.act(&states, epsilon, rng, &mut actions).unwrap();
             assert_eq!(actions, overruled);
             assert_eq!(rng.random::<u64>(), separate.random::<u64>());
-            assert_eq!(policy.greedy.len(), policy.deciding.len());
+            assert_eq!(policy.greedy.len(), policy.greedy_envs.len());
             let share = policy.greedy.len() as f64 / STATES as f64;
             assert!((share - (1.0 - epsilon)).abs() < 0.03, "{share}");
         }

@@ -6,7 +6,7 @@ use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use serde::{Deserialize, Serialize};
 
 /// Converts the end of a step to its wire format.
-const fn end_on_the_wire(end: StepEnd) -> End {
+const fn wire_end(end: StepEnd) -> End {
     match end {
         StepEnd::Running => End::Running,
         StepEnd::LevelChange => End::LevelChange,
@@ -34,18 +34,18 @@ pub struct ChunkRecorder {
 }
 
 impl ChunkRecorder {
-    /// Creates a recorder for `streams` environments. [`ChunkRecorder::begin`] sets the length of each chunk.
+    /// Creates a recorder for `num_envs` environments. [`ChunkRecorder::begin_chunk`] sets the length of each chunk.
     pub fn new(
         pool: BufferPool,
         actor: u32,
         incarnation: u64,
-        streams: u32,
+        num_envs: u32,
         frame_bytes: u32,
     ) -> Self {
         let header = ChunkHeader {
             actor,
             incarnation,
-            streams,
+            streams: num_envs,
             steps: 1,
             frame_bytes,
             ..ChunkHeader::default()
@@ -62,7 +62,7 @@ impl ChunkRecorder {
     ///
     /// # Panics
     /// If a chunk is being filled.
-    pub fn begin(&mut self, weights_version: u64, steps: u32) {
+    pub fn begin_chunk(&mut self, weights_version: u64, steps: u32) {
         assert!(
             self.chunk.is_none(),
             "one chunk, one version of the weights"
@@ -72,7 +72,7 @@ impl ChunkRecorder {
     }
 
     /// The number of transitions in all completed chunks.
-    pub const fn produced(&self) -> u64 {
+    pub const fn transitions_recorded(&self) -> u64 {
         self.header.first_transition
     }
 
@@ -80,7 +80,7 @@ impl ChunkRecorder {
     ///
     /// # Panics
     /// If a chunk is being filled.
-    pub fn next_chunk(&self) -> ChunkNumbers {
+    pub fn next_chunk_numbers(&self) -> ChunkNumbers {
         assert!(self.chunk.is_none(), "a chunk is kept whole or not at all");
         ChunkNumbers {
             sequence: self.header.sequence,
@@ -89,7 +89,7 @@ impl ChunkRecorder {
     }
 
     /// Continues with the numbers of another recorder of the same incarnation.
-    pub fn go_on_at(&mut self, next: ChunkNumbers) {
+    pub fn resume_at(&mut self, next: ChunkNumbers) {
         self.header.sequence = next.sequence;
         self.header.first_transition = next.first_transition;
     }
@@ -111,11 +111,11 @@ impl ChunkRecorder {
             Chunk::in_memory(header, pool.take(bytes))
         });
         let frame_bytes = header.frame_bytes as usize;
-        for (stream, frame) in frames.chunks_exact(frame_bytes).enumerate() {
-            let row = stream * header.steps as usize + self.filled_steps as usize;
+        for (env, frame) in frames.chunks_exact(frame_bytes).enumerate() {
+            let row = env * header.steps as usize + self.filled_steps as usize;
             chunk.frame_mut(row).copy_from_slice(frame);
-            let end = end_on_the_wire(ends[stream]);
-            chunk.set(row, actions[stream], rewards[stream], end);
+            let end = wire_end(ends[env]);
+            chunk.set(row, actions[env], rewards[env], end);
         }
         self.filled_steps += 1;
         if self.filled_steps < self.header.steps {
@@ -139,11 +139,11 @@ mod tests {
         let mut chunks = Vec::new();
         for step in 0..7_u8 {
             if step % 3 == 0 {
-                recorder.begin(u64::from(step), 3);
+                recorder.begin_chunk(u64::from(step), 3);
             }
             chunks.extend(recorder.record(&[step, 100 + step], &[step, step], &[0.5, -1.0], &ends));
         }
-        assert_eq!(recorder.produced(), 12);
+        assert_eq!(recorder.transitions_recorded(), 12);
 
         assert_eq!(chunks[0].frames(), [0, 1, 2, 100, 101, 102]);
         assert_eq!(chunks[1].frames(), [3, 4, 5, 103, 104, 105]);

@@ -20,7 +20,7 @@ use crate::{
 };
 
 /// How long an actor waits for the learner's first weights.
-const WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
+const FIRST_WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
 
 /// The arguments of one actor process. All other settings come from the replay server.
 #[derive(Clone, Debug)]
@@ -47,8 +47,8 @@ pub struct RunArgs {
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints::to(args.connect);
-    let (credentials, max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
-    let opened = session::open_unless(shutdown, endpoints, &keys, credentials, max)?;
+    let (credentials, bytes_max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
+    let opened = session::open_unless(shutdown, endpoints, &keys, credentials, bytes_max)?;
     let Some(session) = opened else {
         return Ok(false);
     };
@@ -60,7 +60,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     if let Some(envs) = args.envs {
         settings.set_envs(envs)?;
     }
-    settings.set_world(args.world)?;
+    settings.set_world_code(args.world)?;
     if settings.transport.shared_memory && !run_info.shared_memory {
         tracing::info!(
             "chunks go through sockets: the replay server takes none through shared memory"
@@ -72,13 +72,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         actor: args.actor,
         incarnation: rand::random(),
     };
-    let who = Participant::Actor {
+    let participant = Participant::Actor {
         actor: join.actor,
         incarnation: join.incarnation,
     };
     // Declared before joining, so that no other process can join as this actor from then on.
     let client = RunClient::new(session, keys, spec_hash);
-    let alive = client.declare_alive(who.alive());
+    let alive = client.declare_alive(participant.alive());
     let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
         return Ok(false);
@@ -92,17 +92,17 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     }
     let activity = Activity::new("waits for the learner's first weights");
     let clients = vec![client.clone()];
-    reporter::start(clients, who, activity.clone(), shutdown.clone())?;
-    let Some(first) = weights::first(&client, WEIGHTS_WAIT_MAX, shutdown)? else {
+    reporter::start(clients, participant, activity.clone(), shutdown.clone())?;
+    let Some(first) = weights::wait_for_first(&client, FIRST_WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(false);
     };
     // The learner has joined by now, so the replay server knows after how many updates a resumed run continues.
     let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
         return Ok(false);
     };
-    let pool = settings.chunk_memory();
+    let pool = settings.chunk_buffers();
     activity.begin("makes its environments");
-    let life = Incarnation {
+    let incarnation = Incarnation {
         actor: join.actor,
         id: join.incarnation,
         after_updates: run_info.after_updates,
@@ -110,24 +110,25 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     };
     let version = first.header.version;
     // A world in its own process may take minutes to start.
-    let made = {
+    let built = {
         let (settings, pool) = (settings.clone(), pool.clone());
-        let make = move || Collector::new(&settings, pool, life, version, &first.safetensors);
-        shutdown.unless_set("environments", make)?
+        let build =
+            move || Collector::new(&settings, pool, incarnation, version, &first.safetensors);
+        shutdown.unless_set("environments", build)?
     };
-    let Some(collector) = made else {
+    let Some(collector) = built else {
         return Ok(false);
     };
     let mut collector = collector?;
-    let newest = weights::watch(client.clone(), version, shutdown.clone())?;
+    let newest = weights::start_puller(client.clone(), version, shutdown.clone())?;
     let (actor, config) = (args.actor, &settings.actor);
-    let (inserted, limits) = (run_info.inserted_total, DeliveryLimits::of(config));
+    let (inserted, limits) = (run_info.inserted_total, DeliveryLimits::from_config(config));
     let delivery = Delivery::start(client.clone(), inserted, limits, pool, shutdown.clone())?;
     let envs = config.envs;
     tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
     // At the start, not all planned actors are connected yet.
     let chunk_steps = |actors: u32| config.chunk_steps(actors.max(settings.actors_planned));
-    let played = play(
+    let result = produce_chunks(
         &mut collector,
         chunk_steps,
         &newest,
@@ -135,29 +136,29 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         &activity,
         shutdown,
     );
-    if played.is_err() {
+    if result.is_err() {
         // Chunks from before the failure are still delivered, without a wait for the rate limiter.
         shutdown.set();
     }
-    let is_over = delivery.progress().finished;
-    let produced = collector.produced();
+    let is_finished = delivery.progress().is_finished;
+    let produced = collector.transitions_recorded();
     activity.begin("delivers its last chunks");
     let delivered = delivery.finish();
-    if let (Err(_), Err(e)) = (&played, &delivered) {
+    if let (Err(_), Err(e)) = (&result, &delivered) {
         tracing::warn!("not all that was played before could be delivered: {e}");
     }
-    played?;
+    result?;
     let stored = produced - delivered?;
     tracing::info!("actor {actor} leaves: {stored} transitions delivered");
     drop(alive);
     let closed = client.session().close().wait();
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))?;
-    Ok(is_over)
+    Ok(is_finished)
 }
 
 /// Collects and queues chunks until `shutdown`, or until the run needs no more. `chunk_steps` maps the number of actors
 /// in the run to the number of steps in a chunk.
-fn play(
+fn produce_chunks(
     collector: &mut Collector,
     chunk_steps: impl Fn(u32) -> u32,
     newest: &NewestWeights,
@@ -165,8 +166,8 @@ fn play(
     activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
-    while !shutdown.is_set() && !delivery.progress().finished {
-        let newer = newest.take_within(delivery.fresh_weights_max());
+    while !shutdown.is_set() && !delivery.progress().is_finished {
+        let newer = newest.take_within(delivery.fresh_weights_wait_max());
         if let Some(Weights {
             header,
             safetensors,
@@ -179,12 +180,12 @@ fn play(
             );
         }
         activity.begin("plays");
-        let run = delivery.progress();
-        let (frames, steps) = (run.inserted_total, chunk_steps(run.actors));
-        let played = collector.collect_unless(|| shutdown.is_set(), frames, steps)?;
-        let Some(chunk) = played else { break };
-        if let Some(waits) = delivery.describe_wait() {
-            activity.begin(waits);
+        let progress = delivery.progress();
+        let (frames, steps) = (progress.inserted_total, chunk_steps(progress.actors));
+        let chunk = collector.collect_unless(|| shutdown.is_set(), frames, steps)?;
+        let Some(chunk) = chunk else { break };
+        if let Some(wait) = delivery.describe_wait() {
+            activity.begin(wait);
         }
         if !delivery.send(chunk) {
             break;

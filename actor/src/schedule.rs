@@ -10,7 +10,7 @@ use crate::{
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Schedule {
     /// Linear over the frames of the whole run, then constant. Source: table of parameters in the paper's appendix.
-    Falling {
+    Linear {
         /// Epsilon at the run's first frame.
         start: f64,
         /// Epsilon from `decay_frames` on.
@@ -30,7 +30,7 @@ impl Schedule {
     pub fn new(config: &Config, actor: u32) -> Result<Self, ActError> {
         match &config.epsilon_ladder {
             Some(ladder) => ladder_epsilon(ladder, actor).map(Self::Fixed),
-            None => Ok(Self::Falling {
+            None => Ok(Self::Linear {
                 start: config.epsilon_start,
                 end: config.epsilon_end,
                 decay_frames: config.epsilon_decay_frames,
@@ -42,10 +42,10 @@ impl Schedule {
     pub fn epsilon(&self, frames: u64) -> f64 {
         match *self {
             Self::Fixed(epsilon) => epsilon,
-            Self::Falling {
+            Self::Linear {
                 end, decay_frames, ..
             } if frames >= decay_frames => end,
-            Self::Falling {
+            Self::Linear {
                 start,
                 end,
                 decay_frames,
@@ -68,8 +68,8 @@ fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, ActError> {
             u64::from(actor) + 1
         )));
     }
-    let down = f64::from(actor) / f64::from(actors - 1);
-    Ok(ladder.base.powf(1.0 + ladder.alpha * down))
+    let fraction = f64::from(actor) / f64::from(actors - 1);
+    Ok(ladder.base.powf(1.0 + ladder.alpha * fraction))
 }
 
 #[cfg(test)]
@@ -134,9 +134,9 @@ mod tests {
 
     #[test]
     fn an_actor_beyond_the_ladder_is_told_what_to_do() {
-        let said = Schedule::new(&with_ladder(8), 9).unwrap_err().to_string();
+        let message = Schedule::new(&with_ladder(8), 9).unwrap_err().to_string();
         assert_eq!(
-            said,
+            message,
             "actor 9 is beyond the 8 of actor.epsilon_ladder.actors, whose numbers begin at 0: start it with another --id, or \
              the replay server with --set actor.epsilon_ladder.actors=10"
         );

@@ -17,17 +17,17 @@ use driml_protocol::{
 /// Time-out of the request for one piece.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pieces requested at the same time.
-const PIECES_IN_FLIGHT: usize = 4;
+const PIECES_IN_FLIGHT_MAX: usize = 4;
 /// How often to pull without an announcement, in case an announcement was lost.
-const PULL_ANYWAY: Duration = Duration::from_secs(10);
+const PULL_INTERVAL_MAX: Duration = Duration::from_secs(10);
 /// How often a thread that has nothing to pull checks for shutdown.
-const TICK: Duration = Duration::from_millis(200);
+const SHUTDOWN_CHECK_INTERVAL: Duration = Duration::from_millis(200);
 /// Pause between two requests for the first weights.
-const PAUSE: Duration = Duration::from_millis(200);
+const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before the wait is logged.
-const SILENT_MAX: Duration = Duration::from_secs(5);
+const UNLOGGED_WAIT_MAX: Duration = Duration::from_secs(5);
 
-/// A slot for the newest weights. Each [`Self::take_within`] allows one pull; one more every [`PULL_ANYWAY`] covers lost announcements.
+/// A slot for the newest weights. Each [`Self::take_within`] allows one pull; one more every [`PULL_INTERVAL_MAX`] covers lost messages.
 #[derive(Clone, Debug)]
 pub(crate) struct NewestWeights {
     shared: Arc<(Mutex<State>, Condvar)>,
@@ -38,7 +38,7 @@ struct State {
     /// The newest version that was announced.
     announced: u64,
     /// The value of `announced` when the last pull began.
-    sought: u64,
+    announced_at_pull: u64,
     /// The version that was pulled last.
     pulled: u64,
     slot: Option<Weights>,
@@ -48,10 +48,10 @@ struct State {
 
 impl NewestWeights {
     /// An empty slot for an actor that uses the weights `version`.
-    fn after(version: u64) -> Self {
+    fn newer_than(version: u64) -> Self {
         let state = State {
             announced: version,
-            sought: version,
+            announced_at_pull: version,
             pulled: version,
             slot: None,
             is_wanted: true,
@@ -71,13 +71,13 @@ impl NewestWeights {
         let (mut state, changed) = (self.state(), &self.shared.1);
         state.is_wanted = true;
         changed.notify_all();
-        let coming = |state: &mut State| state.announced > state.pulled;
-        let waited = changed.wait_timeout_while(state, wait_max, coming);
+        let is_coming = |state: &mut State| state.announced > state.pulled;
+        let waited = changed.wait_timeout_while(state, wait_max, is_coming);
         let (mut state, _) = waited.unwrap_or_else(PoisonError::into_inner);
         state.slot.take()
     }
 
-    fn announce(&self, version: u64) {
+    fn record_announcement(&self, version: u64) {
         let mut state = self.state();
         state.announced = state.announced.max(version);
         self.shared.1.notify_all();
@@ -85,11 +85,11 @@ impl NewestWeights {
 
     /// Waits up to `wait_max` until newer weights are wanted. Returns the version that was pulled last; `None` on a time-out.
     fn wait_until_wanted(&self, wait_max: Duration) -> Option<u64> {
-        let idle = |state: &mut State| !(state.is_wanted && state.announced > state.pulled);
+        let is_idle = |state: &mut State| !(state.is_wanted && state.announced > state.pulled);
         let changed = &self.shared.1;
-        let waited = changed.wait_timeout_while(self.state(), wait_max, idle);
+        let waited = changed.wait_timeout_while(self.state(), wait_max, is_idle);
         let (mut state, waited) = waited.unwrap_or_else(PoisonError::into_inner);
-        state.sought = state.announced;
+        state.announced_at_pull = state.announced;
         if waited.timed_out() {
             return None;
         }
@@ -98,7 +98,7 @@ impl NewestWeights {
     }
 
     /// Stores the result of a pull; `None` if it brought no newer weights.
-    fn put(&self, weights: Option<Weights>) {
+    fn finish_pull(&self, weights: Option<Weights>) {
         let mut state = self.state();
         match weights {
             Some(weights) => {
@@ -106,7 +106,7 @@ impl NewestWeights {
                 state.slot = Some(weights);
             }
             // The announced version does not exist: forget it, unless a later one was announced during the pull.
-            None if state.announced == state.sought => state.announced = state.pulled,
+            None if state.announced == state.announced_at_pull => state.announced = state.pulled,
             None => {}
         }
         self.shared.1.notify_all();
@@ -117,97 +117,97 @@ impl NewestWeights {
 ///
 /// # Errors
 /// No weights within `wait_max`, not counting the time in which the replay server reads its replay back from disk.
-pub(crate) fn first(
+pub(crate) fn wait_for_first(
     client: &RunClient,
     wait_max: Duration,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Option<Weights>> {
     let mut silence = Silence::with_tries_of(PIECE_TIMEOUT);
-    let mut said = LogLimiter::default();
+    let mut log_limiter = LogLimiter::default();
     loop {
         let pulled = pull(client, 0);
         let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
         if let Some(SessionError::Recovering(recovering)) = error {
             silence.answered();
-            if recovering.progress.is_slow() && said.due().is_some() {
+            if recovering.progress.is_slow() && log_limiter.due().is_some() {
                 tracing::info!("waiting for weights for as long as it takes: {recovering}");
             }
         }
         match pulled {
             Ok(Some(weights)) => return Ok(Some(weights)),
             pulled if silence.unanswered() > wait_max => {
-                let none = format!(
+                let message = format!(
                     "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
                 );
                 return Err(match pulled {
-                    Err(e) => e.context(none),
-                    Ok(_) => anyhow!(none),
+                    Err(e) => e.context(message),
+                    Ok(_) => anyhow!(message),
                 });
             }
             Err(e) => tracing::debug!("no weights yet: {e}"),
             Ok(None) => {}
         }
-        if silence.length() > SILENT_MAX && said.due().is_some() {
+        if silence.length() > UNLOGGED_WAIT_MAX && log_limiter.due().is_some() {
             tracing::info!("waiting for the learner's first weights");
         }
-        if shutdown.wait_timeout(PAUSE) {
+        if shutdown.wait_timeout(RETRY_PAUSE) {
             return Ok(None);
         }
     }
 }
 
 /// Starts a thread that pulls newer weights until `shutdown`; weights `version` are in use.
-pub(crate) fn watch(
+pub(crate) fn start_puller(
     client: RunClient,
     version: u64,
     shutdown: Shutdown,
 ) -> anyhow::Result<NewestWeights> {
-    let newest = NewestWeights::after(version);
+    let newest = NewestWeights::newer_than(version);
     let slot = newest.clone();
     let on_announcement = move |announced: Result<WeightsVersion, CodecError>| match announced {
-        Ok(announced) => slot.announce(announced.version),
+        Ok(announced) => slot.record_announcement(announced.version),
         Err(e) => tracing::warn!("an announcement of weights was dropped: {e}"),
     };
     let announcements = client
         .subscribe(on_announcement)
         .map_err(|e| anyhow!("listening for new weights: {e}"))?;
     let slot = newest.clone();
-    let work = move || {
+    let pull_loop = move || {
         // The subscription lasts as long as the thread.
         let _announcements = announcements;
-        let mut looked = Instant::now();
+        let mut last_pull = Instant::now();
         while !shutdown.is_set() {
             fail_point::reach("weights-watch");
-            let wanted = slot.wait_until_wanted(TICK);
+            let wanted = slot.wait_until_wanted(SHUTDOWN_CHECK_INTERVAL);
             let Some(version) = wanted.or_else(|| {
                 // An announcement may have been lost.
-                let look = looked.elapsed() > PULL_ANYWAY;
-                look.then(|| slot.state().pulled)
+                let is_due = last_pull.elapsed() > PULL_INTERVAL_MAX;
+                is_due.then(|| slot.state().pulled)
             }) else {
                 continue;
             };
-            looked = Instant::now();
+            last_pull = Instant::now();
             match pull(&client, version) {
-                Ok(weights) => slot.put(weights),
+                Ok(weights) => slot.finish_pull(weights),
                 // The actor is leaving and has closed its session.
                 Err(_) if client.session().is_closed() => return,
                 Err(e) => {
                     tracing::warn!("keeping weights {version}, newer ones did not come: {e}");
-                    slot.put(None);
+                    slot.finish_pull(None);
                 }
             }
         }
     };
     std::thread::Builder::new()
         .name("weights-watch".into())
-        .spawn(work)?;
+        .spawn(pull_loop)?;
     Ok(newest)
 }
 
 /// Pulls the newest weights, piece by piece. Returns `None` if they are not newer than `version`.
 fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
-    let pool = BufferPool::new(PIECES_IN_FLIGHT);
-    let first = ask(client, WeightsRequest::NewerThan(version))?;
+    let pool = BufferPool::new(PIECES_IN_FLIGHT_MAX);
+    let first = send(client, WeightsRequest::NewerThan(version))?;
     let (reply, piece) = first.receive(&pool)?;
     let WeightsReply::Piece {
         weights,
@@ -224,32 +224,32 @@ fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
         version: weights.version,
         offset,
     });
-    let mut asked = VecDeque::new();
+    let mut pending = VecDeque::new();
     while !assembly.is_whole() {
-        while asked.len() < PIECES_IN_FLIGHT
+        while pending.len() < PIECES_IN_FLIGHT_MAX
             && let Some(request) = requests.next()
         {
-            asked.push_back(ask(client, request)?);
+            pending.push_back(send(client, request)?);
         }
-        let failed = |what: &str| anyhow!("weights {} {what}", weights.version);
-        let next = asked.pop_front();
-        let next = next.ok_or_else(|| failed("have no last piece"))?;
+        let error = |what: &str| anyhow!("weights {} {what}", weights.version);
+        let next = pending.pop_front();
+        let next = next.ok_or_else(|| error("have no last piece"))?;
         let (reply, piece) = next.receive(&pool)?;
         // Newer versions came so often that the replay server dropped this one.
         let WeightsReply::Piece {
             weights, offset, ..
         } = reply
         else {
-            return Err(failed("were replaced too often while they were pulled"));
+            return Err(error("were replaced too often while they were pulled"));
         };
         assembly.take(weights, offset, &piece)?;
     }
     Ok(Some(assembly.finish()?))
 }
 
-fn ask(client: &RunClient, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
-    let asked = client.send(client.seal(&request)?, PIECE_TIMEOUT);
-    asked.map_err(|e| anyhow!("asking for weights: {e}"))
+fn send(client: &RunClient, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
+    let sent = client.send(client.seal(&request)?, PIECE_TIMEOUT);
+    sent.map_err(|e| anyhow!("asking for weights: {e}"))
 }
 
 #[cfg(test)]
@@ -267,38 +267,36 @@ mod tests {
 
     #[test]
     fn weights_are_pulled_once_for_each_time_they_are_asked_for() {
-        let newest = NewestWeights::after(1);
+        let newest = NewestWeights::newer_than(1);
         let wanted = || newest.wait_until_wanted(Duration::ZERO);
         assert_eq!(wanted(), None, "nothing newer was announced");
-        newest.announce(2);
+        newest.record_announcement(2);
         assert_eq!(wanted(), Some(1));
-        newest.put(weights(2));
-        newest.announce(3);
+        newest.finish_pull(weights(2));
+        newest.record_announcement(3);
         assert_eq!(wanted(), None, "the last ones were not taken yet");
-        assert_eq!(
-            newest.take_within(Duration::ZERO).unwrap().header.version,
-            2
-        );
+        let taken = newest.take_within(Duration::ZERO);
+        assert_eq!(taken.unwrap().header.version, 2);
         assert_eq!(wanted(), Some(2));
         // A version that is announced during a pull, which finds nothing.
-        newest.announce(1 << 60);
-        newest.put(None);
+        newest.record_announcement(1 << 60);
+        newest.finish_pull(None);
         assert!(newest.take_within(Duration::ZERO).is_none());
         assert_eq!(wanted(), Some(2));
         // The announcement was false: no newer version exists, and `take_within` does not wait for one.
-        newest.put(None);
+        newest.finish_pull(None);
         assert!(newest.take_within(Duration::from_secs(3600)).is_none());
         assert_eq!(wanted(), None);
     }
 
     #[test]
     fn weights_that_are_coming_are_waited_for() {
-        let newest = NewestWeights::after(1);
-        newest.announce(2);
+        let newest = NewestWeights::newer_than(1);
+        newest.record_announcement(2);
         let watcher = newest.clone();
         let pull = std::thread::spawn(move || {
             while watcher.wait_until_wanted(Duration::from_secs(1)).is_none() {}
-            watcher.put(weights(2));
+            watcher.finish_pull(weights(2));
         });
         let taken = newest.take_within(Duration::from_secs(3600));
         assert_eq!(taken.unwrap().header.version, 2);

@@ -65,7 +65,7 @@ fn chunks(config: &RunConfig, runs_right: bool) -> Vec<Chunk> {
     let frame_bytes = world.frame_shape().bytes();
     let (pool, streams) = (BufferPool::new(0), COPIES as u32);
     let mut recorder = ChunkRecorder::new(pool, 0, 1, streams, frame_bytes as u32);
-    recorder.begin(1, STEPS_PER_CHUNK as u32);
+    recorder.begin_chunk(1, STEPS_PER_CHUNK as u32);
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut frames = vec![0; COPIES * frame_bytes];
     let (mut rewards, mut ends) = ([0.0; COPIES], [StepEnd::Running; COPIES]);

@@ -18,12 +18,12 @@ use worker::DeliveryWorker;
 pub use state::{DeliveryError, DeliveryLimits};
 
 /// How long an actor may wait for newer weights while the rate limiter holds its chunks.
-const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
+const FRESH_WEIGHTS_WAIT_MAX: Duration = Duration::from_millis(200);
 
 /// The delivery thread, and the queue of chunks to it.
 pub struct Delivery {
     queue: mpsc::Sender<Chunk>,
-    limit: usize,
+    chunks_max: usize,
     state: Arc<DeliveryState>,
     thread: JoinHandle<Result<u64, DeliveryError>>,
 }
@@ -49,7 +49,7 @@ impl Delivery {
             .spawn(move || worker.run(&chunks))?;
         Ok(Self {
             queue,
-            limit: limits.chunks_in_flight_max,
+            chunks_max: limits.chunks_in_flight_max,
             state,
             thread,
         })
@@ -61,9 +61,9 @@ impl Delivery {
     }
 
     /// How long the actor may wait for newer weights before its next chunk: while the rate limiter holds its chunks, waiting is free.
-    pub fn fresh_weights_max(&self) -> Duration {
+    pub fn fresh_weights_wait_max(&self) -> Duration {
         match self.progress().is_held {
-            true => FRESH_WEIGHTS_MAX,
+            true => FRESH_WEIGHTS_WAIT_MAX,
             false => Duration::ZERO,
         }
     }
@@ -71,9 +71,10 @@ impl Delivery {
     /// Describes what the next chunk would wait for now; `None` if it would not wait.
     pub fn describe_wait(&self) -> Option<&'static str> {
         let progress = self.progress();
+        let in_flight = progress.in_flight;
         match progress.is_held {
-            true if progress.waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
-            false if progress.waiting >= self.limit => Some("waits for the replay server's answer"),
+            true if in_flight >= 1 => Some("waits until the rate limiter lets its chunk in"),
+            false if in_flight >= self.chunks_max => Some("waits for the replay server's answer"),
             _ => None,
         }
     }
@@ -83,18 +84,16 @@ impl Delivery {
     pub fn send(&self, chunk: Chunk) -> bool {
         let mut progress = self.state.progress();
         loop {
-            let limit = if progress.is_held { 1 } else { self.limit };
-            if progress.waiting < limit || self.thread.is_finished() {
+            let limit = if progress.is_held { 1 } else { self.chunks_max };
+            if progress.in_flight < limit || self.thread.is_finished() {
                 break;
             }
             // The time-out is for a thread that ended without a notification.
-            let waited = self
-                .state
-                .settled
-                .wait_timeout(progress, Duration::from_secs(1));
+            let settled = &self.state.settled;
+            let waited = settled.wait_timeout(progress, Duration::from_secs(1));
             (progress, _) = waited.unwrap_or_else(PoisonError::into_inner);
         }
-        progress.waiting += 1;
+        progress.in_flight += 1;
         self.queue.send(chunk).is_ok()
     }
 

@@ -23,7 +23,7 @@ pub struct DeliveryLimits {
 
 impl DeliveryLimits {
     /// Takes the limits from an actor's settings.
-    pub const fn of(config: &Config) -> Self {
+    pub const fn from_config(config: &Config) -> Self {
         Self {
             chunks_in_flight_max: config.chunks_in_flight_max as usize,
             ack_timeout: Duration::from_millis(config.ack_timeout_ms),
@@ -48,11 +48,11 @@ pub(crate) struct Progress {
     /// Actors that are connected to the run; 0 before the first answer.
     pub(crate) actors: u32,
     /// Whether the run has all the transitions that it wants, or delivery has failed.
-    pub(crate) finished: bool,
+    pub(crate) is_finished: bool,
     /// Whether the rate limiter holds chunks: the actor then queues one at a time, as others would only grow old.
     pub(super) is_held: bool,
     /// Chunks that were queued and are not yet settled.
-    pub(super) waiting: usize,
+    pub(super) in_flight: usize,
 }
 
 impl DeliveryState {
@@ -66,7 +66,7 @@ impl DeliveryState {
 #[allow(missing_docs, reason = "each message says it")]
 pub enum DeliveryError {
     #[error("the replay server was out of reach for {within:?}")]
-    OutOfReach {
+    Unreachable {
         within: Duration,
         source: SessionError,
     },

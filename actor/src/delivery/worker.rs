@@ -23,18 +23,18 @@ const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How often the thread checks for `Shutdown` while it waits for a reply.
-const TICK: Duration = Duration::from_millis(50);
+const SHUTDOWN_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 /// How long `Leave` is retried, not counting the time in which the replay server reads its replay back from disk.
-const LEAVE_MAX: Duration = Duration::from_secs(5);
-/// Time-out of one `Leave`. Several must fit into [`LEAVE_MAX`], as a message may be lost.
-const LEAVE_TRY_MAX: Duration = Duration::from_secs(1);
+const LEAVE_RETRY_MAX: Duration = Duration::from_secs(5);
+/// Time-out of one `Leave`. Several must fit into [`LEAVE_RETRY_MAX`], as a message may be lost.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 
-struct Outgoing {
+struct OutgoingChunk {
     header: ChunkHeader,
     payload: ZBytes,
     in_shared_memory: bool,
     /// The reply to the chunk, or to a poll about it, if one is pending.
-    asked: Option<PendingReply<InsertReply>>,
+    pending: Option<PendingReply<InsertReply>>,
     /// The replay server has the chunk and will store it, so that a poll is enough.
     is_kept: bool,
 }
@@ -45,7 +45,7 @@ enum Outcome {
     /// The run has enough transitions.
     Unwanted,
     /// The chunk, or a poll about it, must be sent again.
-    Again,
+    Resend,
 }
 
 /// The delivery thread's state. Several chunks are in flight at once and are settled in order. If one must be sent
@@ -56,15 +56,15 @@ pub(super) struct DeliveryWorker {
     pool: BufferPool,
     shutdown: Shutdown,
     state: Arc<DeliveryState>,
-    outgoing: VecDeque<Outgoing>,
+    outgoing: VecDeque<OutgoingChunk>,
     /// The most chunks in flight: 1 after a chunk had to wait or be sent again, and 1 more for each chunk that is stored at once.
     window: usize,
     silence: Silence,
     /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
     draining_since: Option<Instant>,
-    retries_said: LogLimiter,
-    waiting_said: LogLimiter,
+    retry_log: LogLimiter,
+    wait_log: LogLimiter,
 }
 
 impl DeliveryWorker {
@@ -86,52 +86,52 @@ impl DeliveryWorker {
             silence: Silence::with_tries_of(limits.ack_timeout),
             held_since: None,
             draining_since: None,
-            retries_said: LogLimiter::default(),
-            waiting_said: LogLimiter::default(),
+            retry_log: LogLimiter::default(),
+            wait_log: LogLimiter::default(),
         }
     }
 
     /// Delivers chunks until the queue closes. Returns the number of transitions that the run did not want.
     pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> Result<u64, DeliveryError> {
-        let mut last = None;
+        let mut sender = None;
         let mut produced = 0;
         let mut unwanted = 0;
-        let mut outcome = Ok(());
-        while let Some(header) = self.first_in_line(chunks) {
+        let mut result = Ok(());
+        while let Some(header) = self.first_header(chunks) {
             fail_point::reach("delivery");
             let transitions = header.transitions() as u64;
             // After a failure the other chunks are only counted, so that `Leave` has the number of all that the actor produced.
-            let outcome_of_first = match outcome {
+            let first_outcome = match result {
                 Ok(()) => self.settle_first(),
                 Err(_) => Ok(Outcome::Stored),
             };
-            match outcome_of_first {
-                Ok(Outcome::Again) => continue,
+            match first_outcome {
+                Ok(Outcome::Resend) => continue,
                 Ok(Outcome::Stored) => {}
                 Ok(Outcome::Unwanted) => unwanted += transitions,
                 Err(e) => {
-                    outcome = Err(e);
-                    self.state.progress().finished = true;
+                    result = Err(e);
+                    self.state.progress().is_finished = true;
                 }
             }
             produced += transitions;
-            last = Some((header.actor, header.incarnation));
+            sender = Some((header.actor, header.incarnation));
             self.outgoing.pop_front();
-            self.state.progress().waiting -= 1;
+            self.state.progress().in_flight -= 1;
             self.state.settled.notify_all();
         }
-        if let Some((actor, incarnation)) = last {
-            self.leave(Leave {
+        if let Some((actor, incarnation)) = sender {
+            self.send_leave(Leave {
                 actor,
                 incarnation,
                 produced: produced - unwanted,
             });
         }
-        outcome.map(|()| unwanted)
+        result.map(|()| unwanted)
     }
 
     /// Takes chunks from the queue and returns the first one's header. Waits if there is none; `None` if the queue has closed.
-    fn first_in_line(&mut self, chunks: &mpsc::Receiver<Chunk>) -> Option<ChunkHeader> {
+    fn first_header(&mut self, chunks: &mpsc::Receiver<Chunk>) -> Option<ChunkHeader> {
         while self.outgoing.len() < self.limits.chunks_in_flight_max {
             let next = match self.outgoing.is_empty() {
                 true => chunks.recv().ok(),
@@ -144,11 +144,11 @@ impl DeliveryWorker {
             }
             let header = chunk.header;
             let payload = chunk.into_payload();
-            self.outgoing.push_back(Outgoing {
+            self.outgoing.push_back(OutgoingChunk {
                 header,
                 in_shared_memory: payload.are_shared(),
                 payload: payload.freeze(),
-                asked: None,
+                pending: None,
                 is_kept: false,
             });
         }
@@ -173,7 +173,7 @@ impl DeliveryWorker {
         let reply = self.send_window().and_then(|()| self.wait_for_first());
         let Some(reply) = reply.transpose() else {
             // Sent again with `leaving` set, the chunk passes the rate limiter at once.
-            return Ok(self.again());
+            return Ok(self.prepare_resend());
         };
         if reply.is_ok() {
             self.silence.answered();
@@ -202,7 +202,7 @@ impl DeliveryWorker {
             Ok(InsertReply::Finished { inserted_total }) => {
                 let mut progress = self.state.progress();
                 progress.inserted_total = inserted_total;
-                progress.finished = true;
+                progress.is_finished = true;
                 Ok(Outcome::Unwanted)
             }
             Ok(InsertReply::Wait {
@@ -210,32 +210,32 @@ impl DeliveryWorker {
                 kept,
             }) => {
                 self.state.progress().inserted_total = inserted_total;
-                self.note_held(kept);
-                Ok(self.again())
+                self.mark_held(kept);
+                Ok(self.prepare_resend())
             }
             // The reply is from when an earlier chunk waited; all earlier chunks are stored now.
-            Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
+            Ok(InsertReply::OutOfOrder { .. }) => Ok(self.prepare_resend()),
             Ok(InsertReply::Refused { why }) => Err(DeliveryError::Failed(format!(
                 "the replay server refused a chunk: {why}"
             ))),
             Err(SessionError::Recovering(recovering)) => {
                 self.silence.answered();
-                if let Some(more) = self.retries_said.due() {
-                    tracing::warn!("chunk {sequence} waits: {recovering}{more}");
+                if let Some(suppressed) = self.retry_log.due() {
+                    tracing::warn!("chunk {sequence} waits: {recovering}{suppressed}");
                 }
                 // A poll of a few bytes instead of the same chunks again and again: its reply says when chunks are wanted.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
                 self.outgoing[0].is_kept = true;
                 self.pause();
-                Ok(self.again())
+                Ok(self.prepare_resend())
             }
             Err(e) => {
                 let within = self.limits.unreachable_max;
                 if self.silence.unanswered() > within {
-                    return Err(DeliveryError::OutOfReach { within, source: e });
+                    return Err(DeliveryError::Unreachable { within, source: e });
                 }
-                if let Some(more) = self.retries_said.due() {
-                    tracing::warn!("chunk {sequence} will be sent again: {e}{more}");
+                if let Some(suppressed) = self.retry_log.due() {
+                    tracing::warn!("chunk {sequence} will be sent again: {e}{suppressed}");
                 }
                 // A chunk without a reply may not have arrived, whatever an earlier reply said.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
@@ -245,7 +245,7 @@ impl DeliveryWorker {
                 }
                 self.copy_out_of_shared_memory();
                 std::thread::sleep(RETRY_PAUSE);
-                Ok(self.again())
+                Ok(self.prepare_resend())
             }
         }
     }
@@ -253,11 +253,11 @@ impl DeliveryWorker {
     /// Waits for the reply to the first chunk. Returns `None` on a shutdown of which the replay server does not know yet.
     fn wait_for_first(&mut self) -> Result<Option<InsertReply>, SessionError> {
         let first = &mut self.outgoing[0];
-        let Some(mut asked) = first.asked.take() else {
+        let Some(mut reply) = first.pending.take() else {
             unreachable!("the window has room for one");
         };
         loop {
-            match asked.wait_within(TICK)? {
+            match reply.wait_within(SHUTDOWN_CHECK_INTERVAL)? {
                 Some(reply) => return Ok(Some(reply)),
                 None if self.shutdown.is_set() && !first.header.leaving => return Ok(None),
                 None => {}
@@ -265,8 +265,8 @@ impl DeliveryWorker {
         }
     }
 
-    /// Notes that the rate limiter holds the first chunk. Pauses before the retry unless the replay server keeps the chunk.
-    fn note_held(&mut self, kept: bool) {
+    /// Records that the rate limiter holds the first chunk. Pauses before the retry unless the replay server keeps the chunk.
+    fn mark_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
         self.state.progress().is_held = true;
         self.outgoing[0].is_kept = kept;
@@ -275,10 +275,10 @@ impl DeliveryWorker {
         }
         let seconds = since.elapsed().as_secs();
         if seconds >= 10
-            && let Some(more) = self.waiting_said.due()
+            && let Some(suppressed) = self.wait_log.due()
         {
             tracing::info!(
-                "waiting for the learner, which is behind by the replay ratio: a chunk has waited {seconds} s{more}"
+                "waiting for the learner, which is behind by the replay ratio: a chunk has waited {seconds} s{suppressed}"
             );
         }
     }
@@ -291,10 +291,10 @@ impl DeliveryWorker {
         }
     }
 
-    fn again(&mut self) -> Outcome {
+    fn prepare_resend(&mut self) -> Outcome {
         self.window = 1;
-        self.outgoing.iter_mut().for_each(|it| it.asked = None);
-        Outcome::Again
+        self.outgoing.iter_mut().for_each(|it| it.pending = None);
+        Outcome::Resend
     }
 
     fn copy_out_of_shared_memory(&mut self) {
@@ -311,12 +311,12 @@ impl DeliveryWorker {
             false => self.limits.ack_timeout,
         };
         for it in self.outgoing.iter_mut().take(self.window) {
-            if it.asked.is_some() {
+            if it.pending.is_some() {
                 continue;
             }
             let header = &mut it.header;
             header.leaving |= leaving;
-            it.asked = Some(if it.is_kept {
+            it.pending = Some(if it.is_kept {
                 let poll = ChunkPoll {
                     actor: header.actor,
                     incarnation: header.incarnation,
@@ -338,11 +338,11 @@ impl DeliveryWorker {
         Ok(())
     }
 
-    fn leave(&self, leave: Leave) {
+    fn send_leave(&self, leave: Leave) {
         let began = Instant::now();
         let mut silent_since = began;
         loop {
-            let e = match self.client.ask(&leave, LEAVE_TRY_MAX) {
+            let e = match self.client.ask(&leave, LEAVE_TIMEOUT) {
                 Ok(Ack) => return,
                 Err(e) => e,
             };
@@ -351,7 +351,7 @@ impl DeliveryWorker {
             if may_wait && matches!(e, SessionError::Recovering(_)) {
                 silent_since = Instant::now();
             }
-            if silent_since.elapsed() > LEAVE_MAX {
+            if silent_since.elapsed() > LEAVE_RETRY_MAX {
                 tracing::warn!("the replay server did not receive this actor's `Leave`: {e}");
                 return;
             }

@@ -4,7 +4,7 @@
 use std::{iter::Cycle, path::Path, slice};
 
 use anyhow::Context;
-use driml_actor::{Acting, ChunkRecorder, RandomPolicy};
+use driml_actor::{ActingLoop, ChunkRecorder, RandomPolicy};
 use driml_envs::{ActionSet, RestrictedWorld, StepEnd};
 use driml_launch::console;
 use driml_protocol::{BufferPool, Chunk};
@@ -71,7 +71,7 @@ impl Recording {
         let world = RestrictedWorld::wrap(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut policy = RandomPolicy::new(world.num_actions() as u8);
-        let mut acting = Acting::new(world, 1, ChaCha8Rng::seed_from_u64(1))?;
+        let mut acting = ActingLoop::new(world, 1, ChaCha8Rng::seed_from_u64(1))?;
         let mut steps = Vec::with_capacity(STEPS);
         for _ in 0..STEPS {
             let step = acting.step(&mut policy, 0.0)?;
@@ -110,7 +110,7 @@ impl Recording {
     pub(super) fn chunks(&self, actor: u32, shape: ChunkShape, pool: BufferPool) -> Chunks<'_> {
         let (streams, bytes) = (shape.streams, self.frame_bytes);
         let mut recorder = ChunkRecorder::new(pool, actor, INCARNATION, streams, bytes as u32);
-        recorder.begin(1, shape.steps);
+        recorder.begin_chunk(1, shape.steps);
         Chunks {
             recorder,
             steps: self.steps.iter().cycle(),
@@ -130,7 +130,7 @@ pub(super) struct Chunks<'a> {
 impl Chunks<'_> {
     /// Returns the number of transitions in all chunks so far.
     pub(super) const fn transitions(&self) -> u64 {
-        self.recorder.produced()
+        self.recorder.transitions_recorded()
     }
 
     pub(super) fn next_chunk(&mut self) -> Chunk {

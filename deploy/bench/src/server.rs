@@ -98,14 +98,14 @@ impl Server {
         is_enough: impl Fn(u64, Instant) -> bool,
     ) -> anyhow::Result<f64> {
         self.actors += 1;
-        let (actor, pool) = (self.actors, self.actor.chunk_memory());
+        let (actor, pool) = (self.actors, self.actor.chunk_buffers());
         let join = ActorJoin {
             actor,
             incarnation: INCARNATION,
         };
         let who = Alive::actor(actor, INCARNATION);
         let (client, alive) = self.join_run(Role::Actor(actor), who, &join)?;
-        let limits = DeliveryLimits::of(&self.actor.actor);
+        let limits = DeliveryLimits::from_config(&self.actor.actor);
         let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
         let mut chunks = recording.chunks(actor, shape, pool);
         let started = Instant::now();

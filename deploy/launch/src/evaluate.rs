@@ -5,7 +5,7 @@ use std::{ops::ControlFlow, path::Path};
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, Watch, episode_returns};
+use driml_actor::{Evaluation, NetworkPolicy, OnStep, Policy, RandomPolicy, Step, episode_returns};
 use driml_envs::{RestrictedWorld, WorldConfig};
 use driml_learner::{
     Compute, UpdateError, checkpoint,
@@ -140,7 +140,7 @@ impl Player {
         world: &WorldConfig,
         episodes: usize,
         seed: u64,
-        watch: Watch<'_>,
+        watch: OnStep<'_>,
     ) -> anyhow::Result<Vec<f64>> {
         let config = &self.config;
         let mut policy: Box<dyn Policy> = match policy_kind {
@@ -211,7 +211,7 @@ fn play_episodes(
     episodes: usize,
     epsilon: f64,
     seed: u64,
-    watch: Watch<'_>,
+    watch: OnStep<'_>,
 ) -> anyhow::Result<Vec<f64>> {
     let envs = Player::envs(episodes);
     let evaluation = Evaluation {

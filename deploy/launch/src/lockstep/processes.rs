@@ -130,7 +130,7 @@ impl Lockstep {
         }
         let mut this = Self::assemble(config, learner, replay, turn).context(resuming)?;
         for (actor, state) in this.actors.iter_mut().zip(actors) {
-            actor.go_on_from(state).context(resuming)?;
+            actor.restore(state).context(resuming)?;
         }
         Ok(this)
     }
@@ -311,7 +311,7 @@ impl Lockstep {
             self.publish()?;
         }
         for (id, (actor, surplus)) in self.actors.iter().zip(&self.turn.unwanted).enumerate() {
-            let produced = actor.produced() - surplus;
+            let produced = actor.transitions_recorded() - surplus;
             self.replay.leave(&Leave {
                 actor: id as u32,
                 incarnation: INCARNATION,

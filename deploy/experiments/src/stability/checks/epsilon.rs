@@ -36,7 +36,7 @@ fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let listed: Vec<u64> = beside.chain([u64::MAX]).collect();
     let mut frames = cases.of(&[listed], |rng| (0..4).map(|_| count(rng)).collect());
     frames.sort_unstable();
-    let schedule = Schedule::Falling {
+    let schedule = Schedule::Linear {
         start,
         end,
         decay_frames,

@@ -3,7 +3,7 @@
 //! run. k is 1, and nothing is augmented.
 
 use anyhow::Context;
-use driml_actor::{Acting, NetworkPolicy, Policy, RandomPolicy};
+use driml_actor::{ActingLoop, NetworkPolicy, Policy, RandomPolicy};
 use driml_envs::{RestrictedWorld, StepEnd};
 use driml_learner::OwnedBatch;
 use driml_protocol::NO_ACTION;
@@ -96,7 +96,7 @@ fn history(
     let actions = config.world.actions(config.actor.actions);
     let world = RestrictedWorld::wrap(world, actions, sent)?;
     let rng = ChaCha8Rng::seed_from_u64(SEED);
-    let mut acting = Acting::new(world, run.frame_stack as usize, rng)?;
+    let mut acting = ActingLoop::new(world, run.frame_stack as usize, rng)?;
     let enlarge = || config.input.resizer(sent, model);
     let enlarged = enlarge()?;
     let precision = config.actor.precision;
