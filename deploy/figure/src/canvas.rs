@@ -88,7 +88,7 @@ impl TextStyle {
         Self { upright, ..self }
     }
 
-    pub(super) const fn within(self, length_max: f64) -> Self {
+    pub(super) const fn cut_at(self, length_max: f64) -> Self {
         Self { length_max, ..self }
     }
 }
@@ -123,7 +123,7 @@ impl Canvas {
 
     /// Returns the SVG text, which ends with a newline.
     pub(super) fn svg(&self) -> String {
-        let [width, height] = [self.width, self.height].map(number);
+        let [width, height] = [self.width, self.height].map(rounded);
         let size = format!(r#"width="{width}" height="{height}" viewBox="0 0 {width} {height}""#);
         let style = format!(r#"font-family="{FONTS}" stroke-linejoin="round""#);
         let elements = &self.elements;
@@ -147,15 +147,15 @@ impl Canvas {
     fn polyline(&mut self, points: &[Point], pen: &str) {
         // Points that all coincide give no visible line.
         if points.iter().any(|point| *point != points[0]) {
-            let points = format!(r#"points="{}""#, corners(points));
+            let points = format!(r#"points="{}""#, point_list(points));
             self.add(&format!(r#"<polyline {points} fill="none" {pen}/>"#));
         }
     }
 
     /// Draws a filled polygon.
-    pub(super) fn area(&mut self, points: &[Point], fill: Colour) {
+    pub(super) fn polygon(&mut self, points: &[Point], fill: Colour) {
         if points.len() > 2 {
-            let (points, brush) = (corners(points), brush(fill));
+            let (points, brush) = (point_list(points), brush(fill));
             self.add(&format!(r#"<polygon points="{points}" {brush}/>"#));
         }
     }
@@ -172,16 +172,16 @@ impl Canvas {
     }
 
     fn circle(&mut self, (x, y): Point, radius: f64, ink: &str) {
-        let [x, y] = [x, y].map(number);
-        let place = format!(r#"cx="{x}" cy="{y}" r="{radius}""#);
-        self.add(&format!("<circle {place} {ink}/>"));
+        let [x, y] = [x, y].map(rounded);
+        let attributes = format!(r#"cx="{x}" cy="{y}" r="{radius}""#);
+        self.add(&format!("<circle {attributes} {ink}/>"));
     }
 
     /// Draws filled rectangles of one colour with sharp edges. Rectangles with a side of 0 or NaN are skipped.
     pub(super) fn rects(&mut self, rects: &[Rect], fill: Colour) {
-        let seen = rects.iter().filter(|it| it.width > 0.0 && it.height > 0.0);
-        let path = seen.map(|it| {
-            let [x, y, w, h] = [it.x, it.y, it.width, it.height].map(number);
+        let visible = rects.iter().filter(|it| it.width > 0.0 && it.height > 0.0);
+        let path = visible.map(|it| {
+            let [x, y, w, h] = [it.x, it.y, it.width, it.height].map(rounded);
             format!("M{x} {y}h{w}v{h}h-{w}z")
         });
         let (path, brush) = (path.collect::<String>(), brush(fill));
@@ -194,15 +194,15 @@ impl Canvas {
 
     /// Draws the outline of a rectangle.
     pub(super) fn frame(&mut self, rect: Rect, colour: Colour, width: f64) {
-        let (sides, pen) = (sides(rect), pen(colour, width));
-        self.add(&format!(r#"<rect {sides} fill="none" {pen}/>"#));
+        let (bounds, pen) = (bounds(rect), pen(colour, width));
+        self.add(&format!(r#"<rect {bounds} fill="none" {pen}/>"#));
     }
 
     /// Draws a filled rectangle with round corners and a border.
     pub(super) fn card(&mut self, rect: Rect, fill: Colour, border: Colour) {
         let pen = pen(border, 1.0);
-        let (sides, brush) = (sides(rect), brush(fill));
-        self.add(&format!(r#"<rect {sides} rx="8" {brush} {pen}/>"#));
+        let (bounds, brush) = (bounds(rect), brush(fill));
+        self.add(&format!(r#"<rect {bounds} rx="8" {brush} {pen}/>"#));
     }
 
     /// Writes a line of text with its baseline at the point. Text longer than the style allows is cut.
@@ -211,7 +211,7 @@ impl Canvas {
         if text.is_empty() {
             return;
         }
-        let ([x, y], brush) = ([x, y].map(number), brush(style.colour));
+        let ([x, y], brush) = ([x, y].map(rounded), brush(style.colour));
         let (anchor, share_left) = match style.anchor {
             Anchor::Start => ("start", 0.0),
             Anchor::Middle => ("middle", 0.5),
@@ -229,20 +229,20 @@ impl Canvas {
             Weight::Regular => "normal",
             Weight::Bold => "bold",
         };
-        let size = number(style.size);
+        let size = rounded(style.size);
         let font = format!(r#"font-size="{size}" font-weight="{weight}" text-anchor="{anchor}""#);
         let text = text.replace('&', "&amp;").replace('<', "&lt;");
         self.add(&format!("<text {place} {font} {brush}>{text}</text>"));
     }
 }
 
-fn corners(points: &[Point]) -> String {
-    let point = |(x, y): &Point| format!("{},{}", number(*x), number(*y));
+fn point_list(points: &[Point]) -> String {
+    let point = |(x, y): &Point| format!("{},{}", rounded(*x), rounded(*y));
     points.iter().map(point).collect::<Vec<_>>().join(" ")
 }
 
-fn sides(rect: Rect) -> String {
-    let [x, y, width, height] = [rect.x, rect.y, rect.width, rect.height].map(number);
+fn bounds(rect: Rect) -> String {
+    let [x, y, width, height] = [rect.x, rect.y, rect.width, rect.height].map(rounded);
     format!(r#"x="{x}" y="{y}" width="{width}" height="{height}""#)
 }
 
@@ -255,24 +255,24 @@ fn brush(colour: Colour) -> String {
 }
 
 fn pen(colour: Colour, width: f64) -> String {
-    let (hex, width) = (colour.hex(), number(width));
+    let (hex, width) = (colour.hex(), rounded(width));
     format!(r#"stroke="{hex}" stroke-width="{width}""#)
 }
 
 /// Rounds to two decimals: more would make the file longer without a visible gain.
-fn number(value: f64) -> f64 {
+fn rounded(value: f64) -> f64 {
     (value * 100.0).round() / 100.0
 }
 
 /// Draws a panel's title and returns the rectangle below it.
-pub(super) fn titled(canvas: &mut Canvas, place: Rect, title: &str) -> Rect {
+pub(super) fn draw_title(canvas: &mut Canvas, area: Rect, title: &str) -> Rect {
     const SIZE: f64 = 14.0;
     let style = TextStyle::new(SIZE, INK, Anchor::Start).bold();
-    let lines = font::wrap(title, SIZE, place.width);
+    let lines = font::wrap(title, SIZE, area.width);
     for (index, line) in lines.iter().enumerate() {
-        let y = place.y + SIZE + index as f64 * (SIZE + 4.0);
-        canvas.text((place.x, y), line, style);
+        let y = area.y + SIZE + index as f64 * (SIZE + 4.0);
+        canvas.text((area.x, y), line, style);
     }
     let used = lines.len() as f64 * (SIZE + 4.0) + 6.0;
-    Rect::new(place.x, place.y + used, place.width, place.height - used)
+    Rect::new(area.x, area.y + used, area.width, area.height - used)
 }

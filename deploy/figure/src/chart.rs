@@ -2,7 +2,7 @@
 //! The chart computes no statistics: the caller decides what a band means.
 
 use super::{
-    canvas::{Anchor, Canvas, Point, Rect, TextStyle, titled},
+    canvas::{Anchor, Canvas, Point, Rect, TextStyle, draw_title},
     colours::{Colour, GRID, INK, INK_SOFT, SERIES_COLOURS, series_colour},
     font::{self, Weight},
     ticks,
@@ -28,7 +28,7 @@ pub struct Axis {
     /// Whether the axis is logarithmic. Values of 0 and below are then left out.
     is_log: bool,
     /// Values that the axis always covers, whatever values the series have.
-    shows: Vec<f64>,
+    covered: Vec<f64>,
     /// Names for the values 0, 1, 2, ..., written instead of numbers. Empty if the axis has numbers.
     names: Vec<String>,
 }
@@ -47,7 +47,7 @@ impl Axis {
         let last = names.len().saturating_sub(1) as f64;
         Self {
             names: names.to_vec(),
-            ..Self::linear(label).showing(&[-0.5, last + 0.5])
+            ..Self::linear(label).covering(&[-0.5, last + 0.5])
         }
     }
 
@@ -60,17 +60,17 @@ impl Axis {
     }
 
     /// Returns the same axis, which also covers these values.
-    pub fn showing(mut self, values: &[f64]) -> Self {
-        self.shows.extend(values);
+    pub fn covering(mut self, values: &[f64]) -> Self {
+        self.covered.extend(values);
         self
     }
 
-    fn keeps(&self, value: f64) -> bool {
+    fn shows(&self, value: f64) -> bool {
         value.is_finite() && (!self.is_log || value > 0.0)
     }
 
     /// Maps a value to the scale of the axis: the value itself, or its decimal logarithm.
-    fn spread(&self, value: f64) -> f64 {
+    fn transform(&self, value: f64) -> f64 {
         match self.is_log {
             true => value.log10(),
             false => value,
@@ -79,22 +79,22 @@ impl Axis {
 
     /// Returns the axis's range for these values, widened by `slack`; `None` without values.
     fn scale(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<Scale<'_>> {
-        let all = values.chain(self.shows.iter().copied());
-        let kept = all.filter(|value| self.keeps(*value));
-        let (low, high) = ticks::bounds(kept.map(|value| self.spread(value)))?;
-        let by = match (high - low) * slack {
+        let all = values.chain(self.covered.iter().copied());
+        let kept = all.filter(|value| self.shows(*value));
+        let (low, high) = ticks::bounds(kept.map(|value| self.transform(value)))?;
+        let margin = match (high - low) * slack {
             0.0 => low.abs().max(1.0) * SLACK,
-            by => by,
+            margin => margin,
         };
         Some(Scale {
             axis: self,
-            low: low - by,
-            high: high + by,
+            low: low - margin,
+            high: high + margin,
         })
     }
 }
 
-/// An axis with its range: `low` and `high` are the values at the ends, after [`Axis::spread`].
+/// An axis with its range: `low` and `high` are the values at the ends, after [`Axis::transform`].
 struct Scale<'a> {
     axis: &'a Axis,
     low: f64,
@@ -103,18 +103,18 @@ struct Scale<'a> {
 
 impl Scale<'_> {
     /// Returns the position of a value along the axis, in 0..=1 for values within the range.
-    fn share(&self, value: f64) -> f64 {
-        (self.axis.spread(value) - self.low) / (self.high - self.low)
+    fn position(&self, value: f64) -> f64 {
+        (self.axis.transform(value) - self.low) / (self.high - self.low)
     }
 
-    /// Returns the tick values and their labels for an axis of this length: about one tick every `each` units.
-    fn ticks(&self, length: f64, each: f64) -> Vec<(f64, String)> {
+    /// Returns the tick values and their labels for an axis of this length: about one tick every `spacing` units.
+    fn ticks(&self, length: f64, spacing: f64) -> Vec<(f64, String)> {
         let ticks = match (&self.axis.names[..], self.axis.is_log) {
             ([], true) => ticks::log(10f64.powf(self.low), 10f64.powf(self.high)),
-            ([], false) => ticks::linear(self.low, self.high, (length / each).max(2.0) as usize),
+            ([], false) => ticks::linear(self.low, self.high, (length / spacing).max(2.0) as usize),
             (names, _) => {
-                let places = (0_u32..).map(f64::from);
-                return places.zip(names.iter().cloned()).collect();
+                let positions = (0_u32..).map(f64::from);
+                return positions.zip(names.iter().cloned()).collect();
             }
         };
         let labels = ticks::labels(&ticks);
@@ -166,37 +166,37 @@ impl Series {
     }
 
     /// Returns the same series with another mark.
-    pub fn marked(mut self, mark: Mark) -> Self {
+    pub fn with_mark(mut self, mark: Mark) -> Self {
         self.mark = mark;
         self
     }
 
     /// Returns the same series in another colour.
-    pub fn coloured(mut self, colour: Colour) -> Self {
+    pub fn with_colour(mut self, colour: Colour) -> Self {
         self.colour = colour;
         self
     }
 
     /// Returns the same series with a band.
-    pub fn banded(mut self, band: Vec<(f64, f64, f64)>) -> Self {
+    pub fn with_band(mut self, band: Vec<(f64, f64, f64)>) -> Self {
         self.band = band;
         self
     }
 
     /// Draws the marks of the series at these positions.
-    fn marks(&self, canvas: &mut Canvas, places: &[Point]) {
-        let (colour, has_length) = (self.colour, places.len() > 1);
+    fn draw_marks(&self, canvas: &mut Canvas, points: &[Point]) {
+        let (colour, has_length) = (self.colour, points.len() > 1);
         match self.mark {
-            Mark::Line if has_length => canvas.line(places, colour, LINE_WIDTH),
-            Mark::Dashed if has_length => canvas.dashed_line(places, colour, LINE_WIDTH),
+            Mark::Line if has_length => canvas.line(points, colour, LINE_WIDTH),
+            Mark::Dashed if has_length => canvas.dashed_line(points, colour, LINE_WIDTH),
             Mark::Rings => {
-                let ring = |place: &Point| canvas.ring(*place, RING_RADIUS, colour);
-                places.iter().for_each(ring);
+                let ring = |point: &Point| canvas.ring(*point, RING_RADIUS, colour);
+                points.iter().for_each(ring);
             }
             // A line of one point would be invisible, so draw a dot.
             Mark::Bars | Mark::Line | Mark::Dashed => {
-                let dot = |place: &Point| canvas.dot(*place, DOT_RADIUS, colour);
-                places.iter().for_each(dot);
+                let dot = |point: &Point| canvas.dot(*point, DOT_RADIUS, colour);
+                points.iter().for_each(dot);
             }
         }
     }
@@ -222,12 +222,12 @@ impl Chart {
         }
     }
 
-    pub(super) fn draw(&self, canvas: &mut Canvas, mut place: Rect, title: bool, legend: bool) {
+    pub(super) fn draw(&self, canvas: &mut Canvas, mut area: Rect, title: bool, legend: bool) {
         if title {
-            place = titled(canvas, place, &self.title);
+            area = draw_title(canvas, area, &self.title);
         }
         if legend {
-            place = self.legend(canvas, place);
+            area = self.draw_legend(canvas, area);
         }
         let points = || self.series.iter().flat_map(|series| &series.points);
         let bands = || self.series.iter().flat_map(|series| &series.band);
@@ -235,37 +235,37 @@ impl Chart {
         let ends = bands().flat_map(|(_, low, high)| [*low, *high]);
         let ys = points().map(|point| point.1).chain(ends);
         let (Some(x), Some(y)) = (self.x.scale(xs, SLACK / 2.0), self.y.scale(ys, SLACK)) else {
-            let middle = (place.x + place.width / 2.0, place.y + place.height / 2.0);
+            let middle = (area.x + area.width / 2.0, area.y + area.height / 2.0);
             canvas.text(middle, "no values yet", soft(LABEL_SIZE, Anchor::Middle));
             return;
         };
 
         let below = TICK_SIZE + LABEL_SIZE + 16.0;
-        let y_ticks = y.ticks(place.height - below, 42.0);
+        let y_ticks = y.ticks(area.height - below, 42.0);
         let y_labels = y_ticks.iter().map(|(_, label)| label);
-        let left = font::widest(y_labels, TICK_SIZE) + LABEL_SIZE + 18.0;
-        let (width, height) = (place.width - left - 8.0, place.height - below - 4.0);
-        let rect = Rect::new(place.x + left, place.y + 4.0, width, height);
+        let left = font::max_width(y_labels, TICK_SIZE) + LABEL_SIZE + 18.0;
+        let (width, height) = (area.width - left - 8.0, area.height - below - 4.0);
+        let rect = Rect::new(area.x + left, area.y + 4.0, width, height);
         let plot = Plot { rect, x, y };
-        plot.axes(canvas, &y_ticks, place.x);
+        plot.draw_axes(canvas, &y_ticks, area.x);
         for series in &self.series {
-            plot.series(canvas, series);
+            plot.draw_series(canvas, series);
         }
     }
 
     /// Draws the legend in as many rows as it needs, and returns the rectangle below the legend.
-    fn legend(&self, canvas: &mut Canvas, place: Rect) -> Rect {
+    fn draw_legend(&self, canvas: &mut Canvas, area: Rect) -> Rect {
         let named = || self.series.iter().filter(|series| !series.name.is_empty());
         if named().next().is_none() {
-            return place;
+            return area;
         }
-        let (mut x, mut y) = (place.x, place.y);
+        let (mut x, mut y) = (area.x, area.y);
         for series in named() {
-            let room = place.width - LEGEND_MARK - 6.0;
-            let name = font::fit(&series.name, LEGEND_SIZE, Weight::Regular, room);
+            let name_width_max = area.width - LEGEND_MARK - 6.0;
+            let name = font::fit(&series.name, LEGEND_SIZE, Weight::Regular, name_width_max);
             let width = LEGEND_MARK + 6.0 + font::width(&name, LEGEND_SIZE, Weight::Regular) + 16.0;
-            if x > place.x && x + width - 16.0 > place.right() {
-                x = place.x;
+            if x > area.x && x + width - 16.0 > area.right() {
+                x = area.x;
                 y += LEGEND_LEADING;
             }
             let middle = y + LEGEND_LEADING / 2.0;
@@ -275,15 +275,15 @@ impl Chart {
             }
             let ends = [(x, middle), (x + LEGEND_MARK, middle)];
             match series.mark {
-                Mark::Line | Mark::Dashed => series.marks(canvas, &ends),
-                _ => series.marks(canvas, &[(x + LEGEND_MARK / 2.0, middle)]),
+                Mark::Line | Mark::Dashed => series.draw_marks(canvas, &ends),
+                _ => series.draw_marks(canvas, &[(x + LEGEND_MARK / 2.0, middle)]),
             }
             let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
             canvas.text(at, &name, TextStyle::new(LEGEND_SIZE, INK, Anchor::Start));
             x += width;
         }
-        let used = y + LEGEND_LEADING + 4.0 - place.y;
-        Rect::new(place.x, place.y + used, place.width, place.height - used)
+        let used = y + LEGEND_LEADING + 4.0 - area.y;
+        Rect::new(area.x, area.y + used, area.width, area.height - used)
     }
 }
 
@@ -295,19 +295,19 @@ struct Plot<'a> {
 }
 
 impl Plot<'_> {
-    fn at(&self, x: f64, y: f64) -> Point {
+    fn point(&self, x: f64, y: f64) -> Point {
         (
-            self.rect.x + self.x.share(x) * self.rect.width,
-            self.rect.bottom() - self.y.share(y) * self.rect.height,
+            self.rect.x + self.x.position(x) * self.rect.width,
+            self.rect.bottom() - self.y.position(y) * self.rect.height,
         )
     }
 
-    fn keeps(&self, x: f64, y: f64) -> bool {
-        self.x.axis.keeps(x) && self.y.axis.keeps(y)
+    fn shows(&self, x: f64, y: f64) -> bool {
+        self.x.axis.shows(x) && self.y.axis.shows(y)
     }
 
     /// Draws the grid, tick labels and axis labels. `left` is the x of the panel's left edge.
-    fn axes(&self, canvas: &mut Canvas, y_ticks: &[(f64, String)], left: f64) {
+    fn draw_axes(&self, canvas: &mut Canvas, y_ticks: &[(f64, String)], left: f64) {
         let plot = self.rect;
         let x_ticks = self.x.ticks(plot.width, 74.0);
         let x_room = match self.x.axis.names.len() {
@@ -315,13 +315,13 @@ impl Plot<'_> {
             names => plot.width / names as f64 - 4.0,
         };
         for (tick, label) in &x_ticks {
-            let x = self.at(*tick, 1.0).0;
+            let x = self.point(*tick, 1.0).0;
             canvas.line(&[(x, plot.y), (x, plot.bottom())], GRID, 1.0);
             let at = (x, plot.bottom() + TICK_SIZE + 5.0);
-            canvas.text(at, label, soft(TICK_SIZE, Anchor::Middle).within(x_room));
+            canvas.text(at, label, soft(TICK_SIZE, Anchor::Middle).cut_at(x_room));
         }
         for (tick, label) in y_ticks {
-            let y = self.at(1.0, *tick).1;
+            let y = self.point(1.0, *tick).1;
             canvas.line(&[(plot.x, y), (plot.right(), y)], GRID, 1.0);
             let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
@@ -335,30 +335,30 @@ impl Plot<'_> {
         let ink = TextStyle::new(LABEL_SIZE, INK, Anchor::Middle);
         let y = plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0;
         let at = (plot.x + plot.width / 2.0, y);
-        canvas.text(at, &self.x.axis.label, ink.within(plot.width));
+        canvas.text(at, &self.x.axis.label, ink.cut_at(plot.width));
         let at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
-        let upright = ink.upright().within(plot.height);
+        let upright = ink.upright().cut_at(plot.height);
         canvas.text(at, &self.y.axis.label, upright);
     }
 
-    fn series(&self, canvas: &mut Canvas, series: &Series) {
-        let kept =
-            |(x, low, high): &&(f64, f64, f64)| self.keeps(*x, *low) && self.keeps(*x, *high);
-        let band: Vec<_> = series.band.iter().filter(kept).collect();
+    fn draw_series(&self, canvas: &mut Canvas, series: &Series) {
+        let is_shown =
+            |(x, low, high): &&(f64, f64, f64)| self.shows(*x, *low) && self.shows(*x, *high);
+        let band: Vec<_> = series.band.iter().filter(is_shown).collect();
         if series.mark == Mark::Bars {
             for (x, low, high) in band {
-                let bar = [self.at(*x, *low), self.at(*x, *high)];
+                let bar = [self.point(*x, *low), self.point(*x, *high)];
                 canvas.line(&bar, series.colour, 1.4);
             }
         } else {
-            let low = band.iter().map(|(x, low, _)| self.at(*x, *low));
-            let high = band.iter().rev().map(|(x, _, high)| self.at(*x, *high));
+            let low = band.iter().map(|(x, low, _)| self.point(*x, *low));
+            let high = band.iter().rev().map(|(x, _, high)| self.point(*x, *high));
             let rim: Vec<Point> = low.chain(high).collect();
-            canvas.area(&rim, series.colour.with_alpha(BAND_ALPHA));
+            canvas.polygon(&rim, series.colour.with_alpha(BAND_ALPHA));
         }
-        let kept = series.points.iter().filter(|(x, y)| self.keeps(*x, *y));
-        let points: Vec<Point> = kept.map(|(x, y)| self.at(*x, *y)).collect();
-        series.marks(canvas, &points);
+        let shown = series.points.iter().filter(|(x, y)| self.shows(*x, *y));
+        let points: Vec<Point> = shown.map(|(x, y)| self.point(*x, *y)).collect();
+        series.draw_marks(canvas, &points);
     }
 }
 

@@ -10,7 +10,7 @@ pub enum FigureError {
     Extension(PathBuf),
     /// The name of a film does not end in `.gif`.
     #[error("{} is not the name of a film: use one that ends in .gif", .0.display())]
-    NoFilm(PathBuf),
+    FilmExtension(PathBuf),
     /// The picture or film has no area or is too large.
     #[error("a picture of {width} x {height} pixels cannot be made")]
     Size {

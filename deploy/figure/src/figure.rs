@@ -60,7 +60,7 @@ pub enum Format {
 
 impl Format {
     /// Returns the format for the file's extension: `.svg`, `.pdf` or `.png`.
-    pub fn of(path: &Path) -> Result<Self, FigureError> {
+    pub fn from_path(path: &Path) -> Result<Self, FigureError> {
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("svg") => Ok(Self::Svg),
             Some("pdf") => Ok(Self::Pdf),
@@ -82,7 +82,7 @@ pub enum Look {
 impl Figure {
     /// Writes the figure in the format of the file's extension.
     pub fn save(&self, path: &Path, look: Look) -> Result<(), FigureError> {
-        let format = Format::of(path)?;
+        let format = Format::from_path(path)?;
         let svg = |letters| self.draw(look, letters).svg();
         let bytes = match format {
             Format::Svg => svg(Letters::Text).into_bytes(),
@@ -99,42 +99,42 @@ impl Figure {
         let width = MARGIN + columns as f64 * (panel_width + MARGIN);
         let lines = |note: &String| font::wrap(note, NOTE_SIZE, width - 2.0 * MARGIN);
         let notes: Vec<String> = self.notes.iter().flat_map(lines).collect();
-        let head = match look {
+        let header_height = match look {
             Look::Card => MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING,
             Look::Plain => MARGIN,
         };
-        let height = head + rows as f64 * (panel_height + MARGIN) + 4.0;
+        let height = header_height + rows as f64 * (panel_height + MARGIN) + 4.0;
 
         let mut canvas = Canvas::new(width, height, letters);
         match look {
-            Look::Card => self.head(&mut canvas, &notes),
+            Look::Card => self.draw_header(&mut canvas, &notes),
             Look::Plain => canvas.rects(&[Rect::new(0.0, 0.0, width, height)], CARD),
         }
         for (index, panel) in self.panels.iter().enumerate() {
             let (row, column) = ((index / columns) as f64, (index % columns) as f64);
             let x = MARGIN + column * (panel_width + MARGIN);
-            let y = head + row * (panel_height + MARGIN);
-            let place = Rect::new(x, y, panel_width, panel_height);
+            let y = header_height + row * (panel_height + MARGIN);
+            let area = Rect::new(x, y, panel_width, panel_height);
             match panel {
                 Panel::Chart(chart) => {
                     let legend = look == Look::Card || index == 0;
                     let title = look == Look::Card || self.panels.len() > 1;
-                    chart.draw(&mut canvas, place, title, legend);
+                    chart.draw(&mut canvas, area, title, legend);
                 }
-                Panel::Heat(heat) => heat.draw(&mut canvas, place),
-                Panel::Lattice(lattice) => lattice.draw(&mut canvas, place),
+                Panel::Heat(heat) => heat.draw(&mut canvas, area),
+                Panel::Lattice(lattice) => lattice.draw(&mut canvas, area),
             }
         }
         canvas
     }
 
     /// Draws the card, the title and the notes.
-    fn head(&self, canvas: &mut Canvas, notes: &[String]) {
+    fn draw_header(&self, canvas: &mut Canvas, notes: &[String]) {
         let (width, height) = (canvas.width, canvas.height);
         let whole = Rect::new(0.5, 0.5, width - 1.0, height - 1.0);
         canvas.card(whole, CARD, CARD_BORDER);
         let title = TextStyle::new(TITLE_SIZE, INK, Anchor::Start).bold();
-        let title = title.within(width - 2.0 * MARGIN);
+        let title = title.cut_at(width - 2.0 * MARGIN);
         canvas.text((MARGIN, MARGIN + TITLE_SIZE - 3.0), &self.title, title);
         for (line, note) in notes.iter().enumerate() {
             let y = MARGIN + TITLE_SIZE + 4.0 + (line + 1) as f64 * NOTE_LEADING - 4.0;

@@ -21,14 +21,14 @@ const DELAY_MIN: u16 = 2;
 /// and an older file at the path stays.
 pub struct Film {
     path: PathBuf,
-    aside: TempPath,
+    tmp_path: TempPath,
     encoder: Encoder<BufWriter<File>>,
     width: u16,
     height: u16,
     /// The delay of each picture in hundredths of a second. `owed` carries the rounding error, because GIF delays are whole numbers.
     delay: f64,
     owed: f64,
-    shown: Option<Vec<[u8; 3]>>,
+    previous: Option<Vec<[u8; 3]>>,
 }
 
 impl Film {
@@ -36,7 +36,7 @@ impl Film {
     pub fn check_name(path: &Path) -> Result<(), FigureError> {
         match path.extension() {
             Some(extension) if extension == "gif" => Ok(()),
-            _ => Err(FigureError::NoFilm(path.to_owned())),
+            _ => Err(FigureError::FilmExtension(path.to_owned())),
         }
     }
 
@@ -55,26 +55,26 @@ impl Film {
             let (width, height) = size;
             return Err(FigureError::Size { width, height });
         };
-        let mut aside = path.as_os_str().to_owned();
-        aside.push(".tmp");
+        let mut tmp_path = path.as_os_str().to_owned();
+        tmp_path.push(".tmp");
         let begin = || -> io::Result<_> {
-            let file = BufWriter::new(File::create(&aside)?);
-            let aside = TempPath::try_from_path(aside)?;
+            let file = BufWriter::new(File::create(&tmp_path)?);
+            let tmp_path = TempPath::try_from_path(tmp_path)?;
             let mut encoder = Encoder::new(file, width, height, &[]).map_err(io::Error::other)?;
             let repeated = encoder.set_repeat(Repeat::Infinite);
             repeated.map_err(io::Error::other)?;
-            Ok((aside, encoder))
+            Ok((tmp_path, encoder))
         };
-        let (aside, encoder) = begin().map_err(|e| FigureError::write(path, e))?;
+        let (tmp_path, encoder) = begin().map_err(|e| FigureError::write(path, e))?;
         Ok(Self {
             path: path.to_owned(),
-            aside,
+            tmp_path,
             encoder,
             width,
             height,
             delay: (100.0 / pictures_per_second).max(DELAY_MIN.into()),
             owed: 0.0,
-            shown: None,
+            previous: None,
         })
     }
 
@@ -86,8 +86,8 @@ impl Film {
         let size = (usize::from(self.width), usize::from(self.height));
         assert_eq!(picture.size(), size, "a film has pictures of one size");
         let pixels = picture.rgb();
-        let changed = |(at, &[r, g, b]): (usize, &[u8; 3])| match &self.shown {
-            Some(shown) if shown[at] == [r, g, b] => [0; 4],
+        let changed = |(at, &[r, g, b]): (usize, &[u8; 3])| match &self.previous {
+            Some(previous) if previous[at] == [r, g, b] => [0; 4],
             _ => [r, g, b, u8::MAX],
         };
         let mut rgba: Vec<u8> = pixels.iter().enumerate().flat_map(changed).collect();
@@ -96,7 +96,7 @@ impl Film {
         let delay = self.owed.round().clamp(DELAY_MIN.into(), u16::MAX.into());
         self.owed -= delay;
         frame.delay = delay as u16;
-        self.shown = Some(pixels);
+        self.previous = Some(pixels);
         let written = self.encoder.write_frame(&frame);
         written.map_err(|e| FigureError::write(&self.path, io::Error::other(e)))
     }
@@ -105,7 +105,7 @@ impl Film {
     pub fn finish(self) -> Result<(), FigureError> {
         let ended = self.encoder.into_inner().map_err(io::Error::other);
         let ended = ended.and_then(|mut file| file.flush());
-        let ended = ended.and_then(|()| self.aside.persist(&self.path).map_err(io::Error::from));
+        let ended = ended.and_then(|()| self.tmp_path.persist(&self.path).map_err(io::Error::from));
         ended.map_err(|e| FigureError::write(&self.path, e))
     }
 }

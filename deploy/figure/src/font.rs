@@ -30,7 +30,7 @@ pub(super) fn width(text: &str, size: f64, weight: Weight) -> f64 {
 }
 
 /// Returns the width of the widest of these texts in regular weight.
-pub(super) fn widest<'a>(texts: impl IntoIterator<Item = &'a String>, size: f64) -> f64 {
+pub(super) fn max_width<'a>(texts: impl IntoIterator<Item = &'a String>, size: f64) -> f64 {
     let texts = texts.into_iter();
     let widths = texts.map(|text| width(text, size, Weight::Regular));
     widths.fold(0.0, f64::max)

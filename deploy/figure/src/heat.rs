@@ -2,7 +2,7 @@
 //! The colours cover the range that the caller gives, or else the range of the values.
 
 use super::{
-    canvas::{Anchor, Canvas, Rect, TextStyle, titled},
+    canvas::{Anchor, Canvas, Rect, TextStyle, draw_title},
     colours::{CARD, CELL_LIGHT, INK, INK_SOFT, OUTLINE, heat_colour, ink_on},
     font, ticks,
 };
@@ -74,7 +74,7 @@ impl Heat {
         }
     }
 
-    fn ends(&self) -> (f64, f64) {
+    fn value_range(&self) -> (f64, f64) {
         let values = self.values.iter().flatten().copied();
         let found = ticks::bounds(values.filter(|value| value.is_finite()));
         let ends = self.range.or(found);
@@ -85,13 +85,13 @@ impl Heat {
         }
     }
 
-    pub(super) fn draw(&self, canvas: &mut Canvas, place: Rect) {
-        let place = titled(canvas, place, &self.title);
-        let (low, high) = self.ends();
+    pub(super) fn draw(&self, canvas: &mut Canvas, area: Rect) {
+        let area = draw_title(canvas, area, &self.title);
+        let (low, high) = self.value_range();
         let bar_ticks = ticks::linear(low, high, 5);
         let bar_labels = ticks::labels(&bar_ticks);
-        let bar_labels_width = font::widest(&bar_labels, TICK_SIZE);
-        let names_width = font::widest(&self.names, TICK_SIZE);
+        let bar_labels_width = font::max_width(&bar_labels, TICK_SIZE);
+        let names_width = font::max_width(&self.names, TICK_SIZE);
         let left = match (self.names.is_empty(), self.labels.1.is_empty()) {
             (true, true) => 0.0,
             (false, true) => names_width + 6.0,
@@ -99,9 +99,9 @@ impl Heat {
         };
         let right = 14.0 + BAR_WIDTH + 6.0 + bar_labels_width + LABEL_SIZE + 8.0;
         // Column names are rotated if they are longer than a cell is wide.
-        let cell_guess = (place.width - left - right) / self.side as f64;
-        let turned = names_width > cell_guess - 2.0;
-        let names_below = match (self.names.is_empty(), turned) {
+        let cell_guess = (area.width - left - right) / self.side as f64;
+        let rotated = names_width > cell_guess - 2.0;
+        let names_below = match (self.names.is_empty(), rotated) {
             (true, _) => 0.0,
             (false, true) => names_width + 6.0,
             (false, false) => TICK_SIZE + 6.0,
@@ -111,12 +111,12 @@ impl Heat {
             false => LABEL_SIZE + 6.0,
         };
         let below = names_below + label_below + 4.0;
-        let room = (place.width - left - right).min(place.height - below);
-        let room = room.max(10.0);
-        let cell = room / self.side as f64;
-        let map = Rect::new(place.x + left, place.y, room, room);
+        let map_side = (area.width - left - right).min(area.height - below);
+        let map_side = map_side.max(10.0);
+        let cell = map_side / self.side as f64;
+        let map = Rect::new(area.x + left, area.y, map_side, map_side);
 
-        let unit = self.field.map_or(cell, |field| room / field.side);
+        let unit = self.field.map_or(cell, |field| map_side / field.side);
         let cells = match self.field {
             Some(field) => {
                 canvas.rects(&[map], CELL_LIGHT);
@@ -126,36 +126,36 @@ impl Heat {
             }
             None => map,
         };
-        self.cells(canvas, cells, cells.width / self.side as f64, (low, high));
-        self.names(canvas, map, cell, turned);
-        let level = style(LABEL_SIZE, Anchor::Middle).within(room);
+        self.draw_cells(canvas, cells, cells.width / self.side as f64, (low, high));
+        self.draw_names(canvas, map, cell, rotated);
+        let style = text_style(LABEL_SIZE, Anchor::Middle).cut_at(map_side);
         let y = map.bottom() + names_below + LABEL_SIZE + 3.0;
-        canvas.text((map.x + room / 2.0, y), &self.labels.0, level);
-        let beside = (place.x + LABEL_SIZE - 2.0, map.y + room / 2.0);
-        canvas.text(beside, &self.labels.1, level.upright());
+        canvas.text((map.x + map_side / 2.0, y), &self.labels.0, style);
+        let beside = (area.x + LABEL_SIZE - 2.0, map.y + map_side / 2.0);
+        canvas.text(beside, &self.labels.1, style.upright());
         if let Some(outline) = self.outline {
-            point_out(canvas, map, unit, outline);
+            draw_outline(canvas, map, unit, outline);
         }
 
-        let bar = Rect::new(map.right() + 14.0, map.y, BAR_WIDTH, room);
-        let step = room / BAR_STEPS as f64;
+        let bar = Rect::new(map.right() + 14.0, map.y, BAR_WIDTH, map_side);
+        let step = map_side / BAR_STEPS as f64;
         for i in 0..BAR_STEPS {
             let colour = heat_colour(1.0 - i as f64 / (BAR_STEPS - 1) as f64);
             let y = bar.y + i as f64 * step;
             canvas.rects(&[Rect::new(bar.x, y, BAR_WIDTH, step + 0.3)], colour);
         }
         for (tick, text) in bar_ticks.iter().zip(&bar_labels) {
-            let y = bar.bottom() - (tick - low) / (high - low) * room;
+            let y = bar.bottom() - (tick - low) / (high - low) * map_side;
             let mark = [(bar.right(), y), (bar.right() + 3.0, y)];
             canvas.line(&mark, INK_SOFT, 1.0);
             let at = (bar.right() + 6.0, y + TICK_SIZE * 0.36);
-            canvas.text(at, text, style(TICK_SIZE, Anchor::Start));
+            canvas.text(at, text, text_style(TICK_SIZE, Anchor::Start));
         }
         let far = bar.right() + 6.0 + bar_labels_width + LABEL_SIZE + 4.0;
-        canvas.text((far, bar.y + room / 2.0), &self.unit, level.upright());
+        canvas.text((far, bar.y + map_side / 2.0), &self.unit, style.upright());
     }
 
-    fn cells(&self, canvas: &mut Canvas, map: Rect, cell: f64, (low, high): (f64, f64)) {
+    fn draw_cells(&self, canvas: &mut Canvas, map: Rect, cell: f64, (low, high): (f64, f64)) {
         for (index, value) in self.values.iter().enumerate() {
             let (row, column) = (index / self.side, index % self.side);
             let (x, y) = (map.x + column as f64 * cell, map.y + row as f64 * cell);
@@ -173,24 +173,24 @@ impl Heat {
         }
     }
 
-    fn names(&self, canvas: &mut Canvas, map: Rect, cell: f64, turned: bool) {
+    fn draw_names(&self, canvas: &mut Canvas, map: Rect, cell: f64, rotated: bool) {
         for (index, name) in self.names.iter().enumerate() {
             let middle = (index as f64 + 0.5) * cell;
             let at = (map.x - 5.0, map.y + middle + TICK_SIZE * 0.36);
-            canvas.text(at, name, style(TICK_SIZE, Anchor::End));
-            if turned {
+            canvas.text(at, name, text_style(TICK_SIZE, Anchor::End));
+            if rotated {
                 let at = (map.x + middle + TICK_SIZE * 0.36, map.bottom() + 5.0);
-                canvas.text(at, name, style(TICK_SIZE, Anchor::End).upright());
+                canvas.text(at, name, text_style(TICK_SIZE, Anchor::End).upright());
             } else {
                 let at = (map.x + middle, map.bottom() + TICK_SIZE + 3.0);
-                canvas.text(at, name, style(TICK_SIZE, Anchor::Middle));
+                canvas.text(at, name, text_style(TICK_SIZE, Anchor::Middle));
             }
         }
     }
 }
 
 /// Draws a marking frame over a map of square cells. `cell` is the drawn length of a unit of the outline.
-pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
+pub(super) fn draw_outline(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
     let Outline { left, top, side } = outline;
     let [left, top, side] = [left, top, side].map(|length| length * cell);
     let rect = Rect::new(map.x + left, map.y + top, side, side);
@@ -198,6 +198,6 @@ pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outl
     canvas.frame(rect, OUTLINE, 2.2);
 }
 
-const fn style(size: f64, anchor: Anchor) -> TextStyle {
+const fn text_style(size: f64, anchor: Anchor) -> TextStyle {
     TextStyle::new(size, INK, anchor)
 }

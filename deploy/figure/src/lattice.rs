@@ -2,9 +2,9 @@
 //! Adjacent dark cells of a row become one rectangle, so that a picture of thousands of cells stays small.
 
 use super::{
-    canvas::{Canvas, Rect, titled},
+    canvas::{Canvas, Rect, draw_title},
     colours::{CARD_BORDER, CELL_DARK, CELL_LIGHT},
-    heat::{Outline, point_out},
+    heat::{Outline, draw_outline},
 };
 
 /// A square grid of cells.
@@ -21,16 +21,16 @@ pub struct Lattice {
 }
 
 impl Lattice {
-    pub(super) fn draw(&self, canvas: &mut Canvas, place: Rect) {
-        let place = titled(canvas, place, &self.title);
-        let room = place.width.min(place.height);
+    pub(super) fn draw(&self, canvas: &mut Canvas, area: Rect) {
+        let area = draw_title(canvas, area, &self.title);
+        let room = area.width.min(area.height);
         // Whole units if a cell is at least one unit wide: this gives short numbers and sharp edges.
         let cell = match (room / self.side as f64).floor() {
             whole if whole >= 1.0 => whole,
             _ => room / self.side as f64,
         };
         let size = cell * self.side as f64;
-        let map = Rect::new(place.x.round(), place.y.round(), size, size);
+        let map = Rect::new(area.x.round(), area.y.round(), size, size);
         canvas.rects(&[map], CELL_LIGHT);
         let mut runs = Vec::new();
         for (row, cells) in self.dark.chunks(self.side.max(1)).enumerate() {
@@ -44,7 +44,7 @@ impl Lattice {
         canvas.rects(&runs, CELL_DARK);
         canvas.frame(map, CARD_BORDER, 1.0);
         if let Some(outline) = self.outline {
-            point_out(canvas, map, cell, outline);
+            draw_outline(canvas, map, cell, outline);
         }
     }
 }

@@ -45,7 +45,7 @@ pub struct Picture {
 impl Picture {
     /// Creates an empty picture of this size in pixels.
     pub fn new(width: usize, height: usize) -> Result<Self, FigureError> {
-        let mut images = render::pixmap(width, height)?;
+        let mut images = render::new_pixmap(width, height)?;
         let [r, g, b] = CARD.rgb;
         images.fill(Color::from_rgba8(r, g, b, u8::MAX));
         let shapes = Canvas::new(width as f64, height as f64, Letters::Outlines);
@@ -75,7 +75,7 @@ impl Picture {
 
     /// Writes a line of text whose baseline starts at `at`. Text wider than `width_max` is cut.
     pub fn text(&mut self, at: Point, width_max: f64, ink: Ink, text: &str) {
-        let style = |colour| TextStyle::new(13.0, colour, Anchor::Start).within(width_max);
+        let style = |colour| TextStyle::new(13.0, colour, Anchor::Start).cut_at(width_max);
         let style = match ink {
             Ink::Plain => style(INK),
             Ink::Bold => style(INK).bold(),
@@ -90,9 +90,9 @@ impl Picture {
         let step = area.width / heights.len().max(1) as f64;
         let gap = if step > 3.0 { 1.0 } else { 0.0 };
         let bars = heights.iter().enumerate().map(|(i, share)| {
-            let tall = share.clamp(0.0, 1.0) * area.height;
-            let (x, y) = (area.x + i as f64 * step, area.bottom() - tall);
-            Rect::new(x, y, step - gap, tall)
+            let height = share.clamp(0.0, 1.0) * area.height;
+            let (x, y) = (area.x + i as f64 * step, area.bottom() - height);
+            Rect::new(x, y, step - gap, height)
         });
         let bars: Vec<Rect> = bars.collect();
         self.shapes.rects(&bars, series_colour(0));
@@ -108,11 +108,11 @@ impl Picture {
         let columns = columns.max(1);
         let rows = values.len().div_ceil(columns).max(1);
         // Edges lie at whole pixels, so that no line shows between cells.
-        let edge = |at: usize, of: usize, length: f64| (at as f64 * length / of as f64).floor();
+        let edge = |i: usize, n: usize, length: f64| (i as f64 * length / n as f64).floor();
         for (index, &value) in values.iter().enumerate() {
             let (row, column) = (index / columns, index % columns);
-            let [left, right] = [column, column + 1].map(|at| edge(at, columns, area.width));
-            let [top, bottom] = [row, row + 1].map(|at| edge(at, rows, area.height));
+            let [left, right] = [column, column + 1].map(|i| edge(i, columns, area.width));
+            let [top, bottom] = [row, row + 1].map(|i| edge(i, rows, area.height));
             let cell = Rect::new(area.x + left, area.y + top, right - left, bottom - top);
             self.shapes.rects(&[cell], heat_colour(value));
         }
@@ -120,7 +120,7 @@ impl Picture {
 
     /// Encodes the picture as a PNG.
     pub fn png(&self) -> Result<Vec<u8>, FigureError> {
-        render::packed(&self.pixels())
+        render::encode_png(&self.pixels())
     }
 
     /// Returns red, green and blue of every pixel, row by row.
@@ -133,8 +133,8 @@ impl Picture {
 
     fn pixels(&self) -> Pixmap {
         let mut pixels = self.images.clone();
-        let shapes = render::tree(&self.shapes.svg()).expect("the SVG is ours, and has an area");
-        resvg::render(&shapes, Transform::identity(), &mut pixels.as_mut());
+        let tree = render::parse_svg(&self.shapes.svg()).expect("the SVG is ours, and has an area");
+        resvg::render(&tree, Transform::identity(), &mut pixels.as_mut());
         pixels
     }
 }

@@ -11,36 +11,36 @@ use super::error::FigureError;
 
 /// Renders the SVG as a PNG with `zoom` pixels for each unit. Pixels that no shape covers are transparent.
 pub(super) fn png(svg: &str, zoom: f32) -> Result<Vec<u8>, FigureError> {
-    let tree = tree(svg)?;
+    let tree = parse_svg(svg)?;
     let sides = [tree.size().width(), tree.size().height()];
     let [width, height] = sides.map(|side| (side * zoom).ceil() as usize);
-    let mut pixmap = pixmap(width, height)?;
+    let mut pixmap = new_pixmap(width, height)?;
     let scale = Transform::from_scale(zoom, zoom);
     resvg::render(&tree, scale, &mut pixmap.as_mut());
-    packed(&pixmap)
+    encode_png(&pixmap)
 }
 
 /// Converts the SVG to a PDF of one page. A unit is a CSS pixel, 1/96 inch.
 pub(super) fn pdf(svg: &str) -> Result<Vec<u8>, FigureError> {
     let page = PageOptions { dpi: 96.0 };
-    let packed = svg2pdf::to_pdf(&tree(svg)?, ConversionOptions::default(), page);
-    packed.map_err(|e| FigureError::Encode(e.to_string()))
+    let bytes = svg2pdf::to_pdf(&parse_svg(svg)?, ConversionOptions::default(), page);
+    bytes.map_err(|e| FigureError::Encode(e.to_string()))
 }
 
-pub(super) fn tree(svg: &str) -> Result<Tree, FigureError> {
+pub(super) fn parse_svg(svg: &str) -> Result<Tree, FigureError> {
     let tree = Tree::from_str(svg, &Options::default());
     tree.map_err(|e| FigureError::Encode(e.to_string()))
 }
 
 /// Creates a buffer of transparent pixels to draw on.
-pub(super) fn pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
+pub(super) fn new_pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
     let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
     let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
     pixmap.ok_or(FigureError::Size { width, height })
 }
 
 /// Encodes the pixels as a PNG file. tiny-skia's encoder compresses fast and gives a file three times as large.
-pub(super) fn packed(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
+pub(super) fn encode_png(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
     let mut file = Vec::new();
     let mut encoder = png::Encoder::new(&mut file, pixmap.width(), pixmap.height());
     encoder.set_color(png::ColorType::Rgba);

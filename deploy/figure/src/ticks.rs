@@ -9,9 +9,9 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
     }
     let power = 10f64.powf(raw.log10().floor());
     // Choose the round step whose ratio to `raw` is closest to 1.
-    let off = |step: &f64| (step / raw).ln().abs();
+    let gap = |step: &f64| (step / raw).ln().abs();
     let steps = [1.0, 2.0, 5.0, 10.0].map(|times| times * power);
-    let nearest = steps.into_iter().min_by(|a, b| off(a).total_cmp(&off(b)));
+    let nearest = steps.into_iter().min_by(|a, b| gap(a).total_cmp(&gap(b)));
     let step = nearest.unwrap_or(power);
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;
@@ -23,25 +23,25 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
 /// Returns the powers of ten in `low..=high`, with multiples of them if there are fewer than three.
 pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
-    let among = |times: &[f64]| -> Vec<f64> {
+    let multiples = |times: &[f64]| -> Vec<f64> {
         let all = (first..=last.min(first + 50))
             .flat_map(|power| times.iter().map(move |times| times * 10f64.powi(power)));
         all.filter(|value| (low * 0.999..=high * 1.001).contains(value))
             .collect()
     };
-    let powers = among(&[1.0]);
+    let powers = multiples(&[1.0]);
     if powers.len() >= 3 {
         return powers;
     }
-    let few = among(&[1.0, 2.0, 5.0]);
+    let few = multiples(&[1.0, 2.0, 5.0]);
     if few.len() >= 3 {
         return few;
     }
-    among(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
+    multiples(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
 }
 
 /// Labels of an axis are plain decimals if the largest tick is in this range, else they have powers of ten.
-const WRITTEN_OUT: std::ops::Range<f64> = 1e-4..1e10;
+const DECIMAL_RANGE: std::ops::Range<f64> = 1e-4..1e10;
 
 /// Formats the ticks of one axis: all with the same number of decimals, thousands and millions as k and M.
 pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
@@ -49,7 +49,7 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     let (_, largest) = bounds(sizes.clone()).unwrap_or_default();
     let (smallest, _) = bounds(sizes.filter(|size| *size > 0.0)).unwrap_or_default();
     let (divisor, unit) = unit_of(largest);
-    let wide = largest / smallest >= 1000.0;
+    let is_wide = largest / smallest >= 1000.0;
     let is_enough = |decimals: &i32| {
         let scale = 10f64.powi(*decimals);
         ticks.iter().map(|tick| tick / divisor).all(|value| {
@@ -60,8 +60,8 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     let decimals = (0..6).find(is_enough).unwrap_or(6) as usize;
     let label = |tick: &f64| match *tick {
         0.0 => "0".to_owned(),
-        tick if wide => plain(tick),
-        tick if !WRITTEN_OUT.contains(&largest) => power_of_ten(tick),
+        tick if is_wide => short_decimal(tick),
+        tick if !DECIMAL_RANGE.contains(&largest) => power_of_ten(tick),
         tick => format!("{:.decimals$}{unit}", tick / divisor),
     };
     let labels = ticks.iter().map(label);
@@ -85,8 +85,8 @@ fn unit_of(size: f64) -> (f64, &'static str) {
 }
 
 /// Formats one number by itself, in as few characters as possible.
-fn plain(value: f64) -> String {
-    if !WRITTEN_OUT.contains(&value.abs()) {
+fn short_decimal(value: f64) -> String {
+    if !DECIMAL_RANGE.contains(&value.abs()) {
         return power_of_ten(value);
     }
     let (divisor, unit) = unit_of(value.abs());

@@ -57,7 +57,7 @@ impl Curve {
 
     /// Returns the curve as a series in the colour of this index.
     pub(crate) fn series(self, name: &str, index: usize) -> Series {
-        Series::line(name, index, self.points).banded(self.band)
+        Series::line(name, index, self.points).with_band(self.band)
     }
 }
 

@@ -60,7 +60,7 @@ const OVERVIEW: [&str; 7] = [
 /// # Errors
 /// No folder is that of a run, a column does not exist, or the file cannot be written.
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
-    Format::of(&args.out).map_err(|e| usage!("{e}"))?;
+    Format::from_path(&args.out).map_err(|e| usage!("{e}"))?;
     let figure = match args.affinity {
         true => affinity::figure(&folders(args)?)?,
         false => charts(args)?,
@@ -260,10 +260,10 @@ fn lines(random: &[(String, f64)], curves: &[Series], groups: usize) -> Vec<Seri
     let line = |(at, (world, mean)): (usize, &(String, f64))| {
         let ends = vec![(0.0, *mean), (last, *mean)];
         let line = match random {
-            [_] => Series::line("random policy", 0, ends).coloured(GREY),
+            [_] => Series::line("random policy", 0, ends).with_colour(GREY),
             _ => Series::line(&format!("random policy, {world}"), groups + at, ends),
         };
-        line.marked(Mark::Dashed)
+        line.with_mark(Mark::Dashed)
     };
     random.iter().enumerate().map(line).collect()
 }

@@ -30,15 +30,15 @@ fn points(rows: &[Row], names: &[String], is_drawn: bool, aside: f64) -> Vec<(f6
 fn chart(rows: &[Row], names: &[String]) -> Chart {
     let of = |is_drawn, aside| points(rows, names, is_drawn, aside);
     let ends = vec![(-0.5, 1.0), (names.len() as f64 - 0.5, 1.0)];
-    let promise = Series::line("the promise", 0, ends).coloured(GREY);
+    let promise = Series::line("the promise", 0, ends).with_colour(GREY);
     Chart::new(
         &format!("{} to {}", names[0], names[names.len() - 1]),
         Axis::names("", names),
-        Axis::log("worst error / promise").showing(&[NONE, MOST]),
+        Axis::log("worst error / promise").covering(&[NONE, MOST]),
         vec![
-            promise.marked(Mark::Dashed),
-            Series::line("listed extremes", 0, of(false, -0.1)).marked(Mark::Rings),
-            Series::line("drawn inputs", 1, of(true, 0.1)).marked(Mark::Rings),
+            promise.with_mark(Mark::Dashed),
+            Series::line("listed extremes", 0, of(false, -0.1)).with_mark(Mark::Rings),
+            Series::line("drawn inputs", 1, of(true, 0.1)).with_mark(Mark::Rings),
         ],
     )
 }

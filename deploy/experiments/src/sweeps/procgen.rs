@@ -152,7 +152,7 @@ fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
         let mut series = Vec::new();
         let first = scored.iter().find(|it| it.point.game == game);
         if let Some(random) = first.and_then(|it| it.random) {
-            series.push(Series::line("random", 0, level(random)).coloured(GREY));
+            series.push(Series::line("random", 0, level(random)).with_colour(GREY));
         }
         for (index, agent) in settings.agents.iter().enumerate() {
             let each = of(scored, game, agent).map(|it| it.metrics.values("frames", "mean_return"));
@@ -163,7 +163,7 @@ fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
             }
             series.push(curve.series(agent, index));
             if let Some(paper) = paper(game, agent) {
-                series.push(Series::line("", index, level(paper)).marked(Mark::Dashed));
+                series.push(Series::line("", index, level(paper)).with_mark(Mark::Dashed));
             }
         }
         let (x, y) = (Axis::linear("frames"), Axis::linear("mean return"));

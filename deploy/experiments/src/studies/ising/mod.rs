@@ -162,13 +162,13 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
         Curve::of_means(means, Band::Range).series(name, index)
     };
     let ends = vec![(0.0, 0.5), (task.settings.updates as f64, 0.5)];
-    let nothing = Series::line("nothing told", 0, ends).coloured(GREY);
+    let nothing = Series::line("nothing told", 0, ends).with_colour(GREY);
     let pairs = over("in the patch: true pair or other", 1, |it| it.auc_pairs);
     let areas = vec![
-        nothing.marked(Mark::Dashed),
+        nothing.with_mark(Mark::Dashed),
         over("patch or noise", 0, |it| it.auc),
         over("patch or noise, clear places", 2, |it| it.auc_clear),
-        pairs.marked(Mark::Dashed),
+        pairs.with_mark(Mark::Dashed),
     ];
     let losses = trained.iter().enumerate().map(|(seed, one)| {
         let name = format!("seed {}", seed + 1);
@@ -176,7 +176,7 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
     });
     let updates = || Axis::linear("updates");
     let loss = Axis::linear("InfoNCE [nats]");
-    let area = Axis::linear("area under the ROC curve").showing(&[0.5, 1.0]);
+    let area = Axis::linear("area under the ROC curve").covering(&[0.5, 1.0]);
     let (left, right) = ("Local DIM loss (3t3), training", "What the scores tell");
     Figure {
         title: "What local DIM learns of the Ising world".into(),

@@ -47,7 +47,7 @@ pub(super) fn fig1(results: &Results) -> Figure {
 }
 
 fn by_alpha() -> Axis {
-    Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0])
+    Axis::linear("\u{3b1}, probability of a step up").covering(&[0.0, 1.0])
 }
 
 /// Draws a closed form over many biases, so that its curve is smooth.
@@ -61,7 +61,7 @@ fn closed_form(results: &Results, name: &str, value: impl Fn(&Chain) -> f64) -> 
 fn numerical(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
     let alphas = results.settings.alphas.iter();
     let points = alphas.map(|&alpha| (alpha, value(&results.chain(alpha))));
-    Series::line("numerical", 0, points.collect()).marked(Mark::Rings)
+    Series::line("numerical", 0, points.collect()).with_mark(Mark::Rings)
 }
 
 fn information(results: &Results) -> Panel {
@@ -69,15 +69,15 @@ fn information(results: &Results) -> Panel {
     let learnt = alphas.map(|&alpha| (alpha, results.learnt_information(alpha)));
     let learnt = Curve::of_means(learnt, Band::Range).series("learnt", 1);
     let of_a_ring = Chain::mutual_information_of_a_ring;
-    let ring = closed_form(results, "a ring, no ends", of_a_ring).coloured(GREY);
+    let ring = closed_form(results, "a ring, no ends", of_a_ring).with_colour(GREY);
     let series = vec![
-        ring.marked(Mark::Dashed),
+        ring.with_mark(Mark::Dashed),
         closed_form(results, "closed form", Chain::mutual_information),
         numerical(results, Chain::mutual_information_numerically),
-        learnt.marked(Mark::Bars),
+        learnt.with_mark(Mark::Bars),
     ];
     let title = "(c) Mutual information of successive states";
-    let y = Axis::linear("I(S, S') [nats]").showing(&[0.0]);
+    let y = Axis::linear("I(S, S') [nats]").covering(&[0.0]);
     Panel::Chart(Chart::new(title, by_alpha(), y, series))
 }
 
@@ -86,7 +86,7 @@ fn inverse_gap(results: &Results) -> Panel {
         closed_form(results, "closed form", |it| 1.0 / it.spectral_gap()),
         numerical(results, |it| 1.0 / it.spectral_gap_numerically()),
     ];
-    let y = Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").showing(&[0.0]);
+    let y = Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").covering(&[0.0]);
     let title = "(d) Inverse spectral gap";
     Panel::Chart(Chart::new(title, by_alpha(), y, series))
 }
@@ -106,7 +106,7 @@ pub(super) fn convergence(results: &Results) -> Figure {
     let share = 100.0 * (1.0 - settings.share_reached);
     let of_share = format!("Updates until {share:.0}% of I(S, S') is learnt");
     let of_last = format!("Error after {} updates", settings.updates);
-    let y = Axis::linear("total variation [probability]").showing(&[0.0]);
+    let y = Axis::linear("total variation [probability]").covering(&[0.0]);
     Figure {
         title: "Does InfoNCE converge as the spectral gap says?".into(),
         notes: vec![format!(
@@ -137,7 +137,7 @@ fn by_sampling(
             (x, values.collect())
         });
         let curve = Curve::of_means(means, Band::Range).series(sampling.name(), index);
-        curve.marked(Mark::Bars)
+        curve.with_mark(Mark::Bars)
     };
     Sampling::ALL.iter().enumerate().map(of).collect()
 }

@@ -61,7 +61,7 @@ fn task_series(results: &Results, part: usize) -> Vec<Series> {
         for task in 1..continual.tasks {
             let x = length * task as f64;
             let line = Series::line("", 0, vec![(x, min), (x, max)]);
-            series.push(line.coloured(GREY).marked(Mark::Line));
+            series.push(line.with_colour(GREY).with_mark(Mark::Line));
         }
     }
     for (index, agent) in results.settings.agents.iter().enumerate() {
@@ -75,7 +75,7 @@ fn task_series(results: &Results, part: usize) -> Vec<Series> {
             if let Some(end) = Spread::of(ends.map(|it| it.0)) {
                 let x = length * task as f64;
                 let line = vec![(x, end.mean), (x + length, end.mean)];
-                series.push(Series::line("", 0, line).marked(Mark::Dashed));
+                series.push(Series::line("", 0, line).with_mark(Mark::Dashed));
             }
         }
     }

@@ -32,17 +32,17 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
     let label = format!("{name} return");
     let panels = results.by_dial().map(|rows| {
         let line = Series::line("", 0, front.clone());
-        let mut series = vec![line.coloured(GREY).marked(Mark::Dashed)];
+        let mut series = vec![line.with_colour(GREY).with_mark(Mark::Dashed)];
         for (index, row) in rows.iter().enumerate() {
             let Some(it) = place(row.result) else {
                 continue;
             };
             let point = Series::line(row.name, index, vec![(it.speed, it.value)]);
             let bar = vec![(it.speed, it.ends[0], it.ends[1])];
-            series.push(point.banded(bar).marked(Mark::Bars));
+            series.push(point.with_band(bar).with_mark(Mark::Bars));
         }
         let (x, y) = (Axis::linear("frames/s"), Axis::linear(&label));
-        let (x, y) = (x.showing(&speeds), y.showing(&values));
+        let (x, y) = (x.covering(&speeds), y.covering(&values));
         Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series))
     });
     Figure {
