@@ -24,7 +24,7 @@ pub struct PlotArgs {
     /// Band over several seeds
     #[arg(long, value_enum, default_value_t = Band::Range)]
     pub(crate) band: Band,
-    /// Draw one line per run
+    /// Draw each run as a separate line
     #[arg(long)]
     pub(crate) separate: bool,
     /// Play so many episodes with a random policy, and draw the mean return as a line
