@@ -27,7 +27,7 @@ use serde::{
 
 use crate::{
     flags::ExperimentFlags,
-    page::{page, summary, time},
+    page::{describe_time, render_page, summary},
     progress::Progress,
 };
 
@@ -41,7 +41,7 @@ pub(crate) const RUNS: &str = "runs";
 
 /// A finished piece as stored on the disk.
 #[derive(Serialize, Deserialize)]
-struct Kept<T> {
+struct StoredPiece<T> {
     /// What the piece was made from, such as the hash of weights; empty if it depends on the settings alone.
     #[serde(default)]
     of: String,
@@ -58,7 +58,7 @@ pub(crate) struct Session {
     progress: Progress,
     seconds: f64,
     /// How many runs were made at once; `seconds` is the sum over all of them.
-    at_once: u32,
+    jobs: u32,
     /// The names of the runs that are planned and not finished.
     missing: Vec<String>,
 }
@@ -103,37 +103,37 @@ impl Session {
             report_only,
             progress: Progress::new(units, shutdown),
             seconds: 0.0,
-            at_once: 1,
+            jobs: 1,
             missing: Vec::new(),
         };
         if !report_only {
-            session.keep(CORES, Machine::detect().cores)?;
+            session.store(CORES, Machine::detect().cores)?;
         }
         Ok(session)
     }
 
     /// Returns the piece of this name if it exists and can be read, whatever it was made from.
-    pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
-        self.read(key).map(|kept| kept.result)
+    pub(crate) fn read_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
+        self.read(key).map(|piece| piece.result)
     }
 
     /// Keeps a piece that took no time.
-    pub(crate) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
-        let kept = Kept {
+    pub(crate) fn store<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
+        let piece = StoredPiece {
             of: String::new(),
             seconds: 0.0,
             result,
         };
-        self.write(key, &kept)
+        self.write(key, &piece)
     }
 
-    fn read<T: DeserializeOwned>(&self, key: &str) -> Option<Kept<T>> {
+    fn read<T: DeserializeOwned>(&self, key: &str) -> Option<StoredPiece<T>> {
         let text = fs::read(self.piece_path(key)).ok()?;
         serde_json::from_slice(&text).ok()
     }
 
-    fn write<T: Serialize>(&self, key: &str, kept: &Kept<T>) -> anyhow::Result<()> {
-        let text = serde_json::to_vec(kept).context("keeping a piece")?;
+    fn write<T: Serialize>(&self, key: &str, piece: &StoredPiece<T>) -> anyhow::Result<()> {
+        let text = serde_json::to_vec(piece).context("keeping a piece")?;
         write_atomically(&self.piece_path(key), &text)
     }
 
@@ -156,14 +156,14 @@ impl Session {
 
     /// Counts runs, which `sweep::runs` keeps: the time of all of them together, how many were made at once, and the names of the
     /// unfinished ones.
-    pub(crate) fn count_runs(&mut self, seconds: f64, at_once: u32, missing: Vec<String>) {
+    pub(crate) fn count_runs(&mut self, seconds: f64, jobs: u32, missing: Vec<String>) {
         self.seconds += seconds;
-        self.at_once = at_once;
+        self.jobs = jobs;
         self.missing = missing;
     }
 
     /// Returns an error if a run is missing, unless this session only reports.
-    pub(crate) fn check_made(&self) -> anyhow::Result<()> {
+    pub(crate) fn check_none_missing(&self) -> anyhow::Result<()> {
         ensure!(
             self.missing.is_empty() || self.report_only,
             "these runs failed and are in no number of the page; the same command tries them again: {}",
@@ -173,69 +173,69 @@ impl Session {
     }
 
     /// Returns an error if no run is finished.
-    pub(crate) fn check_any<T>(&self, made: &[T]) -> anyhow::Result<()> {
+    pub(crate) fn check_has_runs<T>(&self, made: &[T]) -> anyhow::Result<()> {
         if made.is_empty() {
-            self.check_made()?;
+            self.check_none_missing()?;
             bail!(usage!("no run is finished yet: there is nothing to report"));
         }
         Ok(())
     }
 
-    /// Returns the piece of this name, `units` of work: reads it if it exists, else makes and keeps it. `of` names what the piece is made
-    /// from, empty if from the settings alone. If `of` has changed since, the piece is made again.
-    pub(crate) fn piece_of<T: Serialize + DeserializeOwned>(
+    /// Returns the piece of this name, `units` of work: reads it if it exists, else makes and keeps it. `source` names what the piece is
+    /// made from, empty if from the settings alone. If `source` has changed since, the piece is made again.
+    pub(crate) fn load_or_make<T: Serialize + DeserializeOwned>(
         &mut self,
-        of: &str,
+        source: &str,
         key: &str,
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         // A piece that cannot be read is made again, like a missing one.
-        if let Some(kept) = self.read::<T>(key).filter(|kept| kept.of == of) {
-            self.progress.find(units);
-            self.seconds += kept.seconds;
-            return Ok(kept.result);
+        if let Some(piece) = self.read::<T>(key).filter(|piece| piece.of == source) {
+            self.progress.count_earlier(units);
+            self.seconds += piece.seconds;
+            return Ok(piece.result);
         }
-        let stopped = |e: &anyhow::Error| {
+        let report_stop = |e: &anyhow::Error| {
             if e.is::<Interrupted>() {
                 console::eprintln("stopped; the same command resumes after the last whole piece");
             }
         };
-        self.progress.begin(key);
+        self.progress.set_task(key);
         let (started, before) = (Instant::now(), self.progress.done());
-        let result = make(&mut self.progress).inspect_err(stopped)?;
-        let kept = Kept {
-            of: of.into(),
+        let result = make(&mut self.progress).inspect_err(report_stop)?;
+        let piece = StoredPiece {
+            of: source.into(),
             seconds: started.elapsed().as_secs_f64(),
             result,
         };
-        self.write(key, &kept)?;
-        self.seconds += kept.seconds;
+        self.write(key, &piece)?;
+        self.seconds += piece.seconds;
         // Counts the units that `make` did not count. This comes after the write, so that an interrupt here does not lose the piece.
         let rest = units.saturating_sub(self.progress.done() - before);
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
-        counted.inspect_err(stopped)?;
-        Ok(kept.result)
+        counted.inspect_err(report_stop)?;
+        Ok(piece.result)
     }
 
-    /// Like [`Session::piece_of`] for what this program computes from `what`. A piece of another program is remade, except for a report.
-    pub(crate) fn computed<T: Serialize + DeserializeOwned>(
+    /// Like [`Session::load_or_make`] for what this program computes from `inputs`. For a report, pieces of other programs are valid too.
+    pub(crate) fn load_or_compute<T: Serialize + DeserializeOwned>(
         &mut self,
-        what: &str,
+        inputs: &str,
         key: &str,
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        let kept = self.read::<IgnoredAny>(key).map(|kept| kept.of);
-        let of = match kept.filter(|of| self.report_only && of.starts_with(what)) {
-            Some(of) => of,
-            None => format!("{what}, {}", program()?),
+        let piece = self.read::<IgnoredAny>(key).map(|piece| piece.of);
+        let source = match piece.filter(|source| self.report_only && source.starts_with(inputs)) {
+            Some(source) => source,
+            None => format!("{inputs}, {}", program_id()?),
         };
-        self.piece_of(&of, key, units, make)
+        self.load_or_make(&source, key, units, make)
     }
 
     /// Writes rows as `name.csv` below a header. `columns` are the column names, separated by commas.
-    pub(crate) fn csv<R: Serialize>(
+    pub(crate) fn write_csv<R: Serialize>(
         &self,
         name: &str,
         columns: &str,
@@ -252,7 +252,7 @@ impl Session {
     }
 
     /// Writes the figure as `stem.svg` and `stem.png`.
-    pub(crate) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
+    pub(crate) fn save_figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
         for extension in ["svg", "png"] {
             let path = self.folder.join(format!("{stem}.{extension}"));
             figure.save(&path, Look::Card)?;
@@ -262,15 +262,15 @@ impl Session {
 
     /// Fills the page template with these values and the `missing` runs, writes the page and prints its path. Returns an error if a run
     /// failed and is therefore not on the page.
-    pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
+    pub(crate) fn write_page(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
-        let time = time(self.seconds, self.at_once, self.kept_piece(CORES));
+        let time = describe_time(self.seconds, self.jobs, self.read_piece(CORES));
         let values = context! { missing => self.missing, ..values };
-        let text = page(template, values, self.smoke, &time);
+        let text = render_page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
         write_atomically(&path, text.as_bytes())?;
         print(&format!("{}{}\n", summary(&text), path.display()))?;
-        self.check_made()
+        self.check_none_missing()
     }
 }
 
@@ -286,16 +286,16 @@ fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
     flags.out.clone().unwrap_or_else(default)
 }
 
-/// Identifies this program and its processor, for [`Session::piece_of`]: the size and modification time of its file, and the model.
-pub(crate) fn program() -> anyhow::Result<String> {
+/// Identifies this program and its processor, for [`Session::load_or_make`]: the size and modification time of its file, and the model.
+pub(crate) fn program_id() -> anyhow::Result<String> {
     let file = process_env::program_path();
-    let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
-    let written = about.modified().ok();
-    let written = written.and_then(|it| it.duration_since(SystemTime::UNIX_EPOCH).ok());
+    let metadata = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
+    let modified = metadata.modified().ok();
+    let modified = modified.and_then(|it| it.duration_since(SystemTime::UNIX_EPOCH).ok());
     Ok(format!(
         "{} bytes of {} s, {}",
-        about.len(),
-        written.map_or(0.0, |it| it.as_secs_f64()),
+        metadata.len(),
+        modified.map_or(0.0, |it| it.as_secs_f64()),
         resources::processor_name()
     ))
 }
@@ -320,13 +320,13 @@ mod tests {
         // A folder with copied runs, opened with wrong flags: the flags are not stored.
         fs::create_dir_all(folder.path().join("walk/runs")).unwrap();
         let copied = report("wrong").unwrap();
-        assert_eq!(copied.kept_piece::<u32>(CORES), None, "of another machine");
+        assert_eq!(copied.read_piece::<u32>(CORES), None, "of another machine");
         let mut session = open("a").unwrap();
-        assert_eq!(session.piece_of("", "one", 2, |_| Ok(7)).unwrap(), 7);
-        let failed = session.piece_of::<u32>("", "two", 2, |_| bail!("stopped"));
+        assert_eq!(session.load_or_make("", "one", 2, |_| Ok(7)).unwrap(), 7);
+        let failed = session.load_or_make::<u32>("", "two", 2, |_| bail!("stopped"));
         assert!(failed.is_err());
 
-        let made = |key: &str, made: u32| open("a").unwrap().piece_of("", key, 2, |_| Ok(made));
+        let made = |key: &str, made: u32| open("a").unwrap().load_or_make("", key, 2, |_| Ok(made));
         assert_eq!(made("one", 8).unwrap(), 7, "it is kept");
         assert_eq!(made("two", 8).unwrap(), 8);
         // A crash of the machine cut the file off in the middle of a write.
@@ -334,42 +334,42 @@ mod tests {
         assert_eq!(made("one", 9).unwrap(), 9);
         assert!(open("b").unwrap_err().is::<Usage>());
         // The source of the piece has changed.
-        let mut of = |of: &str, made: u32| session.piece_of(of, "played", 1, |_| Ok(made)).unwrap();
+        let mut of = |of: &str, n: u32| session.load_or_make(of, "played", 1, |_| Ok(n)).unwrap();
         let all = [of("x", 1), of("x", 2), of("y", 3), of("y", 4)];
         assert_eq!(all, [1, 1, 3, 3]);
-        // `kept_piece` reads a piece whatever it was made from.
-        assert_eq!(session.kept_piece::<u32>("played"), Some(3));
-        assert_eq!(session.kept_piece::<u32>("never"), None);
-        session.keep("calls", ["driml tradeoff"]).unwrap();
-        let calls: Option<Vec<String>> = session.kept_piece("calls");
+        // `read_piece` reads a piece whatever it was made from.
+        assert_eq!(session.read_piece::<u32>("played"), Some(3));
+        assert_eq!(session.read_piece::<u32>("never"), None);
+        session.store("calls", ["driml tradeoff"]).unwrap();
+        let calls: Option<Vec<String>> = session.read_piece("calls");
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
         let mut reported = report("a").unwrap();
-        let cores = reported.kept_piece(CORES);
+        let cores = reported.read_piece(CORES);
         assert_eq!(cores, Some(Machine::detect().cores));
-        let made = session.piece_of("w, an old program", "errors", 1, |_| Ok(1));
+        let made = session.load_or_make("w, an old program", "errors", 1, |_| Ok(1));
         assert_eq!(made.unwrap(), 1);
-        let computed = |session: &mut Session, what: &str, made: u32| {
-            session.computed(what, "errors", 1, |_| Ok(made)).unwrap()
+        let computed = |session: &mut Session, of: &str, n: u32| {
+            session.load_or_compute(of, "errors", 1, |_| Ok(n)).unwrap()
         };
         assert_eq!(computed(&mut reported, "w", 2), 1);
         assert_eq!(computed(&mut session, "w", 3), 3);
         assert_eq!(computed(&mut reported, "v", 4), 4);
         assert!(report("b").unwrap_err().is::<Usage>());
         // Ctrl-C while a piece is made: the piece is kept first.
-        let stopped = session.piece_of("", "slow", 1, |progress| {
+        let stopped = session.load_or_make("", "slow", 1, |progress| {
             nix::sys::signal::raise(nix::sys::signal::Signal::SIGINT)?;
             progress.shutdown().ending.wait();
             Ok(5)
         });
         assert!(stopped.unwrap_err().is::<Interrupted>());
-        assert_eq!(session.kept_piece::<u32>("slow"), Some(5));
+        assert_eq!(session.read_piece::<u32>("slow"), Some(5));
         // Failed runs are not a usage error.
         for (session, is_usage) in [(&mut session, false), (&mut reported, true)] {
             session.count_runs(0.0, 1, vec!["a".into()]);
-            let said = session.check_any::<u32>(&[]).unwrap_err();
+            let said = session.check_has_runs::<u32>(&[]).unwrap_err();
             assert_eq!(said.is::<Usage>(), is_usage);
             assert_eq!(said.to_string().ends_with(": a"), !is_usage);
-            assert_eq!(session.check_made().is_ok(), is_usage);
+            assert_eq!(session.check_none_missing().is_ok(), is_usage);
         }
     }
 }

@@ -156,7 +156,7 @@ pub struct SweepArgs {
 }
 
 /// Reads the table `full` or `smoke` of an experiment's built-in settings.
-pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
+pub(crate) fn read_settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
     let length = if smoke { "smoke" } else { "full" };
     let read = || -> Result<T, toml::de::Error> {
         let mut file: toml::Table = text.parse()?;
@@ -168,12 +168,12 @@ pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool)
     })
 }
 
-/// Expands each name with `of` and drops duplicates, because runs of the same name would share a folder.
-pub(crate) fn once(
+/// Expands each name with `expand` and drops duplicates, because runs of the same name would share a folder.
+pub(crate) fn expand_unique(
     names: &[String],
-    of: impl Fn(&str) -> Result<Vec<String>, Usage>,
+    expand: impl Fn(&str) -> Result<Vec<String>, Usage>,
 ) -> Result<Vec<String>, Usage> {
-    let all = names.iter().map(|name| of(name));
+    let all = names.iter().map(|name| expand(name));
     let all = all.collect::<Result<Vec<_>, _>>()?.concat();
     let mut seen = BTreeSet::new();
     let new = |name: &String| seen.insert(name.clone());
@@ -181,7 +181,7 @@ pub(crate) fn once(
 }
 
 /// Returns the command line of this process for a page, without `--out` and `--report`.
-pub(crate) fn this_command() -> String {
+pub(crate) fn this_command_line() -> String {
     let mut words = vec!["driml".to_owned()];
     let args = std::env::args_os().skip(1);
     let mut args = args.map(|word| word.to_string_lossy().into_owned());
@@ -208,7 +208,7 @@ pub(crate) mod tests {
     }
 
     /// Parses the arguments of a command from these words.
-    pub(crate) fn parsed<T: Args>(words: &str) -> T {
+    pub(crate) fn parse<T: Args>(words: &str) -> T {
         let words = ["driml"].into_iter().chain(words.split_whitespace());
         CommandLine::parse_from(words).args
     }

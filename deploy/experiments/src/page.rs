@@ -5,21 +5,21 @@ use driml_machine::units::rough_duration;
 use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context};
 
 use crate::{
-    flags::this_command,
+    flags::this_command_line,
     stats::{Spread, difference, interval, mean},
 };
 
-const SMOKE: &str =
+const SMOKE_WARNING: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
 
-/// Describes for a page the time that all pieces took together: `at_once` runs were made at a time, on a machine with `cores` cores if
+/// Describes for a page the time that all pieces took together: `jobs` runs were made at a time, on a machine with `cores` cores if
 /// that is known.
-pub(crate) fn time(seconds: f64, at_once: u32, cores: Option<u32>) -> String {
-    let at_once = match at_once {
+pub(crate) fn describe_time(seconds: f64, jobs: u32, cores: Option<u32>) -> String {
+    let jobs = match jobs {
         1 => String::new(),
         jobs => format!(" of runs, {jobs} at once,"),
     };
-    let time = format!("{}{at_once}", rough_duration(seconds));
+    let time = format!("{}{jobs}", rough_duration(seconds));
     match cores {
         Some(cores) => format!("{time} on a machine with {cores} cores."),
         None => format!("{}.", time.trim_end_matches(',')),
@@ -29,11 +29,11 @@ pub(crate) fn time(seconds: f64, at_once: u32, cores: Option<u32>) -> String {
 /// Returns the page of `template` as Markdown, filled with `values`. `smoke` adds a warning that the numbers mean nothing. The command
 /// is that of this process unless `values` has another.
 /// Do not build `values` through JSON: it turns NaN into null, which a mean would silently leave out.
-pub(crate) fn page(template: &str, values: Value, smoke: bool, time: &str) -> String {
+pub(crate) fn render_page(template: &str, values: Value, smoke: bool, time: &str) -> String {
     let values = context! {
         time,
-        smoke => if smoke { SMOKE } else { "" },
-        ..context! { ..values, ..context! { command => this_command() } }
+        smoke => if smoke { SMOKE_WARNING } else { "" },
+        ..context! { ..values, ..context! { command => this_command_line() } }
     };
     fill(template, &values).unwrap_or_else(|e| {
         panic!("the template of the page is built in, and a test fills it: {e:#}")
@@ -55,36 +55,36 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);
     environment.set_lstrip_blocks(true);
-    environment.add_function("figure", figure);
+    environment.add_function("figure", figure_markdown);
     environment.add_filter("fixed", fixed);
     environment.add_filter("percent", |value: Value| {
-        written(&value, |it| format!("{:.1}%", 100.0 * it))
+        or_dash(&value, |it| format!("{:.1}%", 100.0 * it))
     });
     environment.add_filter("sci", |value: Value| {
-        written(&value, |it| format!("{it:.1e}"))
+        or_dash(&value, |it| format!("{it:.1e}"))
     });
     environment.add_filter("factor", |value: Value| {
-        written(&value, |it| format!("x{it:.2}"))
+        or_dash(&value, |it| format!("x{it:.2}"))
     });
-    environment.add_filter("duration", |value: Value| written(&value, rough_duration));
-    environment.add_filter("mean", |list: Value| of_list(&list, mean));
+    environment.add_filter("duration", |value: Value| or_dash(&value, rough_duration));
+    environment.add_filter("mean", |list: Value| reduce(&list, mean));
     environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
-        of_list(&list, |all| mean_and_sd(all, decimals.unwrap_or(3), true))
+        reduce(&list, |all| mean_and_sd(all, decimals.unwrap_or(3), true))
     });
     environment.add_filter("mean_and_sd", |list: Value, decimals: usize| {
-        of_list(&list, |all| mean_and_sd(all, decimals, false))
+        reduce(&list, |all| mean_and_sd(all, decimals, false))
     });
     environment.add_filter("interval", |list: Value, decimals: Option<usize>| {
         let decimals = decimals.unwrap_or(2);
-        of_list(&list, |all| Some(format!("{:.decimals$}", interval(all)?)))
+        reduce(&list, |all| Some(format!("{:.decimals$}", interval(all)?)))
     });
     environment.add_filter("minus", |to: Value, from: Value| {
-        let (to, from) = (list_of(&to)?, list_of(&from)?);
+        let (to, from) = (numbers_of(&to)?, numbers_of(&from)?);
         let found = difference(&from, &to).map(|it| format!("{:+}", it.interval));
         Ok::<_, Error>(found.unwrap_or_else(|| "-".into()))
     });
     environment.add_filter("verdict", |to: Value, from: Value| {
-        let (to, from) = (list_of(&to)?, list_of(&from)?);
+        let (to, from) = (numbers_of(&to)?, numbers_of(&from)?);
         Ok::<_, Error>(difference(&from, &to).map_or("", |it| it.verdict()))
     });
     let text = environment.render_str(template, values)?;
@@ -96,11 +96,11 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
 /// Formats a number times `unit` (1 by default) with fixed decimals.
 fn fixed(value: Value, decimals: usize, unit: Option<f64>) -> Result<String, Error> {
     let unit = unit.unwrap_or(1.0);
-    written(&value, |it| format!("{:.decimals$}", it * unit))
+    or_dash(&value, |it| format!("{:.decimals$}", it * unit))
 }
 
 /// Formats a number with `text`, or a dash for `None`. An undefined value is an error.
-fn written(value: &Value, text: impl Fn(f64) -> String) -> Result<String, Error> {
+fn or_dash(value: &Value, text: impl Fn(f64) -> String) -> Result<String, Error> {
     match value.is_none() || value.as_str() == Some("-") {
         true => Ok("-".into()),
         false => f64::try_from(value.clone()).map(text),
@@ -108,7 +108,7 @@ fn written(value: &Value, text: impl Fn(f64) -> String) -> Result<String, Error>
 }
 
 /// Returns the numbers of a list without the `None` entries, which are runs and seeds that lack the number.
-fn list_of(list: &Value) -> Result<Vec<f64>, Error> {
+fn numbers_of(list: &Value) -> Result<Vec<f64>, Error> {
     if list.is_undefined() {
         return Err(ErrorKind::UndefinedError.into());
     }
@@ -116,9 +116,9 @@ fn list_of(list: &Value) -> Result<Vec<f64>, Error> {
     known.map(f64::try_from).collect()
 }
 
-/// Applies `of` to the numbers of a list; a dash if the result is `None`.
-fn of_list<T: Into<Value>>(list: &Value, of: impl Fn(&[f64]) -> Option<T>) -> Result<Value, Error> {
-    Ok(of(&list_of(list)?).map_or_else(|| "-".into(), Into::into))
+/// Applies `f` to the numbers of a list; a dash if the result is `None`.
+fn reduce<T: Into<Value>>(list: &Value, f: impl Fn(&[f64]) -> Option<T>) -> Result<Value, Error> {
+    Ok(f(&numbers_of(list)?).map_or_else(|| "-".into(), Into::into))
 }
 
 /// Formats the mean, and for several values the standard deviation: `in_words` or after "±".
@@ -134,7 +134,7 @@ fn mean_and_sd(values: &[f64], decimals: usize, in_words: bool) -> Option<String
 }
 
 /// Returns the Markdown of a picture with its caption below and a link to the SVG.
-fn figure(stem: &str, caption: &str) -> String {
+fn figure_markdown(stem: &str, caption: &str) -> String {
     format!("![{caption}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
 }
 
@@ -148,9 +148,9 @@ mod tests {
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";
         let values = context! { got => 0.5, more => ["1", "2"], no => false, command };
-        let page = |smoke, at_once, cores| {
-            let time = time(130.0, at_once, cores);
-            page(template, values.clone(), smoke, &time)
+        let page = |smoke, jobs, cores| {
+            let time = describe_time(130.0, jobs, cores);
+            render_page(template, values.clone(), smoke, &time)
         };
         let text = page(true, 1, Some(64));
         for part in [

@@ -15,9 +15,9 @@ pub(crate) struct Progress {
     total: u64,
     done: u64,
     /// The units that an earlier start did; they do not count for the speed.
-    found: u64,
+    earlier: u64,
     started: Instant,
-    what: String,
+    task: String,
     screen: Screen,
     shutdown: GracefulShutdown,
 }
@@ -27,22 +27,22 @@ impl Progress {
         Self {
             total,
             done: 0,
-            found: 0,
+            earlier: 0,
             started: Instant::now(),
-            what: String::new(),
+            task: String::new(),
             screen: Screen::new(total, PROGRESS_TEMPLATE),
             shutdown,
         }
     }
 
-    pub(crate) fn begin(&mut self, what: &str) {
-        self.what = what.to_owned();
+    pub(crate) fn set_task(&mut self, task: &str) {
+        self.task = task.to_owned();
     }
 
     /// Counts work that an earlier start did.
-    pub(crate) fn find(&mut self, units: u64) {
+    pub(crate) fn count_earlier(&mut self, units: u64) {
         self.count(units);
-        self.found += units;
+        self.earlier += units;
     }
 
     fn count(&mut self, units: u64) {
@@ -55,7 +55,7 @@ impl Progress {
     }
 
     /// Adds units to the total: work that turns out to be needed, or that failed and must be done again.
-    pub(crate) fn again(&mut self, units: u64) {
+    pub(crate) fn add_work(&mut self, units: u64) {
         self.total += units;
         if let Some(bar) = self.screen.bar() {
             bar.set_length(self.total);
@@ -90,19 +90,19 @@ impl Progress {
             Some(seconds) => format!("about {} left", rough_duration(seconds)),
             None => "the time left is not known yet".to_owned(),
         };
-        let (what, percent) = (&self.what, 100 * self.done / self.total.max(1));
+        let (task, percent) = (&self.task, 100 * self.done / self.total.max(1));
         let done = self.done.min(self.total);
         self.screen.show(done, |beside_bar| match beside_bar {
-            true => format!("{what}, {left}"),
-            false => format!("{percent:>3}%  {what}, {left}"),
+            true => format!("{task}, {left}"),
+            false => format!("{percent:>3}%  {task}, {left}"),
         });
     }
 
     /// Returns the seconds left at the speed so far; `None` until this start has done some work.
     pub(crate) fn seconds_left(&self, elapsed: f64) -> Option<f64> {
-        let fresh = self.done - self.found;
+        let new_units = self.done - self.earlier;
         let left = self.total.saturating_sub(self.done);
-        (fresh > 0).then(|| elapsed / fresh as f64 * left as f64)
+        (new_units > 0).then(|| elapsed / new_units as f64 * left as f64)
     }
 }
 
@@ -113,7 +113,7 @@ mod tests {
     #[test]
     fn the_time_left_follows_from_the_work_of_this_start() {
         let mut progress = Progress::new(100, GracefulShutdown::default());
-        progress.find(40);
+        progress.count_earlier(40);
         assert_eq!(progress.seconds_left(5.0), None);
         progress.advance(10).unwrap();
         assert_eq!(progress.seconds_left(5.0), Some(25.0));

@@ -33,12 +33,12 @@ pub(crate) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
 }
 
 /// Returns the config of the network with the fewest parameters: eight scalars.
-pub(crate) fn least() -> ModelConfig {
+pub(crate) fn minimal_config() -> ModelConfig {
     config(2, 1, (-1.0, 1.0))
 }
 
 /// Returns the number of scalars in all parameters together.
-pub(crate) fn len(config: &ModelConfig) -> usize {
+pub(crate) fn scalar_count(config: &ModelConfig) -> usize {
     let shapes = config.parameter_shapes().into_iter();
     let scalars = |(_, shape): (_, Vec<usize>)| shape.iter().product::<usize>();
     shapes.map(scalars).sum()
@@ -60,7 +60,7 @@ pub(crate) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Paramet
 }
 
 /// Returns the scalars of all parameters, in the order of [`parameters`].
-pub(crate) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Vec<f32>> {
+pub(crate) fn scalars(config: &ModelConfig, parameters: &Parameters) -> Result<Vec<f32>> {
     let mut values = Vec::new();
     for (name, _) in config.parameter_shapes() {
         if let Some(var) = parameters.get(&name) {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use driml_machine::error::Usage;
 
 use super::*;
-use crate::sweep::plan::Call;
+use crate::sweep::plan::TrainCall;
 
 struct Runs(tempfile::TempDir);
 
@@ -158,9 +158,9 @@ fn rows_at_the_same_place_are_one_point_whatever_their_order() {
 fn a_random_policy_is_a_line() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, METRICS);
-    let call = Call {
+    let call = TrainCall {
         env: Some("chain".into()),
-        ..Call::default()
+        ..TrainCall::default()
     };
     std::fs::write(a.join("config.toml"), call.config().unwrap().to_toml()).unwrap();
     let mut args = root.args(&[&a], &["mean_return"]);

@@ -28,20 +28,20 @@ const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,i
 
 /// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
+    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let table = checks::table(&settings);
     let units = table.len() as u64 * u64::from(settings.seeds);
     let mut session = Session::open(NAME, args, &settings, units, false)?;
     // Pieces of another build of the program are not valid for its routines.
-    let program = cache::program()?;
+    let program = cache::program_id()?;
     let mut rows: Vec<Row> = Vec::new();
     for (at, mut property) in table.into_iter().enumerate() {
         let routine = property.routine;
         let name = routine.replace(|c: char| !c.is_alphanumeric(), "-");
         for seed in 1..=settings.seeds {
             let key = format!("{at:02}-{name}-seed{seed}");
-            let seen = session.piece_of(&program, &key, 1, |progress| {
+            let seen = session.load_or_make(&program, &key, 1, |progress| {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed.into());
                 rng.set_stream(at as u64);
                 property.run(&settings, rng, progress)
@@ -56,10 +56,10 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         let found = [number(row.seen.worst), number(row.bound)];
         (of, found, kept, row.promise, &row.seen.input)
     });
-    session.csv("promises", COLUMNS, promises)?;
-    session.figure("worst", &figure::figure(&rows, &cases(&rows)))?;
+    session.write_csv("promises", COLUMNS, promises)?;
+    session.save_figure("worst", &figure::figure(&rows, &cases(&rows)))?;
     let page = session.folder().join("README.md");
-    session.finish(include_str!("page.md.j2"), values(&rows, &settings))?;
+    session.write_page(include_str!("page.md.j2"), values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
     ensure!(is_kept, "{} See {}", verdict(&rows), page.display());
     Ok(())
@@ -138,8 +138,8 @@ mod tests {
     fn the_page_and_the_verdict_name_what_is_broken() {
         let reported = |worst: f64, input: &str| {
             let rows = [row(1, worst, input)];
-            let values = values(&rows, &flags::settings(NAME, SETTINGS, true));
-            let page = crate::page::page(include_str!("page.md.j2"), values, true, "1 s.");
+            let values = values(&rows, &flags::read_settings(NAME, SETTINGS, true));
+            let page = crate::page::render_page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)
         };
         let (verdict, page) = reported(0.25, "");
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn both_lengths_read() {
         for smoke in [false, true] {
-            let settings: Settings = flags::settings(NAME, SETTINGS, smoke);
+            let settings: Settings = flags::read_settings(NAME, SETTINGS, smoke);
             assert!(settings.seeds > 0 && settings.draws > 0);
         }
     }

@@ -301,7 +301,7 @@ mod tests {
                 cases.see(format_args!("4"), [Some(f64::NAN), None])
             })
             .on("failing", Listed, |_| anyhow::bail!("no memory"));
-        let settings = flags::settings(NAME, SETTINGS, true);
+        let settings = flags::read_settings(NAME, SETTINGS, true);
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
         let seen = halving.run(&settings, rng, progress).unwrap();

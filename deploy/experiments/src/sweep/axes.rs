@@ -21,26 +21,26 @@ pub(crate) type Cell = Vec<(String, String)>;
 impl Axis {
     /// Reads `KEY=VALUE,VALUE,..`. Commas within brackets, braces and quotes belong to a value.
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
-        let form =
+        let hint =
             "--set takes table.key=value,value,.., such as learner.update.adam.lr=1e-4,2.5e-4";
         let parts = text.split_once('=');
-        let (name, values) = parts.ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
-        let values = split(values).into_iter();
+        let (name, values) = parts.ok_or_else(|| usage!("--set {text:?} has no '='; {hint}"))?;
+        let values = split_at_commas(values).into_iter();
         let axis = Self {
             name: name.trim().into(),
             values: values.map(|it| it.trim().to_owned()).collect(),
         };
-        axis.check(form)?;
+        axis.check_values(hint)?;
         Ok(axis)
     }
 
-    pub(crate) fn check(&self, form: &str) -> Result<(), Usage> {
+    pub(crate) fn check_values(&self, hint: &str) -> Result<(), Usage> {
         for (at, value) in self.values.iter().enumerate() {
             if value.is_empty() {
-                return Err(usage!("{} has an empty value; {form}", self.name));
+                return Err(usage!("{} has an empty value; {hint}", self.name));
             }
             if self.values[..at].contains(value) {
-                return Err(usage!("{} has {value} twice; {form}", self.name));
+                return Err(usage!("{} has {value} twice; {hint}", self.name));
             }
         }
         Ok(())
@@ -48,7 +48,7 @@ impl Axis {
 }
 
 /// Splits `text` at the commas outside brackets, braces and quotes.
-fn split(text: &str) -> Vec<&str> {
+fn split_at_commas(text: &str) -> Vec<&str> {
     let (mut depth, mut quote, mut start) = (0_i32, None, 0);
     let mut parts = Vec::new();
     for (at, letter) in text.char_indices() {
@@ -80,11 +80,11 @@ pub(crate) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
     }
     let mut cells = vec![Cell::new()];
     for Axis { name, values } in axes {
-        let longer = |cell: Cell| {
+        let extended = |cell: Cell| {
             let values = values.iter().map(|value| (name.clone(), value.clone()));
             values.map(move |it| [&cell[..], &[it]].concat())
         };
-        cells = cells.into_iter().flat_map(longer).collect();
+        cells = cells.into_iter().flat_map(extended).collect();
     }
     Ok(cells)
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     axes::{Axis, Cell, RUNS_MAX, cells},
-    plan::{Call, Made, PlannedRun, install},
+    plan::{PlannedRun, PointRun, TrainCall, install_worlds},
     queue,
 };
 use crate::{
@@ -21,7 +21,7 @@ use crate::{
 /// The name of the default folder, the table and the plot.
 const NAME: &str = "sweep";
 /// The most letters that describe a cell in the name of a run's folder.
-const NAME_LETTERS: usize = 80;
+const NAME_LETTERS_MAX: usize = 80;
 /// The columns of the table after the axes.
 const MEASURED: &str =
     "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
@@ -47,8 +47,8 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         out: args.out.clone(),
         seeds: None,
     };
-    let kept = settings_of(NAME, &flags).filter(|_| args.report);
-    let (settings, seeds) = settings(args, kept)?;
+    let stored = settings_of(NAME, &flags).filter(|_| args.report);
+    let (settings, seeds) = resolve_settings(args, stored)?;
     let axes = &settings.axes;
     let cells = cells(axes, args.seeds)?;
     // A report asks for `SEEDS_MAX` seeds; no sweep has more than `RUNS_MAX` runs.
@@ -56,7 +56,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let mut plans = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
         let config = settings.call(cell, 1).config();
-        let config = config.map_err(|e| match &described(cell)[..] {
+        let config = config.map_err(|e| match &describe(cell)[..] {
             "" => e,
             cell => usage!("{cell}: {e}"),
         })?;
@@ -67,53 +67,53 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         }));
     }
     plans.sort_by_key(|(_, plan)| plan.call.seed);
-    install(&plans, args.report)?;
+    install_worlds(&plans, args.report)?;
     let mut session = Session::open(NAME, &flags, &settings, 0, args.report)?;
-    let made = queue::make(&mut session, plans, args.jobs)?;
+    let finished = queue::run_all(&mut session, plans, args.jobs)?;
     session.progress().clear();
-    let rows = rows(&cells, &made);
+    let rows = table_rows(&cells, &finished);
     let names = axes.iter().map(|axis| axis.name.as_str());
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
-    session.csv(NAME, &header.join(","), &rows)?;
+    session.write_csv(NAME, &header.join(","), &rows)?;
     let lines = [vec![header], rows].concat();
     print(&format!("{}{LEGEND}", align_columns(&lines, &[])))?;
-    session.check_any(&made)?;
-    let runs = made.iter().map(|it| it.run.folder.path().to_owned());
+    session.check_has_runs(&finished)?;
+    let runs = finished.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {
         runs: runs.collect(),
         out: session.folder().join(format!("{NAME}.svg")),
         ..PlotArgs::default()
     })?;
-    session.check_made()
+    session.check_none_missing()
 }
 
-/// Returns the settings and the number of seeds of a call. A report that names no axis uses the `kept` settings and all seeds.
-fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Settings, u32)> {
-    let asked = Settings {
-        axes: axes_of(args)?,
+/// Returns the settings and the number of seeds of a call. A report that names no axis uses the `stored` settings and all seeds.
+fn resolve_settings(args: &SweepArgs, stored: Option<Settings>) -> anyhow::Result<(Settings, u32)> {
+    let given = Settings {
+        axes: parse_axes(args)?,
         frames: args.frames,
         preset: args.preset.clone(),
     };
-    let Some(kept) = kept.filter(|_| asked.axes.is_empty()) else {
-        return Ok((asked, args.seeds));
+    let Some(stored) = stored.filter(|_| given.axes.is_empty()) else {
+        return Ok((given, args.seeds));
     };
     let settings = Settings {
-        axes: kept.axes,
-        frames: asked.frames.or(kept.frames),
-        preset: asked.preset.or(kept.preset),
+        axes: stored.axes,
+        frames: given.frames.or(stored.frames),
+        preset: given.preset.or(stored.preset),
     };
     Ok((settings, SEEDS_MAX))
 }
 
 /// Returns the axes of a call: `--env` and `--agent` first, if given, then each `--set` in the order of the command line.
-fn axes_of(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
+fn parse_axes(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
     let mut axes = Vec::new();
     for (name, values) in [("env", &args.env), ("agent", &args.agent)] {
         let axis = Axis {
             name: name.into(),
             values: values.clone(),
         };
-        axis.check(&format!("--{name} takes a list, such as --{name} A,B"))?;
+        axis.check_values(&format!("--{name} takes a list, such as --{name} A,B"))?;
         axes.extend((!values.is_empty()).then_some(axis));
     }
     for set in &args.sets {
@@ -131,17 +131,17 @@ fn axes_of(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
 }
 
 impl Settings {
-    fn call(&self, cell: &Cell, seed: u32) -> Call {
-        let mut call = Call {
+    fn call(&self, cell: &Cell, seed: u32) -> TrainCall {
+        let mut call = TrainCall {
             preset: self.preset.clone(),
             seed,
             frames: self.frames,
-            ..Call::default()
+            ..TrainCall::default()
         };
         for (name, value) in cell {
             match name.as_str() {
                 // The user may name a game without its `procgen:`.
-                "env" => call.env = Some(full_name(value)),
+                "env" => call.env = Some(world_name(value)),
                 "agent" => call.agent = Some(value.clone()),
                 _ => call.sets.push(format!("{name}={value}")),
             }
@@ -150,12 +150,12 @@ impl Settings {
     }
 }
 
-fn full_name(world: &str) -> String {
+fn world_name(world: &str) -> String {
     presets::world(world).map_or_else(|_| world.to_owned(), |it| it.to_string())
 }
 
 /// Describes a cell, such as `agent=c51, learner.batch_size=64`.
-fn described(cell: &Cell) -> String {
+fn describe(cell: &Cell) -> String {
     let words = cell.iter().map(|(name, value)| format!("{name}={value}"));
     words.collect::<Vec<_>>().join(", ")
 }
@@ -172,13 +172,13 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
             _ => format!("-{key}={value}"),
         };
     }
-    name.chars().take(NAME_LETTERS).collect()
+    name.chars().take(NAME_LETTERS_MAX).collect()
 }
 
 /// Returns the table, a row for each cell of the grid; a missing number is empty. The `point` of a run is the number of its cell.
-fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
+fn table_rows(cells: &[Cell], finished: &[PointRun<usize>]) -> Vec<Vec<String>> {
     let row = |(at, cell): (usize, &Cell)| {
-        let here = made.iter().filter(|it| it.point == at);
+        let here = finished.iter().filter(|it| it.point == at);
         let runs: Vec<_> = here.map(|it| &it.run.summary).collect();
         let returns: Vec<f64> = runs.iter().filter_map(|it| it.mean_return).collect();
         let (low, high) = interval(&returns).and_then(|it| it.ends).unzip();
@@ -208,15 +208,15 @@ fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flags::tests::parsed;
+    use crate::flags::tests::parse;
 
     #[test]
     fn a_report_need_not_repeat_what_the_folder_was_made_with() {
-        let of = |line: &str, kept| settings(&parsed(line), kept).unwrap();
-        let kept = || Some(of("--agent c51,curl --frames 320", None).0);
-        assert_eq!(of("--report", kept()), (kept().unwrap(), SEEDS_MAX));
-        let asked = of("--report --agent c51 --seeds 2", kept());
-        assert_eq!(asked, of("--agent c51 --seeds 2", None));
+        let of = |line: &str, stored| resolve_settings(&parse(line), stored).unwrap();
+        let stored = || Some(of("--agent c51,curl --frames 320", None).0);
+        assert_eq!(of("--report", stored()), (stored().unwrap(), SEEDS_MAX));
+        let given = of("--report --agent c51 --seeds 2", stored());
+        assert_eq!(given, of("--agent c51 --seeds 2", None));
     }
 
     #[test]
@@ -236,8 +236,8 @@ mod tests {
 
     #[test]
     fn a_game_may_be_named_alone() {
-        assert_eq!(full_name("maze"), "procgen:maze");
-        assert_eq!(full_name("chain"), "chain");
-        assert_eq!(full_name("exec:python3 world.py"), "exec:python3 world.py");
+        assert_eq!(world_name("maze"), "procgen:maze");
+        assert_eq!(world_name("chain"), "chain");
+        assert_eq!(world_name("exec:python3 world.py"), "exec:python3 world.py");
     }
 }

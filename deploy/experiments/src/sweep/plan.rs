@@ -17,7 +17,7 @@ use driml_settings::{
 
 /// The flags of `driml train` that make a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Call {
+pub(crate) struct TrainCall {
     pub(crate) env: Option<String>,
     pub(crate) agent: Option<String>,
     pub(crate) preset: Option<String>,
@@ -27,7 +27,7 @@ pub(crate) struct Call {
     pub(crate) sets: Vec<String>,
 }
 
-impl Call {
+impl TrainCall {
     pub(crate) fn args(&self) -> Vec<String> {
         let named = [
             ("--env", self.env.clone()),
@@ -64,7 +64,7 @@ impl Call {
 pub(crate) struct PlannedRun {
     /// The name of its folder.
     pub(crate) name: String,
-    pub(crate) call: Call,
+    pub(crate) call: TrainCall,
     pub(crate) frames: u64,
     /// The number of episodes after which the run may stop before it has all its frames.
     pub(crate) episodes: Option<u64>,
@@ -74,9 +74,9 @@ pub(crate) struct PlannedRun {
 
 impl PlannedRun {
     /// Plans a run. In the folder name each unsuitable character, such as one of a world's command, becomes a dash.
-    pub(crate) fn new(name: &str, call: Call, frames: u64) -> Self {
-        let fits = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
-        let letters = name.chars().map(|it| if fits(it) { it } else { '-' });
+    pub(crate) fn new(name: &str, call: TrainCall, frames: u64) -> Self {
+        let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
+        let letters = name.chars().map(|it| if is_allowed(it) { it } else { '-' });
         Self {
             name: letters.collect(),
             call,
@@ -97,10 +97,10 @@ pub(crate) struct FinishedRun {
 }
 
 /// A planned run, with its point on the axes of the sweep.
-pub(crate) type Planned<P> = (P, PlannedRun);
+pub(crate) type PointPlan<P> = (P, PlannedRun);
 
 /// A finished run at its point in the sweep.
-pub(crate) struct Made<P> {
+pub(crate) struct PointRun<P> {
     pub(crate) point: P,
     pub(crate) plan: PlannedRun,
     pub(crate) run: FinishedRun,
@@ -108,20 +108,20 @@ pub(crate) struct Made<P> {
 
 /// Resolves the settings of each call once, whatever its seed, and installs what its world needs. For a report it does nothing. Call it
 /// before anything is written, so that the user can correct the call and use the same folder.
-pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<()> {
-    let mut known: Vec<Call> = Vec::new();
+pub(crate) fn install_worlds<P>(plans: &[PointPlan<P>], report: bool) -> anyhow::Result<()> {
+    let mut known: Vec<TrainCall> = Vec::new();
     let plans = if report { &[] } else { plans };
     for (_, plan) in plans {
-        let call = Call {
+        let call = TrainCall {
             seed: 1,
             ..plan.call.clone()
         };
         if !known.contains(&call) {
             let config = call.config();
             let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
-            let is_its_own = config.run.seed == 1 && config.frames() == plan.frames;
+            let is_as_planned = config.run.seed == 1 && config.frames() == plan.frames;
             ensure!(
-                is_its_own,
+                is_as_planned,
                 usage!("--set changes the run's seed or frames: use --seeds and --frames")
             );
             config.world.install(&mut console::eprintln)?;

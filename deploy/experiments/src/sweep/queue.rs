@@ -25,13 +25,13 @@ use driml_protocol::lock_file;
 use driml_settings::flags::Flags;
 
 use super::{
-    plan::{Made, Planned, PlannedRun},
+    plan::{PlannedRun, PointPlan, PointRun},
     runs::{Runs, move_aside},
 };
 use crate::{cache::Session, progress::Progress};
 
 /// How often a run is tried in one call. On a machine that is busy with other work, a run may lose contact with its processes.
-const TRIES: u32 = 2;
+const TRIES_MAX: u32 = 2;
 /// The interval between two checks of the running children.
 const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save after they were asked to stop. Then they are killed.
@@ -39,14 +39,14 @@ const DRAIN_MAX: Duration = Duration::from_secs(240);
 
 /// Makes all runs, `jobs` at once, in the order of `plans`, and adds their work to the progress. For a report it makes none. Returns the
 /// finished runs in the same order.
-pub(crate) fn make<P>(
+pub(crate) fn run_all<P>(
     session: &mut Session,
-    plans: Vec<Planned<P>>,
+    plans: Vec<PointPlan<P>>,
     jobs: u32,
-) -> anyhow::Result<Vec<Made<P>>> {
+) -> anyhow::Result<Vec<PointRun<P>>> {
     let (runs, report_only) = (Runs::open(session.folder())?, session.report_only());
     let progress = session.progress();
-    progress.again(plans.iter().map(|(_, plan)| plan.units).sum());
+    progress.add_work(plans.iter().map(|(_, plan)| plan.units).sum());
     let mut queue = Queue {
         runs,
         jobs,
@@ -56,30 +56,30 @@ pub(crate) fn make<P>(
         running: Vec::new(),
     };
     for (_, plan) in &plans {
-        if queue.runs.finished(plan).is_some() {
-            progress.find(plan.units);
+        if queue.runs.get_finished(plan).is_some() {
+            progress.count_earlier(plan.units);
         } else if !report_only {
-            queue.waiting.push_back(Job::of(plan.clone()));
+            queue.waiting.push_back(Job::new(plan.clone()));
         }
     }
-    if let Err(e) = queue.make(progress) {
-        queue.stop(progress);
+    if let Err(e) = queue.run_jobs(progress) {
+        queue.stop_all(progress);
         return Err(e);
     }
-    let (mut made, mut missing) = (Vec::new(), Vec::new());
+    let (mut finished, mut missing) = (Vec::new(), Vec::new());
     for (point, plan) in plans {
-        match queue.runs.finished(&plan) {
-            Some(run) => made.push(Made { point, plan, run }),
+        match queue.runs.get_finished(&plan) {
+            Some(run) => finished.push(PointRun { point, plan, run }),
             None => missing.push(plan.name),
         }
     }
-    let seconds = made.iter().map(|it| it.run.summary.wall_seconds);
+    let seconds = finished.iter().map(|it| it.run.summary.wall_seconds);
     session.count_runs(seconds.sum(), jobs, missing);
-    Ok(made)
+    Ok(finished)
 }
 
 /// Returns the commit of this program's file, which `--version` prints in brackets. Another build may have replaced the file.
-fn commit() -> anyhow::Result<String> {
+fn program_commit() -> anyhow::Result<String> {
     let mut command = Command::new(process_env::program_path());
     let output = command.arg("--version").output();
     let output = output.context("asking this program for its version")?;
@@ -95,40 +95,40 @@ struct Queue {
     /// The bytes of memory for each of the concurrent runs.
     memory_share: u64,
     waiting: VecDeque<Job>,
-    running: Vec<Running>,
+    running: Vec<RunningJob>,
 }
 
 /// A run to be made, with the history of its tries in this call.
 struct Job {
     plan: PlannedRun,
     /// How often the run was started.
-    tried: u32,
+    tries: u32,
     /// The updates of the checkpoint that the last try resumed from. That checkpoint may cause the failure, so it is not used again.
     resumed_at: Option<u64>,
 }
 
 impl Job {
-    const fn of(plan: PlannedRun) -> Self {
+    const fn new(plan: PlannedRun) -> Self {
         Self {
             plan,
-            tried: 0,
+            tries: 0,
             resumed_at: None,
         }
     }
 }
 
-struct Running {
+struct RunningJob {
     job: Job,
     child: Child,
     /// The units of the plan that are done.
     done: u64,
     /// Whether the run is long enough and was asked to stop.
-    enough: bool,
+    has_enough: bool,
 }
 
 impl Queue {
     /// Starts and watches runs until none is waiting or running.
-    fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
+    fn run_jobs(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
             while self.running.len() < self.jobs as usize
                 && let Some(next) = self.waiting.pop_front()
@@ -141,24 +141,24 @@ impl Queue {
             let names = self.running.iter().map(|it| it.job.plan.name.as_str());
             let waiting = self.waiting.len();
             let names = names.collect::<Vec<_>>().join(", ");
-            progress.begin(&format!("{names}; {waiting} waiting"));
+            progress.set_task(&format!("{names}; {waiting} waiting"));
             std::thread::sleep(POLL);
-            self.look(progress)?;
+            self.poll_children(progress)?;
             progress.advance(0)?;
         }
     }
 
     /// Counts the new work of the children, and handles those that exited.
-    fn look(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
+    fn poll_children(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         let mut at = 0;
         while at < self.running.len() {
-            let (done, enough) = self.done(&self.running[at].job.plan);
+            let (done, has_enough) = self.work_done(&self.running[at].job.plan);
             let running = &mut self.running[at];
-            let fresh = done.saturating_sub(running.done);
-            running.done += fresh;
-            progress.advance(fresh)?;
-            if enough && !running.enough {
-                running.enough = true;
+            let new_units = done.saturating_sub(running.done);
+            running.done += new_units;
+            progress.advance(new_units)?;
+            if has_enough && !running.has_enough {
+                running.has_enough = true;
                 ask_to_stop(&running.child, &running.job.plan.name);
             }
             let ended = running.child.try_wait();
@@ -166,7 +166,7 @@ impl Queue {
                 None => at += 1,
                 Some(status) => {
                     let ended = self.running.remove(at);
-                    self.see_to(ended, status, progress)?;
+                    self.handle_exit(ended, status, progress)?;
                 }
             }
         }
@@ -174,48 +174,48 @@ impl Queue {
     }
 
     /// Returns the units that the plan's run has done, and whether the run has all its episodes.
-    fn done(&self, plan: &PlannedRun) -> (u64, bool) {
+    fn work_done(&self, plan: &PlannedRun) -> (u64, bool) {
         let folder = self.runs.folder(plan);
         let RunProgress { frames, episodes } = read_progress(&folder).unwrap_or_default();
         let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
         let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
         let share = of_episodes.max(share(frames, plan.frames)).min(1.0);
-        let enough = plan.episodes.is_some_and(|all| episodes >= all);
-        ((share * plan.units as f64) as u64, enough)
+        let has_enough = plan.episodes.is_some_and(|all| episodes >= all);
+        ((share * plan.units as f64) as u64, has_enough)
     }
 
     /// Counts and returns the units that a resumed run did in an earlier start. They do not count for the speed.
-    fn find(&self, plan: &PlannedRun, progress: &mut Progress) -> u64 {
-        let (done, _) = self.done(plan);
-        progress.find(done);
+    fn count_earlier_work(&self, plan: &PlannedRun, progress: &mut Progress) -> u64 {
+        let (done, _) = self.work_done(plan);
+        progress.count_earlier(done);
         done
     }
 
     /// Handles a run whose process exited: counts a finished run; retries a failed run once, then leaves it out.
-    fn see_to(
+    fn handle_exit(
         &mut self,
-        ended: Running,
+        ended: RunningJob,
         status: ExitStatus,
         progress: &mut Progress,
     ) -> anyhow::Result<()> {
-        let Job { plan, tried, .. } = &ended.job;
-        if self.runs.finished(plan).is_some() {
+        let Job { plan, tries, .. } = &ended.job;
+        if self.runs.get_finished(plan).is_some() {
             return Ok(progress.advance(plan.units - ended.done)?);
         }
-        let (name, words) = (&plan.name, self.runs.last_words(plan));
+        let (name, log_tail) = (&plan.name, self.runs.log_tail(plan));
         // Settings that are wrong here are wrong for the other runs too.
         if status.code() == Some(EXIT_USAGE.into()) && ended.job.resumed_at.is_none() {
-            return Err(usage!("the run {name} cannot be made:\n{words}").into());
+            return Err(usage!("the run {name} cannot be made:\n{log_tail}").into());
         }
-        let (failed, then) = match *tried < TRIES {
+        let (failed, next_step) = match *tries < TRIES_MAX {
             true => ("failed", "is tried once more"),
             false => ("failed again", "is left out"),
         };
         progress.line(&format!(
-            "the run {name} {failed} ({status}) and {then}. Its last words:\n{words}"
+            "the run {name} {failed} ({status}) and {next_step}. Its last words:\n{log_tail}"
         ));
-        if *tried < TRIES {
-            progress.again(ended.done);
+        if *tries < TRIES_MAX {
+            progress.add_work(ended.done);
             self.waiting.push_back(ended.job);
             return Ok(());
         }
@@ -223,23 +223,23 @@ impl Queue {
     }
 
     /// Starts a run in a separate process group, so that only this process passes Ctrl-C to it. `None` if the run is finished or left out.
-    fn start(&self, mut job: Job, progress: &mut Progress) -> anyhow::Result<Option<Running>> {
+    fn start(&self, mut job: Job, progress: &mut Progress) -> anyhow::Result<Option<RunningJob>> {
         let plan = &job.plan;
-        let path = self.runs.log(plan);
+        let path = self.runs.log_path(plan);
         let doing = || format!("making {}", path.display());
         let log = File::options().create(true).append(true).open(&path);
         let log = log.with_context(doing)?;
-        wait_for_the_last(&log, plan, progress)?;
-        if self.runs.finished(plan).is_some() {
-            progress.find(plan.units);
+        wait_for_log_lock(&log, plan, progress)?;
+        if self.runs.get_finished(plan).is_some() {
+            progress.count_earlier(plan.units);
             return Ok(None);
         }
         log.set_len(0).with_context(doing)?;
-        let resumed_at = match self.resumes_at(&job, progress) {
+        let resumed_at = match self.resume_point(&job, progress) {
             Ok(updates) => updates,
             Err(e) => {
                 progress.line(&format!("the run {} is left out: {e:#}", plan.name));
-                progress.find(plan.units);
+                progress.count_earlier(plan.units);
                 return Ok(None);
             }
         };
@@ -252,8 +252,8 @@ impl Queue {
                 aside.display()
             ));
         }
-        self.runs.write_call(plan, &commit()?, resumed)?;
-        let mut command = self.command(plan, resumed);
+        self.runs.write_call(plan, &program_commit()?, resumed)?;
+        let mut command = self.train_command(plan, resumed);
         command
             .stdin(Stdio::null())
             .stdout(log.try_clone().with_context(doing)?)
@@ -261,20 +261,20 @@ impl Queue {
             .process_group(0);
         let starting = || format!("starting the run {}", plan.name);
         let child = command.spawn().with_context(starting)?;
-        let found = resumed.then(|| self.find(plan, progress));
+        let found = resumed.then(|| self.count_earlier_work(plan, progress));
         let done = found.unwrap_or(0);
-        job.tried += 1;
+        job.tries += 1;
         job.resumed_at = resumed_at;
-        Ok(Some(Running {
+        Ok(Some(RunningJob {
             job,
             child,
             done,
-            enough: false,
+            has_enough: false,
         }))
     }
 
     /// Builds the command that starts a run, or resumes it. A resumed run keeps its replay size and its number of threads.
-    fn command(&self, plan: &PlannedRun, resumed: bool) -> Command {
+    fn train_command(&self, plan: &PlannedRun, resumed: bool) -> Command {
         let folder = self.runs.folder(plan);
         let mut command = Command::new(process_env::program_path());
         command
@@ -284,14 +284,14 @@ impl Queue {
             command.arg("--resume").arg(folder.path());
         } else {
             command.arg("--run-dir").arg(folder.path());
-            command.args(self.threads()).args(plan.call.args());
+            command.args(self.thread_flags()).args(plan.call.args());
             command.env(MEMORY_SHARE_ENV, self.memory_share.to_string());
         }
         command
     }
 
     /// Returns the updates of the checkpoint from which the run resumes; `None` if the run starts from the beginning.
-    fn resumes_at(&self, job: &Job, progress: &mut Progress) -> anyhow::Result<Option<u64>> {
+    fn resume_point(&self, job: &Job, progress: &mut Progress) -> anyhow::Result<Option<u64>> {
         let (plan, folder) = (&job.plan, self.runs.folder(&job.plan));
         if !folder.path().exists() {
             return Ok(None);
@@ -318,7 +318,7 @@ impl Queue {
     }
 
     /// Returns the flags that divide the cores among the concurrent runs, so that their learners do not compete for them.
-    fn threads(&self) -> Vec<String> {
+    fn thread_flags(&self) -> Vec<String> {
         if self.jobs == 1 {
             return Vec::new();
         }
@@ -327,7 +327,7 @@ impl Queue {
     }
 
     /// Asks all children to stop and waits until they have saved. A second interrupt, or `DRAIN_MAX`, kills them.
-    fn stop(&mut self, progress: &Progress) {
+    fn stop_all(&mut self, progress: &Progress) {
         if self.running.is_empty() {
             return;
         }
@@ -354,10 +354,10 @@ impl Queue {
 
 /// Waits until no process of an earlier call writes to the run: a run whose parent was killed still saves. A child inherits our open
 /// log file and with it the lock, so that two processes never write to one folder.
-fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<()> {
-    let mut said = false;
+fn wait_for_log_lock(log: &File, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<()> {
+    let mut has_told = false;
     while !lock_file::try_lock(log).context("locking a run's log")? {
-        if !std::mem::replace(&mut said, true) {
+        if !std::mem::replace(&mut has_told, true) {
             let name = &plan.name;
             progress.line(&format!(
                 "an earlier {name} still runs or saves: waiting for it"
@@ -376,19 +376,19 @@ mod tests {
     use driml_protocol::GracefulShutdown;
 
     use super::*;
-    use crate::sweep::{plan::Call, runs::tests::finish};
+    use crate::sweep::{plan::TrainCall, runs::tests::write_finished_run};
 
     /// Creates a queue in `root` with a single plan, whose run is finished.
     fn queue(root: &Path) -> (Queue, PlannedRun) {
         let runs = Runs::open(root).unwrap();
-        let plan = PlannedRun::new("run", Call::default(), 10);
-        finish(&runs.folder(&plan));
+        let plan = PlannedRun::new("run", TrainCall::default(), 10);
+        write_finished_run(&runs.folder(&plan));
         runs.write_call(&plan, "abc", false).unwrap();
         let queue = Queue {
             runs,
             jobs: 1,
             memory_share: 7,
-            waiting: [Job::of(plan.clone())].into(),
+            waiting: [Job::new(plan.clone())].into(),
             running: Vec::new(),
         };
         (queue, plan)
@@ -401,7 +401,7 @@ mod tests {
         let metrics = queue.runs.folder(&plan).metrics();
         std::fs::write(metrics, "seconds,frames,episodes\n60,9,0\n").unwrap();
         let mut progress = Progress::new(10, GracefulShutdown::default());
-        assert_eq!(queue.find(&plan, &mut progress), 9);
+        assert_eq!(queue.count_earlier_work(&plan, &mut progress), 9);
         assert_eq!(progress.seconds_left(1.0), None);
     }
 
@@ -410,7 +410,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let (queue, plan) = queue(root.path());
         let share = |resumed| {
-            let command = queue.command(&plan, resumed);
+            let command = queue.train_command(&plan, resumed);
             let mut shares = command.get_envs().filter(|it| it.0 == MEMORY_SHARE_ENV);
             shares.next().map(|(_, value)| value == Some("7".as_ref()))
         };
@@ -426,10 +426,10 @@ mod tests {
         let checkpoint = folder.checkpoints().join("checkpoint-000000000005");
         std::fs::create_dir_all(checkpoint).unwrap();
         let mut progress = Progress::new(10, GracefulShutdown::default());
-        let mut job = Job::of(plan);
+        let mut job = Job::new(plan);
         for (resumed_at, is_tried) in [(None, true), (Some(4), true), (Some(5), false)] {
             job.resumed_at = resumed_at;
-            let found = queue.resumes_at(&job, &mut progress);
+            let found = queue.resume_point(&job, &mut progress);
             assert_eq!(found.is_err(), is_tried, "{found:?}");
         }
     }
@@ -440,7 +440,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let (mut queue, plan) = queue(root.path());
         let mut progress = Progress::new(10, GracefulShutdown::default());
-        queue.make(&mut progress).unwrap();
-        assert_eq!(queue.runs.finished(&plan).unwrap().commit, "abc");
+        queue.run_jobs(&mut progress).unwrap();
+        assert_eq!(queue.runs.get_finished(&plan).unwrap().commit, "abc");
     }
 }

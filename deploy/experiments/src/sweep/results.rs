@@ -15,7 +15,7 @@ use crate::{cache::Session, progress::Progress};
 const SEED: u64 = 1;
 
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Played {
+pub(crate) struct PlaySettings {
     pub(crate) levels: Levels,
     /// The number of newest checkpoints that share the episodes. If a run has averaged weights, only these play.
     pub(crate) checkpoints: usize,
@@ -24,40 +24,40 @@ pub(crate) struct Played {
     pub(crate) units: u64,
 }
 
-impl Played {
+impl PlaySettings {
     /// Plays a run's agent greedily and gives its returns; `None` if the world lacks the levels. Kept under `key` for these weights.
-    pub(crate) fn greedy(
+    pub(crate) fn play_greedy(
         self,
         session: &mut Session,
         key: &str,
         run: &FinishedRun,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        let of = format!("{} {}", run.summary.weights_sha256, self.episodes);
-        session.piece_of(&of, key, self.units, |progress| {
-            self.returns(&run.folder, progress)
+        let source = format!("{} {}", run.summary.weights_sha256, self.episodes);
+        session.load_or_make(&source, key, self.units, |progress| {
+            self.play_checkpoints(&run.folder, progress)
         })
     }
 
     /// Plays a random policy in a run's world, on the training levels, and gives its returns.
-    pub(crate) fn random(
+    pub(crate) fn play_random(
         self,
         session: &mut Session,
         key: &str,
         run: &FinishedRun,
     ) -> anyhow::Result<Vec<f64>> {
-        session.piece_of(&self.episodes.to_string(), key, self.units, |_| {
+        session.load_or_make(&self.episodes.to_string(), key, self.units, |_| {
             random_returns(&read_config(&run.folder)?, self.episodes as usize, SEED)
         })
     }
 
-    fn returns(
+    fn play_checkpoints(
         self,
         folder: &RunFolder,
         progress: &mut Progress,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        let players = players(folder, self.checkpoints)?;
-        let each = self.episodes.div_ceil(players.len().max(1) as u32);
-        let returns = players.into_iter().map(|choice| {
+        let chosen = checkpoints_to_play(folder, self.checkpoints)?;
+        let each = self.episodes.div_ceil(chosen.len().max(1) as u32);
+        let returns = chosen.into_iter().map(|choice| {
             progress.advance(0)?;
             let player = Player::load(folder, choice, WeightsChoice::default())?;
             player.play_levels(PolicyKind::Agent, self.levels, each, SEED)
@@ -67,7 +67,7 @@ impl Played {
     }
 }
 
-fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<CheckpointChoice>> {
+fn checkpoints_to_play(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<CheckpointChoice>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
@@ -88,16 +88,16 @@ mod tests {
     fn the_average_plays_before_the_newest_checkpoints() {
         let folder = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(folder.path());
-        assert_eq!(players(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
+        assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
         for updates in [1, 2, 3, 4] {
             let name = format!("checkpoint-{updates:012}");
             let path = folder.checkpoints().join(name);
             fs::create_dir_all(path).unwrap();
         }
         let newest = [4, 3, 2].map(CheckpointChoice::After);
-        assert_eq!(players(&folder, 3).unwrap(), newest);
+        assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
-        assert_eq!(players(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
+        assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
     }
 }

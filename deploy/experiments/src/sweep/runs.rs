@@ -13,7 +13,7 @@ use super::plan::{FinishedRun, PlannedRun};
 use crate::cache::RUNS;
 
 /// The number of bytes at the end of a failed run's output that are shown.
-const LAST_WORDS_BYTES: usize = 1200;
+const LOG_TAIL_BYTES: usize = 1200;
 
 pub(crate) struct Runs {
     root: PathBuf,
@@ -28,34 +28,34 @@ impl Runs {
     }
 
     /// Returns the plan's run if it exists, was made by this plan, and is complete and long enough.
-    pub(crate) fn finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
+    pub(crate) fn get_finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
         if !self.is_made_by(plan) {
             return None;
         }
         let folder = self.folder(plan);
         read_progress(&folder)?;
         let summary = Summary::read(&folder).ok()?;
-        let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
+        let has_enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
         let is_good = match summary.outcome {
             Outcome::Finished => true,
-            Outcome::Interrupted => enough,
+            Outcome::Interrupted => has_enough,
             Outcome::Failed => false,
         };
         is_good.then_some(FinishedRun {
             folder,
             summary,
-            commit: self.commit(plan),
+            commit: self.read_commit(plan),
         })
     }
 
-    fn commit(&self, plan: &PlannedRun) -> String {
-        let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
+    fn read_commit(&self, plan: &PlannedRun) -> String {
+        let commit = fs::read_to_string(self.path_beside(plan, "commit")).unwrap_or_default();
         commit.trim().to_owned()
     }
 
     /// Whether the run in the plan's folder was started with exactly this plan's call.
     pub(super) fn is_made_by(&self, plan: &PlannedRun) -> bool {
-        let call = fs::read_to_string(self.beside(plan, "call.json")).ok();
+        let call = fs::read_to_string(self.path_beside(plan, "call.json")).ok();
         let call = call.and_then(|text| serde_json::from_str::<Vec<String>>(&text).ok());
         call.is_some_and(|args| args == plan.call.args())
     }
@@ -67,14 +67,14 @@ impl Runs {
         commit: &str,
         resumed: bool,
     ) -> anyhow::Result<()> {
-        let before = match resumed {
-            true => self.commit(plan),
+        let earlier = match resumed {
+            true => self.read_commit(plan),
             false => String::new(),
         };
-        let commits = match before.split('+').any(|it| it == commit) {
-            true => before,
-            false if before.is_empty() => commit.to_owned(),
-            false => format!("{before}+{commit}"),
+        let commits = match earlier.split('+').any(|it| it == commit) {
+            true => earlier,
+            false if earlier.is_empty() => commit.to_owned(),
+            false => format!("{earlier}+{commit}"),
         };
         let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
         write_atomically(&self.beside(plan, "call.json"), &call)?;
@@ -82,9 +82,9 @@ impl Runs {
     }
 
     /// Returns the end of the output of the run's process.
-    pub(super) fn last_words(&self, plan: &PlannedRun) -> String {
-        let text = fs::read(self.log(plan)).unwrap_or_default();
-        let start = text.len().saturating_sub(LAST_WORDS_BYTES);
+    pub(super) fn log_tail(&self, plan: &PlannedRun) -> String {
+        let text = fs::read(self.log_path(plan)).unwrap_or_default();
+        let start = text.len().saturating_sub(LOG_TAIL_BYTES);
         String::from_utf8_lossy(&text[start..]).into_owned()
     }
 
@@ -93,11 +93,11 @@ impl Runs {
     }
 
     /// Returns the path of the output of the run's process.
-    pub(super) fn log(&self, plan: &PlannedRun) -> PathBuf {
-        self.beside(plan, "log")
+    pub(super) fn log_path(&self, plan: &PlannedRun) -> PathBuf {
+        self.path_beside(plan, "log")
     }
 
-    fn beside(&self, plan: &PlannedRun, what: &str) -> PathBuf {
+    fn path_beside(&self, plan: &PlannedRun, what: &str) -> PathBuf {
         self.root.join(format!("{}.{what}", plan.name))
     }
 }
@@ -126,13 +126,13 @@ pub(super) mod tests {
     };
 
     use super::*;
-    use crate::sweep::plan::Call;
+    use crate::sweep::plan::TrainCall;
 
     /// Writes what a finished run of the chain world leaves in its folder.
-    pub(in crate::sweep) fn finish(folder: &RunFolder) {
-        let call = Call {
+    pub(in crate::sweep) fn write_finished_run(folder: &RunFolder) {
+        let call = TrainCall {
             env: Some("chain".into()),
-            ..Call::default()
+            ..TrainCall::default()
         };
         let config = call.config().unwrap();
         let mut view = RunView::new(Plan::new(&config));
@@ -145,19 +145,17 @@ pub(super) mod tests {
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
         let root = tempfile::tempdir().unwrap();
-        let runs = Runs {
-            root: root.path().to_owned(),
-        };
+        let runs = Runs::open(root.path()).unwrap();
         let plan = |frames: u64| {
-            let call = Call {
+            let call = TrainCall {
                 frames: Some(frames),
-                ..Call::default()
+                ..TrainCall::default()
             };
             PlannedRun::new("run", call, frames)
         };
         let folder = runs.folder(&plan(10));
-        finish(&folder);
-        assert!(runs.finished(&plan(10)).is_none(), "it has no call");
+        write_finished_run(&folder);
+        assert!(runs.get_finished(&plan(10)).is_none(), "it has no call");
         for (commit, resumed, expected) in [
             ("old", false, "old"),
             ("abc", false, "abc"),
@@ -166,13 +164,14 @@ pub(super) mod tests {
             ("abc", true, "abc+def"),
         ] {
             runs.write_call(&plan(10), commit, resumed).unwrap();
-            assert_eq!(runs.finished(&plan(10)).unwrap().commit, expected);
+            assert_eq!(runs.get_finished(&plan(10)).unwrap().commit, expected);
         }
-        assert!(runs.finished(&plan(20)).is_none());
-        fs::remove_file(runs.beside(&plan(10), "commit")).unwrap();
-        assert_eq!(runs.finished(&plan(10)).unwrap().commit, "");
+        assert!(runs.get_finished(&plan(20)).is_none());
+        fs::remove_file(runs.path_beside(&plan(10), "commit")).unwrap();
+        assert_eq!(runs.get_finished(&plan(10)).unwrap().commit, "");
         fs::write(folder.metrics(), "seconds,frames\n").unwrap();
-        assert!(runs.finished(&plan(10)).is_none(), "its metrics are gone");
+        let found = runs.get_finished(&plan(10));
+        assert!(found.is_none(), "its metrics are gone");
     }
 
     #[test]

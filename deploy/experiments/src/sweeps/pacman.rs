@@ -16,7 +16,7 @@ use self::{
 use crate::{
     cache::Session,
     flags::PacmanArgs,
-    sweep::{plan::install, queue},
+    sweep::{plan::install_worlds, queue},
 };
 
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
@@ -26,14 +26,14 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
     let report = args.queue.report;
-    install(&plans, report)?;
+    install_worlds(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, 0, report)?;
-    let made = queue::make(&mut session, plans, settings.jobs)?;
-    session.check_any(&made)?;
+    let made = queue::run_all(&mut session, plans, settings.jobs)?;
+    session.check_has_runs(&made)?;
     let results = Results::read(settings, made)?;
-    session.figure("fig3", &figure::figure(&results))?;
+    session.save_figure("fig3", &figure::figure(&results))?;
     write_data(&session, &results)?;
-    session.finish(include_str!("pacman.md.j2"), values(&results))
+    session.write_page(include_str!("pacman.md.j2"), values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -43,16 +43,16 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         let points = it.points.iter();
         points.map(move |(x, y)| (of, *x as u64, rounded(*y)))
     });
-    session.csv("loss", "epsilon,seed,loss,frames,nats", points)?;
+    session.write_csv("loss", "epsilon,seed,loss,frames,nats", points)?;
     let ends = losses.map(|(of, it)| (of, [it.last, it.whole].map(|it| it.map(rounded))));
     let columns = "epsilon,seed,loss,last_fifth_nats,whole_nats";
-    session.csv("final_loss", columns, ends)?;
+    session.write_csv("final_loss", columns, ends)?;
     for (name, traces) in PART_NAMES.iter().zip(&results.traces) {
         let rows = traces.iter().flat_map(|it| {
             let points = it.points.iter();
             points.map(move |(x, y)| (&it.agent, it.seed, *x as u64, rounded(*y)))
         });
-        session.csv(name, "agent,seed,episodes,mean_return", rows)?;
+        session.write_csv(name, "agent,seed,episodes,mean_return", rows)?;
     }
     Ok(())
 }

@@ -22,7 +22,7 @@ use crate::{
         over_games::{Scores, improvement, iqm},
     },
     sweep::{
-        plan::{FinishedRun, Made, PlannedRun, install},
+        plan::{FinishedRun, PlannedRun, PointRun, install_worlds},
         queue,
     },
     sweeps::published::{normalised, paper},
@@ -39,19 +39,19 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let settings = Settings::of(args)?;
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
-    let play = settings.play(Levels::Train);
+    let play = settings.play_settings(Levels::Train);
     // For each run its agent plays, and also a random policy.
     let units = plans.len() as u64 * 2 * play.units;
     let report = args.queue.report;
-    install(&plans, report)?;
+    install_worlds(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;
-    let made = queue::make(&mut session, plans, settings.jobs)?;
-    session.check_any(&made)?;
+    let made = queue::run_all(&mut session, plans, settings.jobs)?;
+    session.check_has_runs(&made)?;
     let mut scored = Vec::new();
-    for Made { point, plan, run } in made {
-        let greedy = play.greedy(&mut session, &format!("{}-greedy", plan.name), &run)?;
+    for PointRun { point, plan, run } in made {
+        let greedy = play.play_greedy(&mut session, &format!("{}-greedy", plan.name), &run)?;
         let greedy = greedy.unwrap_or_default();
-        let random = play.random(&mut session, &format!("{}-at-random", point.game), &run)?;
+        let random = play.play_random(&mut session, &format!("{}-at-random", point.game), &run)?;
         scored.push(Scored {
             training: run.summary.mean_return,
             greedy: mean(&greedy),
@@ -65,19 +65,19 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
         });
     }
     write_data(&session, &scored)?;
-    session.figure("curves", &figure(&settings, &scored)?)?;
+    session.save_figure("curves", &figure(&settings, &scored)?)?;
     if has_seeds(&settings, &scored) {
-        let play = settings.play(Levels::TrainSingle);
+        let play = settings.play_settings(Levels::TrainSingle);
         for it in &mut scored {
-            session.progress().again(play.units);
+            session.progress().add_work(play.units);
             let key = format!("{}-single", it.plan.name);
-            let returns = play.greedy(&mut session, &key, &it.run)?;
+            let returns = play.play_greedy(&mut session, &key, &it.run)?;
             let score = returns.and_then(|it| mean(&it));
             it.single = score.and_then(|score| normalised(&it.point.game, score));
         }
     }
     let values = values(&settings, &scored);
-    session.finish(include_str!("procgen.md.j2"), values)
+    session.write_page(include_str!("procgen.md.j2"), values)
 }
 
 /// A finished run and its mean returns: a line of the table, and an entry of the page.
@@ -141,7 +141,7 @@ fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
             (summary.wall_seconds.round() as u64, &it.run.commit),
         ));
     }
-    session.csv("table", columns, rows)
+    session.write_csv("table", columns, rows)
 }
 
 /// Draws the training return over frames, with a chart for each game.

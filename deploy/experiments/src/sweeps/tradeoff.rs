@@ -28,14 +28,14 @@ use self::{
 };
 use crate::{
     cache::{self, Session},
-    flags::{SEEDS_MAX, TradeoffArgs, this_command},
+    flags::{SEEDS_MAX, TradeoffArgs, this_command_line},
     page::fill,
     plot::Run,
     stats::Spread,
     sweep::{
-        plan::{FinishedRun, Made, Planned, install},
+        plan::{FinishedRun, PointPlan, PointRun, install_worlds},
         queue,
-        results::Played,
+        results::PlaySettings,
         runs::Runs,
     },
 };
@@ -90,7 +90,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     }
     let results = it.make(&chosen)?;
     if results.levels.is_empty() {
-        it.session.check_made()?;
+        it.session.check_none_missing()?;
         let what = match results.points.is_empty() {
             true => "no run is finished yet",
             false => "no level has a finished run beside its base's",
@@ -132,7 +132,7 @@ impl Tradeoff<'_> {
     /// Benchmarks every requested level and its base. For other levels, and for a report, it only reads existing benchmarks.
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
         let (smoke, settings) = (self.args.flags.smoke, &self.settings);
-        let (units, program) = (self.piece_units(), cache::program()?);
+        let (units, program) = (self.piece_units(), cache::program_id()?);
         for point in settings.levels.iter().flat_map(LevelOf::points) {
             if self.speeds.contains_key(&point.key) {
                 continue;
@@ -140,13 +140,13 @@ impl Tradeoff<'_> {
             let key = format!("speed-{}", point.key);
             let speed = if self.args.queue.report || !settings.asks_for(point) {
                 // Accept the result of any program: only requested points are measured again.
-                self.session.kept_piece(&key)
+                self.session.read_piece(&key)
             } else {
                 let base = settings.common.config(settings.base_of(point))?;
                 let config = settings.common.config(point)?;
-                self.session.progress().again(units);
+                self.session.progress().add_work(units);
                 let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
-                Some(self.session.piece_of(&program, &key, units, measure)?)
+                Some(self.session.load_or_make(&program, &key, units, measure)?)
             };
             self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
         }
@@ -187,7 +187,7 @@ impl Tradeoff<'_> {
         let taken = |point: &Point| {
             let seeds = self.settings.seeds_of(point == base);
             let plans = (1..=seeds).map(|seed| common.run(point, seed));
-            let finished = plans.filter_map(|plan| runs.finished(&plan));
+            let finished = plans.filter_map(|plan| runs.get_finished(&plan));
             Spread::of(finished.map(|ran| ran.summary.wall_seconds / f64::from(common.jobs)))
         };
         let estimated = |point: &Point| -> anyhow::Result<Option<f64>> {
@@ -215,9 +215,9 @@ impl Tradeoff<'_> {
     }
 
     /// Returns the runs of the chosen levels and their bases, and all runs that are already finished.
-    fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<Planned<Point>>> {
+    fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<PointPlan<Point>>> {
         let runs = Runs::open(self.session.folder())?;
-        let mut wanted: Vec<Planned<Point>> = Vec::new();
+        let mut wanted: Vec<PointPlan<Point>> = Vec::new();
         // Ordered by seed, so that a stopped call has one seed of every point before two of any. The page also has further seeds that
         // another call made.
         for seed in 1..=SEEDS_MAX {
@@ -227,7 +227,7 @@ impl Tradeoff<'_> {
                     let is_asked = is_chosen && seed <= self.settings.seeds_of(is_base);
                     // Levels share bases, and a level may be the base of another.
                     let is_new = wanted.iter().all(|(_, known)| known.name != run.name);
-                    if is_new && (is_asked || runs.finished(&run).is_some()) {
+                    if is_new && (is_asked || runs.get_finished(&run).is_some()) {
                         wanted.push((point.clone(), run));
                     }
                 }
@@ -240,13 +240,13 @@ impl Tradeoff<'_> {
     fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
         let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
-        install(&wanted, report_only)?;
+        install_worlds(&wanted, report_only)?;
         // The agent of each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
-        self.session.progress().again(units * plays);
+        self.session.progress().add_work(units * plays);
         let common = self.settings.common.clone();
-        let made = queue::make(&mut self.session, wanted, common.jobs)?;
-        let play = Played {
+        let made = queue::run_all(&mut self.session, wanted, common.jobs)?;
+        let play = PlaySettings {
             levels: Levels::Train,
             checkpoints: 1,
             episodes: common.episodes,
@@ -255,11 +255,11 @@ impl Tradeoff<'_> {
         let commands = self.commands()?;
         let mut points = BTreeMap::<String, PointResult>::new();
         let mut random = Vec::new();
-        for Made { point, plan, run } in made {
+        for PointRun { point, plan, run } in made {
             let key = format!("{}-played", plan.name);
-            let greedy = play.greedy(&mut self.session, &key, &run)?;
+            let greedy = play.play_greedy(&mut self.session, &key, &run)?;
             if random.is_empty() {
-                random = play.random(&mut self.session, "random", &run)?;
+                random = play.play_random(&mut self.session, "random", &run)?;
             }
             let result = points.entry(point.key.clone()).or_default();
             // One run suffices: seeds differ in what they learned, not in the numeric error of the computation.
@@ -297,22 +297,22 @@ impl Tradeoff<'_> {
     fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
         // Read the config of this run, whose seed may not be 1.
         let (units, config) = (self.piece_units(), read_config(&run.folder)?);
-        self.session.progress().again(units);
+        self.session.progress().add_work(units);
         let key = format!("exactness-{}", point.key);
         let (rows, states) = measured::sizes(&config);
         let weights = &run.summary.weights_sha256;
         let what = format!("{weights}, {rows} rows, {states} states");
         let measure = |_: &mut _| measured::errors(&config, &run.folder);
-        self.session.computed(&what, &key, units, measure)
+        self.session.load_or_compute(&what, &key, units, measure)
     }
 
     /// Returns the command lines that made the folder's runs, with this one last unless it only reports.
     fn commands(&self) -> anyhow::Result<Vec<String>> {
-        let mut all: Vec<String> = self.session.kept_piece(CALLS).unwrap_or_default();
-        let this = this_command();
+        let mut all: Vec<String> = self.session.read_piece(CALLS).unwrap_or_default();
+        let this = this_command_line();
         if !all.contains(&this) && !self.args.queue.report {
             all.push(this);
-            self.session.keep(CALLS, &all)?;
+            self.session.store(CALLS, &all)?;
         }
         Ok(all)
     }

@@ -57,7 +57,7 @@ fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> 
 fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let sizes = cases.of(&[(2, 1), (512, 256)], |_| (17, 13));
     let config = small::config(sizes.0, sizes.1, (-1.0, 1.0));
-    let len = small::len(&config);
+    let len = small::scalar_count(&config);
     let values = cases.of(&listed(len), |rng| finites(len, rng));
     let norm = gradients(&config, &values)?.norm(Kernels::FUSED)?;
     // The reference is the largest |value| times the norm of all values divided by it.
@@ -72,7 +72,7 @@ fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 
 fn norm_of_none(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let config = small::config(17, 13, (-1.0, 1.0));
-    let mut values = finites(small::len(&config), &mut cases.rng);
+    let mut values = finites(small::scalar_count(&config), &mut cases.rng);
     let at = cases.rng.random_range(0..values.len());
     values[at] = not_finite(&mut cases.rng);
     let said = gradients(&config, &values)?.norm(Kernels::FUSED);
@@ -114,11 +114,11 @@ fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let way = |_| (rng.random_range(1..5), clamped(10, FOLLOWED_MAX, rng));
         (0..count).map(way).collect()
     });
-    let target = small::parameters(&small::least(), &start)?;
+    let target = small::parameters(&small::minimal_config(), &start)?;
     // Each parameter in f64, and the largest absolute value that it had in either network.
     let mut exact: Vec<_> = widened(&start).iter().map(|&x| (x, x.abs())).collect();
     for (moves, online) in &ways {
-        let source = small::parameters(&small::least(), online)?;
+        let source = small::parameters(&small::minimal_config(), online)?;
         for _ in 0..*moves {
             follow(&target, &source, tau, Kernels::FUSED)?;
         }
@@ -129,7 +129,7 @@ fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             *largest = largest.max(online.abs());
         }
     }
-    let found = widened(&small::values(&small::least(), &target)?);
+    let found = widened(&small::scalars(&small::minimal_config(), &target)?);
     let errors = found.iter().zip(exact).map(|(found, (exact, largest))| {
         (found - exact).abs() / largest.max(LEAST) / follow_error(tau)
     });
@@ -139,12 +139,12 @@ fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 }
 
 fn copied(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let config = small::least();
+    let config = small::minimal_config();
     let target = small::parameters(&config, &finites(10, &mut cases.rng))?;
     let online = finites(8, &mut cases.rng);
     let source = small::parameters(&config, &online)?;
     follow(&target, &source, 1.0, Kernels::FUSED)?;
-    for (found, online) in small::values(&config, &target)?.iter().zip(&online) {
+    for (found, online) in small::scalars(&config, &target)?.iter().zip(&online) {
         let is_copied = found.to_bits() == online.to_bits();
         cases.keeps(1, format_args!("{online:e}"), is_copied)?;
     }

@@ -73,7 +73,7 @@ fn see(cases: &mut Cases<'_>, stored: WeightDtype, values: &[f32]) -> anyhow::Re
     let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
     let bytes = small::parameters(&config, values)?.to_safetensors_as(stored, |_| true)?;
     let read = Parameters::load_safetensors(&config, &bytes, &Device::Cpu)?;
-    for (&x, found) in values.iter().zip(small::values(&config, &read)?) {
+    for (&x, found) in values.iter().zip(small::scalars(&config, &read)?) {
         let step = step_at(stored, x);
         let nearest = (f64::from(x) / step).round_ties_even() * step;
         let has_its_sign = x.is_sign_negative() == found.is_sign_negative();

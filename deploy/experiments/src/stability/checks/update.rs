@@ -89,7 +89,7 @@ impl Setting {
         };
         let mut weights = || -> anyhow::Result<Vec<f32>> {
             let drawn = Parameters::init(&model, rng, &Device::Cpu)?;
-            let values = small::values(&model, &drawn)?.into_iter();
+            let values = small::scalars(&model, &drawn)?.into_iter();
             Ok(values.map(|value| value * self.scale).collect())
         };
         let (online, target) = (weights()?, weights()?);

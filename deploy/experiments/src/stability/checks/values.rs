@@ -64,9 +64,9 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 fn policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<PolicyNetwork> {
     let config = ModelConfig {
         num_actions,
-        ..small::least()
+        ..small::minimal_config()
     };
-    let mut values = vec![0.0; small::len(&config)];
+    let mut values = vec![0.0; small::scalar_count(&config)];
     set(&mut values);
     let bytes = small::parameters(&config, &values)?.to_safetensors(|_| true)?;
     Ok(PolicyNetwork::new(&config, &bytes, Precision::F32)?)

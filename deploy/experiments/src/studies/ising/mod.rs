@@ -42,7 +42,7 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
 }
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
+    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let task = task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
@@ -50,14 +50,16 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
         let key = format!("seed{seed}");
-        trained.push(session.piece_of("", &key, settings.updates, |progress| {
-            train(&task, seed.into(), progress)
-        })?);
+        trained.push(
+            session.load_or_make("", &key, settings.updates, |progress| {
+                train(&task, seed.into(), progress)
+            })?,
+        );
     }
     write_data(&session, &trained)?;
-    session.figure("fig2", &fig2(&task, &trained[0])?)?;
-    session.figure("learning", &learning(&task, &trained))?;
-    session.finish(include_str!("page.md.j2"), values(&task, &trained))
+    session.save_figure("fig2", &fig2(&task, &trained[0])?)?;
+    session.save_figure("learning", &learning(&task, &trained))?;
+    session.write_page(include_str!("page.md.j2"), values(&task, &trained))
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
@@ -69,16 +71,16 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
         })
     });
     let columns = "seed,updates,auc,auc_raw_score,auc_clear,auc_pairs,loss_nats";
-    session.csv("auc", columns, checks)?;
+    session.write_csv("auc", columns, checks)?;
     let losses = seeds().flat_map(|(seed, one)| {
         smoothed(&one.loss).map(move |(update, loss)| (seed, update as u64, rounded(loss)))
     });
-    session.csv("loss", "seed,updates,loss_nats", losses)?;
+    session.write_csv("loss", "seed,updates,loss_nats", losses)?;
     let maps = (1u32..).zip(&trained[0].maps).flat_map(|(episode, map)| {
         let scores = map.iter().enumerate();
         scores.map(move |(at, score)| (episode, at, rounded(*score)))
     });
-    session.csv("maps", "episode,location,score_nats", maps)
+    session.write_csv("maps", "episode,location,score_nats", maps)
 }
 
 /// Returns (update, mean loss) for each window of `LOSS_WINDOW` updates; the update is the last of its window.
@@ -214,12 +216,12 @@ mod tests {
     use super::*;
 
     pub(super) fn smoke() -> Settings {
-        flags::settings(NAME, SETTINGS, true)
+        flags::read_settings(NAME, SETTINGS, true)
     }
 
     #[test]
     fn both_lengths_read_and_ask_for_local_dim_alone() {
-        for settings in [smoke(), flags::settings(NAME, SETTINGS, false)] {
+        for settings in [smoke(), flags::read_settings(NAME, SETTINGS, false)] {
             let task = task(&settings).unwrap();
             // From the paper's table of parameters.
             let local = [true, false, false, false];

@@ -25,7 +25,7 @@ const NAME: &str = "random-walk";
 const SETTINGS: &str = include_str!("config.toml");
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
+    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let pieces = settings.alphas.len() * Sampling::ALL.len() * settings.seeds as usize;
     let units = pieces as u64 * settings.updates;
@@ -39,7 +39,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     for (sampling, alpha, seed) in grid {
         let chain = Chain::new(settings.states, alpha);
         let key = format!("{}-alpha{alpha}-seed{seed}", sampling.name());
-        let learnt = session.piece_of("", &key, settings.updates, |progress| {
+        let learnt = session.load_or_make("", &key, settings.updates, |progress| {
             train(&chain, &settings, sampling, seed.into(), progress)
         })?;
         let share = settings.share_reached * chain.mutual_information();
@@ -54,9 +54,9 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     }
     let results = Results { settings, trained };
     write_data(&session, &results)?;
-    session.figure("fig1", &figures::fig1(&results))?;
-    session.figure("convergence", &figures::convergence(&results))?;
-    session.finish(include_str!("page.md.j2"), values(&results))
+    session.save_figure("fig1", &figures::fig1(&results))?;
+    session.save_figure("convergence", &figures::convergence(&results))?;
+    session.write_page(include_str!("page.md.j2"), values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -76,7 +76,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         (alpha, of_chain.map(rounded))
     });
     let columns = "alpha,mi_nats,mi_numerical_nats,mi_learnt_nats,mi_ring_nats,mi_as_printed_nats,gap,gap_numerical";
-    session.csv("alpha", columns, laws)?;
+    session.write_csv("alpha", columns, laws)?;
 
     let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let entries = truth.iter().zip(&learnt).enumerate();
@@ -85,7 +85,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         (at / k + 1, at % k + 1, entry)
     });
     let columns = "state,next,true_ratio,learnt_mean,learnt_sd";
-    session.csv("ratio", columns, entries)?;
+    session.write_csv("ratio", columns, entries)?;
 
     let times = results.trained.iter().map(|one| {
         let gap = rounded(one.chain.spectral_gap());
@@ -95,7 +95,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     });
     let columns =
         "sampling,alpha,seed,gap,updates_to_tv,updates_to_share,final_tv,final_excess_nats";
-    session.csv("convergence", columns, times)?;
+    session.write_csv("convergence", columns, times)?;
 
     let curves = results.shown().into_iter().flat_map(|alpha| {
         let Curve { points, band } = results.tv_curve(alpha);
@@ -104,7 +104,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
             (alpha, updates as u64, [mean, min, max].map(rounded))
         })
     });
-    session.csv("curves", "alpha,updates,tv_mean,tv_min,tv_max", curves)
+    session.write_csv("curves", "alpha,updates,tv_mean,tv_min,tv_max", curves)
 }
 
 fn values(results: &Results) -> Value {
@@ -163,7 +163,7 @@ mod tests {
     #[test]
     fn both_lengths_read_and_have_the_figure_s_alpha() {
         for smoke in [false, true] {
-            let settings: Settings = flags::settings(NAME, SETTINGS, smoke);
+            let settings: Settings = flags::read_settings(NAME, SETTINGS, smoke);
             assert!(settings.alphas.contains(&settings.figure_alpha));
             assert!(settings.alphas.iter().all(|a| 0.0 < *a && *a < 1.0));
             assert!(settings.states >= 2 && settings.seeds > 0 && settings.updates > 0);

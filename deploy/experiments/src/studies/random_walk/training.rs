@@ -247,7 +247,7 @@ mod tests {
     use driml_protocol::GracefulShutdown;
 
     fn settings() -> Settings {
-        flags::settings(NAME, SETTINGS, false)
+        flags::read_settings(NAME, SETTINGS, false)
     }
 
     #[test]

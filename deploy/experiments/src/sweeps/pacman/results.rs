@@ -6,7 +6,7 @@ use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
     stats::{mean, rank_correlation},
-    sweep::plan::Made,
+    sweep::plan::PointRun,
 };
 
 /// The DIM losses of the preset: the column of the metrics, and the kind of features that the loss compares.
@@ -51,9 +51,9 @@ pub(super) struct Trace {
 }
 
 impl Results {
-    pub(super) fn read(settings: Settings, made: Vec<Made<Point>>) -> anyhow::Result<Self> {
+    pub(super) fn read(settings: Settings, made: Vec<PointRun<Point>>) -> anyhow::Result<Self> {
         let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PARTS]);
-        for Made { point, plan, run } in made {
+        for PointRun { point, plan, run } in made {
             let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
             match point {
                 Point::Epsilon(epsilon) => {

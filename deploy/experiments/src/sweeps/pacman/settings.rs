@@ -5,8 +5,8 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    flags::{self, PacmanArgs, once},
-    sweep::plan::{Call, Planned, PlannedRun},
+    flags::{self, PacmanArgs, expand_unique},
+    sweep::plan::{PlannedRun, PointPlan, TrainCall},
 };
 
 pub(super) const NAME: &str = "pacman";
@@ -84,7 +84,7 @@ impl Settings {
         [&self.continual, &self.noise][part]
     }
 
-    pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
+    pub(super) fn plans(&self, seed: u32) -> Vec<PointPlan<Point>> {
         let mut plans = Vec::new();
         let of = &self.predictability;
         for &epsilon in &of.epsilons {
@@ -123,8 +123,8 @@ impl Settings {
         plans
     }
 
-    fn call(&self, agent: &str, seed: u32, frames: u64, sets: &[String]) -> Call {
-        Call {
+    fn call(&self, agent: &str, seed: u32, frames: u64, sets: &[String]) -> TrainCall {
+        TrainCall {
             env: Some("mspacman".into()),
             agent: Some(agent.into()),
             preset: Some(self.preset.clone()),
@@ -138,9 +138,9 @@ impl Settings {
 /// Returns the settings of the full or smoke length, overridden by the flags.
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
-    let mut settings: Settings = flags::settings(NAME, text, args.flags.smoke);
+    let mut settings: Settings = flags::read_settings(NAME, text, args.flags.smoke);
     if !args.agents.is_empty() {
-        settings.agents = once(&args.agents, |name| {
+        settings.agents = expand_unique(&args.agents, |name| {
             Ok(vec![presets::agent(name)?.name.to_owned()])
         })?;
     }
@@ -165,11 +165,11 @@ pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flags::tests::parsed;
+    use crate::flags::tests::parse;
 
     #[test]
     fn an_agent_that_is_named_twice_runs_once() {
-        let settings = with_flags(&parsed("--agents c51,curl,c51")).unwrap();
+        let settings = with_flags(&parse("--agents c51,curl,c51")).unwrap();
         assert_eq!(settings.agents, ["c51", "curl"]);
     }
 }

@@ -7,10 +7,10 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    flags::{self, ProcgenArgs, once},
+    flags::{self, ProcgenArgs, expand_unique},
     sweep::{
-        plan::{Call, Planned, PlannedRun},
-        results::Played,
+        plan::{PlannedRun, PointPlan, TrainCall},
+        results::PlaySettings,
     },
 };
 
@@ -54,7 +54,7 @@ pub(super) struct Point {
 impl Settings {
     pub(super) fn of(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self =
-            flags::settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
+            flags::read_settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
         if !args.games.is_empty() {
             settings.games.clone_from(&args.games);
         }
@@ -74,13 +74,13 @@ impl Settings {
         Ok(settings)
     }
 
-    pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
+    pub(super) fn plans(&self, seed: u32) -> Vec<PointPlan<Point>> {
         let mut plans = Vec::new();
         let games = self.games.iter();
         for (world, name) in games.flat_map(|it| self.agents.iter().map(move |name| (it, name))) {
             let (agent, k) = with_k(name);
             let k = k.map(|k| format!("run.horizon.k={k}"));
-            let call = Call {
+            let call = TrainCall {
                 env: Some(world.clone()),
                 agent: Some(agent.to_owned()),
                 preset: Some(self.preset.clone()),
@@ -99,8 +99,8 @@ impl Settings {
     }
 
     /// Returns how a run is played on these levels.
-    pub(super) fn play(&self, levels: Levels) -> Played {
-        Played {
+    pub(super) fn play_settings(&self, levels: Levels) -> PlaySettings {
+        PlaySettings {
             levels,
             checkpoints: CHECKPOINTS as usize,
             episodes: CHECKPOINTS * self.episodes,
@@ -111,7 +111,7 @@ impl Settings {
 
 /// Resolves names of worlds or games and drops duplicates. `all` means every Procgen game.
 fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
-    once(names, |name| match name {
+    expand_unique(names, |name| match name {
         "all" => {
             let games = WorldName::all().filter(|it| it.kind() == "procgen");
             Ok(games.map(|world| world.to_string()).collect())
@@ -134,7 +134,7 @@ fn with_k(name: &str) -> (&str, Option<u32>) {
 
 /// Resolves names of agents, with or without a k, and drops duplicates. `all` means every agent of the paper.
 fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
-    once(names, |name| {
+    expand_unique(names, |name| {
         Ok(match (name, with_k(name)) {
             ("all", _) => AGENTS.split(' ').map(String::from).collect(),
             (_, (agent, None)) => vec![presets::agent(agent)?.name.to_owned()],
@@ -148,7 +148,7 @@ mod tests {
     use super::*;
 
     fn settings(smoke: bool) -> Settings {
-        flags::settings(NAME, include_str!("../procgen.toml"), smoke)
+        flags::read_settings(NAME, include_str!("../procgen.toml"), smoke)
     }
 
     #[test]

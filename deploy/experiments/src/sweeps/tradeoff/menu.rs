@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     flags::TradeoffArgs,
-    sweep::plan::{Call, PlannedRun},
+    sweep::plan::{PlannedRun, TrainCall},
 };
 
 /// A base has this many times the seeds of a level. All levels are compared with it, so chance in the base affects all differences.
@@ -242,7 +242,7 @@ impl Common {
     }
 
     pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
-        let call = Call {
+        let call = TrainCall {
             env: Some(self.env.clone()),
             agent: Some(point.agent.clone()),
             preset: Some(self.preset.clone()),
@@ -293,10 +293,10 @@ mod tests {
     use driml_settings::presets;
 
     use super::*;
-    use crate::flags::tests::parsed;
+    use crate::flags::tests::parse;
 
     fn of(line: &str, found: Option<Common>) -> Result<Settings, Usage> {
-        let args: TradeoffArgs = parsed(line);
+        let args: TradeoffArgs = parse(line);
         Settings::of(&args, presets::world(&args.env)?, found)
     }
 

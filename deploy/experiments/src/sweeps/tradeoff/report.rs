@@ -30,15 +30,15 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
     let equal: Vec<_> = of_dim.filter_map(|row| EqualTime::of(&row)).collect();
     write_runs(&session, results)?;
     write_levels(&session, results)?;
-    session.csv("equal_time", EQUAL_TIME, equal.iter().map(EqualTime::cells))?;
+    session.write_csv("equal_time", EQUAL_TIME, equal.iter().map(EqualTime::cells))?;
     for (stem, returns, name) in [
         ("pareto", GREEDY, "greedy"),
         ("pareto_training", TRAINING, "training"),
     ] {
-        session.figure(stem, &figures::pareto(results, returns, name))?;
+        session.save_figure(stem, &figures::pareto(results, returns, name))?;
     }
-    session.figure("wall", &figures::wall(results))?;
-    session.finish(include_str!("../tradeoff.md.j2"), values(results, &equal)?)
+    session.save_figure("wall", &figures::wall(results))?;
+    session.write_page(include_str!("../tradeoff.md.j2"), values(results, &equal)?)
 }
 
 fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -53,7 +53,7 @@ fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
         let of = (key, &summary.agent, it.seed);
         (of, speed, &summary.weights_sha256, measured)
     });
-    session.csv("runs", &columns, rows)
+    session.write_csv("runs", &columns, rows)
 }
 
 fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -76,7 +76,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
             of_runs,
         )
     });
-    session.csv("levels", &columns, rows)
+    session.write_csv("levels", &columns, rows)
 }
 
 /// Returns the cells for mean, low end and high end; missing numbers are empty.
