@@ -5,7 +5,7 @@ use std::fmt;
 use rand::{Rng, seq::IndexedRandom};
 
 /// The ends of ranges.
-const ENDS: [f32; 11] = [
+const RANGE_ENDS: [f32; 11] = [
     0.0,
     -0.0,
     1e-45,
@@ -20,7 +20,7 @@ const ENDS: [f32; 11] = [
 ];
 
 /// Draws a finite number: of usual size, of any size, subnormal, a neighbour of a power of two, or an end of a range.
-pub(super) fn finite(rng: &mut impl Rng) -> f32 {
+pub(super) fn draw_finite(rng: &mut impl Rng) -> f32 {
     match rng.random_range(0..10) {
         0..4 => rng.random_range(-10.0f32..10.0),
         4..6 => {
@@ -36,38 +36,38 @@ pub(super) fn finite(rng: &mut impl Rng) -> f32 {
                 f32::from_bits((exponent << 23).wrapping_add_signed(rng.random_range(-1..=1)));
             if rng.random() { -size } else { size }
         }
-        _ => one_of(&ENDS, rng),
+        _ => one_of(&RANGE_ENDS, rng),
     }
 }
 
 /// Draws `count` finite numbers: independent, all of usual size, all equal, from two values, or all of similar size.
-pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
+pub(super) fn draw_finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     match rng.random_range(0..6) {
-        0..2 => (0..count).map(|_| finite(rng)).collect(),
+        0..2 => (0..count).map(|_| draw_finite(rng)).collect(),
         2 => (0..count)
             .map(|_| rng.random_range(-10.0f32..10.0))
             .collect(),
-        3 => vec![finite(rng); count],
+        3 => vec![draw_finite(rng); count],
         4 => {
-            let two = [finite(rng), finite(rng)];
+            let two = [draw_finite(rng), draw_finite(rng)];
             (0..count).map(|_| one_of(&two, rng)).collect()
         }
         _ => {
-            let size = finite(rng);
+            let size = draw_finite(rng);
             let share = |_| size * rng.random_range(-1.0f32..1.0);
             (0..count).map(share).collect()
         }
     }
 }
 
-/// Draws as [`finites`], and clamps to `-most..=most`.
-pub(super) fn clamped(count: usize, most: f32, rng: &mut impl Rng) -> Vec<f32> {
-    let values = finites(count, rng).into_iter();
+/// Draws as [`draw_finites`], and clamps to `-most..=most`.
+pub(super) fn draw_clamped(count: usize, most: f32, rng: &mut impl Rng) -> Vec<f32> {
+    let values = draw_finites(count, rng).into_iter();
     values.map(|x| x.clamp(-most, most)).collect()
 }
 
 /// Lists vectors of `count` numbers on which sums and exponentials may fail: all equal, shuffled ramps, one unlike the rest.
-pub(super) fn listed(count: usize) -> Vec<Vec<f32>> {
+pub(super) fn extremes(count: usize) -> Vec<Vec<f32>> {
     let sizes = [0.0, 1e-45, 1e-38, 1e4, 1e12, 1e20, 1e38, f32::MAX];
     let equal = sizes.iter().flat_map(|&x| [x, -x]);
     let equal = equal.map(|x| vec![x; count]);
@@ -76,16 +76,16 @@ pub(super) fn listed(count: usize) -> Vec<Vec<f32>> {
         let values = (0..count).map(|i| place(i) * scale - scale / 2.0);
         values.collect::<Vec<_>>()
     });
-    let unlike = [1e-45, f32::MIN].map(|rest| {
+    let outliers = [1e-45, f32::MIN].map(|rest| {
         let mut values = vec![rest; count];
         values[count / 2] = f32::MAX;
         values
     });
-    equal.chain(ramps).chain(unlike).collect()
+    equal.chain(ramps).chain(outliers).collect()
 }
 
 /// Draws probabilities of `count` atoms. They sum to 1, and some are 0 or tiny.
-pub(super) fn law(count: usize, rng: &mut impl Rng) -> Vec<f32> {
+pub(super) fn draw_probs(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     let mut weights: Vec<f64> = (0..count)
         .map(|_| match rng.random_range(0..3) {
             0 => 0.0,
@@ -99,11 +99,11 @@ pub(super) fn law(count: usize, rng: &mut impl Rng) -> Vec<f32> {
 }
 
 /// Draws a probability: uniform, near 0 or 1, or a listed edge.
-pub(super) fn probability(rng: &mut impl Rng) -> f32 {
+pub(super) fn draw_probability(rng: &mut impl Rng) -> f32 {
     match rng.random_range(0..4) {
         0 => rng.random(),
-        1 => finite(rng).abs().min(1.0),
-        2 => 1.0 - finite(rng).abs().min(1.0),
+        1 => draw_finite(rng).abs().min(1.0),
+        2 => 1.0 - draw_finite(rng).abs().min(1.0),
         _ => one_of(&[0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0], rng),
     }
 }
@@ -128,8 +128,8 @@ pub(super) const SUPPORTS: [(f32, f32); 14] = [
 ];
 
 /// Draws a support within 1e30: the usual one, one that is one float step wide, or any.
-pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
-    let end = |rng: &mut _| finite(rng).clamp(-1e30, 1e30);
+pub(super) fn draw_support(rng: &mut impl Rng) -> (f32, f32) {
+    let end = |rng: &mut _| draw_finite(rng).clamp(-1e30, 1e30);
     match rng.random_range(0..4) {
         0 => (-10.0, 10.0),
         1 => {
@@ -146,11 +146,11 @@ pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
 }
 
 /// The smallest normal f32. Errors of smaller values are relative to this.
-pub(super) const LEAST: f64 = f32::MIN_POSITIVE as f64;
+pub(super) const MIN_NORMAL: f64 = f32::MIN_POSITIVE as f64;
 pub(super) const F32_STEP: f64 = f32::EPSILON as f64;
 
 /// Returns the softmax of a row, exp(x - max) / sum, with the largest x and the sum.
-pub(super) fn shares(row: &[f64]) -> (Vec<f64>, f64, f64) {
+pub(super) fn softmax_f64(row: &[f64]) -> (Vec<f64>, f64, f64) {
     let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let weights: Vec<f64> = row.iter().map(|x| (x - max).exp()).collect();
     let sum = exact_sum(weights.iter().copied());
@@ -159,7 +159,7 @@ pub(super) fn shares(row: &[f64]) -> (Vec<f64>, f64, f64) {
 }
 
 /// Converts the numbers to f64.
-pub(super) fn widened(values: &[f32]) -> Vec<f64> {
+pub(super) fn to_f64(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&x| f64::from(x)).collect()
 }
 
@@ -183,23 +183,23 @@ pub(super) fn exact_sum(terms: impl IntoIterator<Item = f64>) -> f64 {
 }
 
 /// Returns the error of `found` relative to `expected`, or relative to the smallest normal f32 if that is larger.
-pub(super) fn off(found: f32, expected: f64) -> f64 {
-    (f64::from(found) - expected).abs() / expected.abs().max(LEAST)
+pub(super) fn rel_error(found: f32, expected: f64) -> f64 {
+    (f64::from(found) - expected).abs() / expected.abs().max(MIN_NORMAL)
 }
 
 /// Returns the largest error, or NaN if any is NaN.
-pub(super) fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
+pub(super) fn max_error(errors: impl IntoIterator<Item = f64>) -> f64 {
     let larger = |a: f64, b: f64| if b <= a || a.is_nan() { a } else { b };
     errors.into_iter().fold(0.0, larger)
 }
 
 /// Returns `error` if the condition holds, else NaN, which counts as the largest error.
-pub(super) const fn only_if(holds: bool, error: f64) -> f64 {
+pub(super) const fn nan_unless(holds: bool, error: f64) -> f64 {
     if holds { error } else { f64::NAN }
 }
 
 /// Draws infinity, -infinity or NaN.
-pub(super) fn not_finite(rng: &mut impl Rng) -> f32 {
+pub(super) fn draw_nonfinite(rng: &mut impl Rng) -> f32 {
     one_of(&[f32::INFINITY, f32::NEG_INFINITY, f32::NAN], rng)
 }
 
@@ -210,9 +210,9 @@ pub(super) fn one_of<T: Clone>(values: &[T], rng: &mut impl Rng) -> T {
 }
 
 /// Displays the first four values, and the number of values.
-pub(super) struct Shown<'a>(pub(super) &'a [f32]);
+pub(super) struct Preview<'a>(pub(super) &'a [f32]);
 
-impl fmt::Display for Shown<'_> {
+impl fmt::Display for Preview<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let more = if self.0.len() > 4 { ", .." } else { "" };
         let first: Vec<_> = self.0.iter().take(4).map(|x| format!("{x:e}")).collect();
@@ -230,7 +230,7 @@ mod tests {
     #[test]
     fn the_generator_likes_the_edges_and_is_never_infinite() {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
-        let values: Vec<f32> = (0..20_000).map(|_| finite(rng)).collect();
+        let values: Vec<f32> = (0..20_000).map(|_| draw_finite(rng)).collect();
         assert!(values.iter().all(|x| x.is_finite()));
         let share = |wanted: fn(&f32) -> bool| {
             values.iter().filter(|x| wanted(x)).count() as f64 / values.len() as f64
@@ -240,10 +240,10 @@ mod tests {
         assert!(share(|x| x.to_bits() & 0x7f_ffff == 0x7f_ffff) > 0.03);
         assert!(share(|x| *x == 0.0) > 0.005);
         for _ in 0..2_000 {
-            let (low, high) = support(rng);
+            let (low, high) = draw_support(rng);
             assert!(low < high && low >= -1e30 && high <= 1e30, "{low}, {high}");
-            assert!((0.0..=1.0).contains(&probability(rng)));
-            let sum: f32 = law(7, rng).iter().sum();
+            assert!((0.0..=1.0).contains(&draw_probability(rng)));
+            let sum: f32 = draw_probs(7, rng).iter().sum();
             assert!((sum - 1.0).abs() < 1e-6);
         }
         assert_eq!(exact_sum([1e16, 1.0, -1e16, 1e-3]), 1.001);

@@ -5,40 +5,40 @@ use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use super::property::Row;
 
 /// The drawn value of a row without any error, because 0 has no place on a logarithmic axis.
-const NONE: f64 = 1e-6;
+const LOW: f64 = 1e-6;
 /// The largest drawn value, for rows whose error exceeds the bound by more.
-const MOST: f64 = 10.0;
+const HIGH: f64 = 10.0;
 /// The number of routines in a chart, so that their names fit below it.
-const ROUTINES_A_CHART: usize = 8;
+const ROUTINES_PER_CHART: usize = 8;
 
-/// Returns the worst errors of the rows with drawn or listed inputs, each at x = index of its routine + `aside`.
-fn points(rows: &[Row], names: &[String], is_drawn: bool, aside: f64) -> Vec<(f64, f64)> {
+/// Returns the worst errors of the rows with drawn or listed inputs, each at x = index of its routine + `x_offset`.
+fn points(rows: &[Row], names: &[String], is_drawn: bool, x_offset: f64) -> Vec<(f64, f64)> {
     let some = rows.iter().filter(|it| it.is_drawn == is_drawn);
     let points = some.filter_map(|row| {
         let at = names.iter().position(|name| *name == row.routine)? as f64;
-        let share = match row.seen.worst {
-            _ if row.seen.cases == 0 => MOST,
+        let share = match row.tally.worst {
+            _ if row.tally.cases == 0 => HIGH,
             0.0 => 0.0,
             worst => worst / row.bound,
         };
-        Some((at + aside, share.clamp(NONE, MOST)))
+        Some((at + x_offset, share.clamp(LOW, HIGH)))
     });
     points.collect()
 }
 
 /// Draws one chart for some of the routines.
 fn chart(rows: &[Row], names: &[String]) -> Chart {
-    let of = |is_drawn, aside| points(rows, names, is_drawn, aside);
+    let series_points = |is_drawn, x_offset| points(rows, names, is_drawn, x_offset);
     let ends = vec![(-0.5, 1.0), (names.len() as f64 - 0.5, 1.0)];
     let promise = Series::line("the promise", 0, ends).with_colour(GREY);
     Chart::new(
         &format!("{} to {}", names[0], names[names.len() - 1]),
         Axis::names("", names),
-        Axis::log("worst error / promise").covering(&[NONE, MOST]),
+        Axis::log("worst error / promise").covering(&[LOW, HIGH]),
         vec![
             promise.with_mark(Mark::Dashed),
-            Series::line("listed extremes", 0, of(false, -0.1)).with_mark(Mark::Rings),
-            Series::line("drawn inputs", 1, of(true, 0.1)).with_mark(Mark::Rings),
+            Series::line("listed extremes", 0, series_points(false, -0.1)).with_mark(Mark::Rings),
+            Series::line("drawn inputs", 1, series_points(true, 0.1)).with_mark(Mark::Rings),
         ],
     )
 }
@@ -47,7 +47,7 @@ fn chart(rows: &[Row], names: &[String]) -> Chart {
 pub(super) fn figure(rows: &[Row], cases: &str) -> Figure {
     let mut names: Vec<String> = rows.iter().map(|row| row.routine.into()).collect();
     names.dedup();
-    let charts = names.chunks(ROUTINES_A_CHART);
+    let charts = names.chunks(ROUTINES_PER_CHART);
     let charts = charts.map(|some| Panel::Chart(chart(rows, some)));
     Figure {
         title: "The worst error of each routine, beside what it promises".into(),
@@ -74,7 +74,7 @@ mod tests {
         };
         let rows = [row(false, 1, 0.25), row(true, 1, 0.0), row(false, 0, 0.0)];
         let names = ["halving".to_owned()];
-        assert_eq!(points(&rows, &names, false, 0.0), [(0.0, 0.5), (0.0, MOST)]);
-        assert_eq!(points(&rows, &names, true, 0.0), [(0.0, NONE)]);
+        assert_eq!(points(&rows, &names, false, 0.0), [(0.0, 0.5), (0.0, HIGH)]);
+        assert_eq!(points(&rows, &names, true, 0.0), [(0.0, LOW)]);
     }
 }

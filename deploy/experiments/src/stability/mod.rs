@@ -41,32 +41,32 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         let name = routine.replace(|c: char| !c.is_alphanumeric(), "-");
         for seed in 1..=settings.seeds {
             let key = format!("{at:02}-{name}-seed{seed}");
-            let seen = session.load_or_make(&program, &key, 1, |progress| {
+            let tallies = session.load_or_make(&program, &key, 1, |progress| {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed.into());
                 rng.set_stream(at as u64);
                 property.run(&settings, rng, progress)
             })?;
-            property.add(seen);
+            property.add_seed(tallies);
         }
-        rows.extend(property.tried());
+        rows.extend(property.into_tried_rows());
     }
     let promises = rows.iter().map(|row| {
-        let of = (row.routine, row.range, &row.extreme, row.seen.cases);
+        let check = (row.routine, row.range, &row.extreme, row.tally.cases);
         let kept = if row.is_kept() { "yes" } else { "no" };
-        let found = [number(row.seen.worst), number(row.bound)];
-        (of, found, kept, row.promise, &row.seen.input)
+        let found = [format_number(row.tally.worst), format_number(row.bound)];
+        (check, found, kept, row.promise, &row.tally.input)
     });
     session.write_csv("promises", COLUMNS, promises)?;
-    session.save_figure("worst", &figure::figure(&rows, &cases(&rows)))?;
+    session.save_figure("worst", &figure::figure(&rows, &case_count(&rows)))?;
     let page = session.folder().join("README.md");
-    session.write_page(include_str!("page.md.j2"), values(&rows, &settings))?;
+    session.write_page(include_str!("page.md.j2"), page_values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
     ensure!(is_kept, "{} See {}", verdict(&rows), page.display());
     Ok(())
 }
 
 /// Formats a number with two digits. The largest float stands for a result that is not finite.
-fn number(value: f64) -> String {
+fn format_number(value: f64) -> String {
     match value {
         0.0 => "0".to_owned(),
         f64::MAX => "not finite".to_owned(),
@@ -75,28 +75,28 @@ fn number(value: f64) -> String {
     }
 }
 
-fn cases(rows: &[Row]) -> String {
-    HumanCount(rows.iter().map(|row| row.seen.cases).sum()).to_string()
+fn case_count(rows: &[Row]) -> String {
+    HumanCount(rows.iter().map(|row| row.tally.cases).sum()).to_string()
 }
 
 /// Returns the outcome as a sentence.
 fn verdict(rows: &[Row]) -> String {
     let kept = rows.iter().filter(|row| row.is_kept()).count();
-    let (all, cases) = (rows.len(), cases(rows));
+    let (all, cases) = (rows.len(), case_count(rows));
     format!("{kept} of {all} promises are kept, in {cases} cases.")
 }
 
-fn values(rows: &[Row], settings: &Settings) -> Value {
+fn page_values(rows: &[Row], settings: &Settings) -> Value {
     let broken = rows.iter().filter(|row| !row.is_kept()).map(|row| {
-        let (worst, bound) = (number(row.seen.worst), number(row.bound));
+        let (worst, bound) = (format_number(row.tally.worst), format_number(row.bound));
         let (routine, extreme, promise) = (row.routine, &row.extreme, row.promise);
-        let input = &row.seen.input;
+        let input = &row.tally.input;
         format!(
             "**Not kept**: {routine}, {extreme}: {promise}: {worst}, promised {bound}; at {input}."
         )
     });
     // Rows with a bound above 0, sorted by the share of the bound that is used.
-    let share = |row: &Row| 100.0 * row.seen.worst / row.bound;
+    let share = |row: &Row| 100.0 * row.tally.worst / row.bound;
     let mut close: Vec<&Row> = rows.iter().filter(|row| row.bound > 0.0).collect();
     close.sort_by(|a, b| share(b).total_cmp(&share(a)));
     let mut named = HashSet::new();
@@ -116,7 +116,7 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use super::{property::Seen, *};
+    use super::{property::Tally, *};
 
     /// Creates a row with these results.
     pub(super) fn row(cases: u64, worst: f64, input: &str) -> Row {
@@ -125,7 +125,7 @@ mod tests {
             extreme: "big".into(),
             promise: "error of |x|",
             bound: 0.5,
-            seen: Seen {
+            tally: Tally {
                 cases,
                 worst,
                 input: input.into(),
@@ -138,7 +138,7 @@ mod tests {
     fn the_page_and_the_verdict_name_what_is_broken() {
         let reported = |worst: f64, input: &str| {
             let rows = [row(1, worst, input)];
-            let values = values(&rows, &flags::read_settings(NAME, SETTINGS, true));
+            let values = page_values(&rows, &flags::read_settings(NAME, SETTINGS, true));
             let page = crate::page::render_page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)
         };
@@ -163,6 +163,6 @@ mod tests {
 
     #[test]
     fn numbers_are_short() {
-        assert_eq!([0.25, 3.1e-8].map(number), ["0.25", "3.1e-8"]);
+        assert_eq!([0.25, 3.1e-8].map(format_number), ["0.25", "3.1e-8"]);
     }
 }

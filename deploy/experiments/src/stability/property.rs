@@ -75,7 +75,7 @@ impl Property {
     }
 
     /// Adds a check that tries all promises on these inputs. `extreme` describes the kind of inputs.
-    pub(super) fn on(
+    pub(super) fn check(
         mut self,
         extreme: &str,
         inputs: Inputs,
@@ -90,7 +90,7 @@ impl Property {
                 is_drawn: matches!(inputs, Drawn(_)),
                 promise,
                 bound,
-                seen: Seen::default(),
+                tally: Tally::default(),
             });
         }
         self
@@ -102,30 +102,30 @@ impl Property {
         settings: &Settings,
         rng: ChaCha8Rng,
         progress: &mut Progress,
-    ) -> anyhow::Result<Vec<Seen>> {
+    ) -> anyhow::Result<Vec<Tally>> {
         let mut cases = Cases {
             settings,
             rng,
             progress,
-            rest: None,
+            listed_index: None,
             combinations: 1,
-            seen: Vec::new(),
+            tallies: Vec::new(),
         };
         let mut all = Vec::new();
         for (inputs, check) in &self.checks {
-            cases.seen = vec![Seen::default(); self.promises.len()];
+            cases.tallies = vec![Tally::default(); self.promises.len()];
             let (is_listed, mut count) = match *inputs {
                 Listed => (true, 1),
-                Drawn(share) => (false, cases.draws(share)),
+                Drawn(share) => (false, cases.draw_count(share)),
             };
             let mut case = 0;
             while case < count {
-                cases.rest = is_listed.then_some(case);
+                cases.listed_index = is_listed.then_some(case);
                 cases.combinations = 1;
                 match check(&mut cases) {
                     // An error breaks the first promise. Its message is shown as the input.
                     Err(e) if !e.is::<Interrupted>() => {
-                        cases.see(format_args!("{e:#}"), [f64::NAN])?;
+                        cases.record_errors(format_args!("{e:#}"), [f64::NAN])?;
                     }
                     done => done?,
                 }
@@ -133,23 +133,23 @@ impl Property {
                 count = count.max(cases.combinations);
                 case += 1;
             }
-            all.append(&mut cases.seen);
+            all.append(&mut cases.tallies);
         }
         Ok(all)
     }
 
     /// Adds the results of one seed.
-    pub(super) fn add(&mut self, seen: Vec<Seen>) {
-        assert_eq!(self.rows.len(), seen.len(), "each seed has all rows");
-        for (row, seen) in self.rows.iter_mut().zip(seen) {
-            row.seen.add(seen.cases, seen.worst, || seen.input);
+    pub(super) fn add_seed(&mut self, tallies: Vec<Tally>) {
+        assert_eq!(self.rows.len(), tallies.len(), "each seed has all rows");
+        for (row, tally) in self.rows.iter_mut().zip(tallies) {
+            row.tally.add(tally.cases, tally.worst, || tally.input);
         }
     }
 
     /// Returns the rows that have cases. For a promise without any case it adds one row, which counts as not kept.
-    pub(super) fn tried(self) -> Vec<Row> {
+    pub(super) fn into_tried_rows(self) -> Vec<Row> {
         let rows = self.rows.into_iter();
-        let (mut tried, untried): (Vec<_>, Vec<_>) = rows.partition(|row| row.seen.cases > 0);
+        let (mut tried, untried): (Vec<_>, Vec<_>) = rows.partition(|row| row.tally.cases > 0);
         for mut row in untried {
             if tried.iter().all(|it| it.promise != row.promise) {
                 (row.extreme, row.is_drawn) = ("none was tried".into(), false);
@@ -170,18 +170,18 @@ pub(super) struct Row {
     pub(super) is_drawn: bool,
     pub(super) promise: &'static str,
     pub(super) bound: f64,
-    pub(super) seen: Seen,
+    pub(super) tally: Tally,
 }
 
 impl Row {
     pub(super) fn is_kept(&self) -> bool {
-        self.seen.cases > 0 && self.seen.worst <= self.bound
+        self.tally.cases > 0 && self.tally.worst <= self.bound
     }
 }
 
 /// The cases of a row and the worst of them.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Seen {
+pub(super) struct Tally {
     pub(super) cases: u64,
     /// The largest error, in the unit of the bound; the largest float if a result was NaN.
     pub(super) worst: f64,
@@ -189,7 +189,7 @@ pub(super) struct Seen {
     pub(super) input: String,
 }
 
-impl Seen {
+impl Tally {
     fn add(&mut self, cases: u64, error: f64, input: impl FnOnce() -> String) {
         self.cases += cases;
         if error > self.worst {
@@ -205,42 +205,42 @@ pub(super) struct Cases<'a> {
     pub(super) rng: ChaCha8Rng,
     progress: &'a mut Progress,
     /// The index of the combination of listed inputs, divided by the lengths of the lists used so far; `None` if inputs are drawn.
-    rest: Option<u64>,
+    listed_index: Option<u64>,
     /// The number of combinations of the lists that this case has used so far.
     combinations: u64,
     /// What was seen of each promise at the current extreme.
-    seen: Vec<Seen>,
+    tallies: Vec<Tally>,
 }
 
 impl Cases<'_> {
     /// Returns the number of cases in this share of the draws, at least 8.
-    pub(super) fn draws(&self, share: f64) -> u64 {
+    pub(super) fn draw_count(&self, share: f64) -> u64 {
         (self.settings.draws as f64 * share).ceil().max(8.0) as u64
     }
 
     /// Returns one of `items`. Listed inputs go through all combinations with the items of other lists; else the item is drawn.
-    pub(super) fn each<T: Clone>(&mut self, items: &[T]) -> T {
-        self.of(items, |rng| one_of(items, rng))
+    pub(super) fn one_of<T: Clone>(&mut self, items: &[T]) -> T {
+        self.listed_or(items, |rng| one_of(items, rng))
     }
 
-    /// Returns one of `items` like [`Cases::each`] if inputs are listed, else calls `draw`. A list must have the same length in all cases.
-    pub(super) fn of<T: Clone>(
+    /// Returns one of `items` like [`Cases::one_of`] if inputs are listed, else calls `draw`. A list has the same length in every case.
+    pub(super) fn listed_or<T: Clone>(
         &mut self,
         items: &[T],
         draw: impl FnOnce(&mut ChaCha8Rng) -> T,
     ) -> T {
-        let Some(rest) = &mut self.rest else {
+        let Some(listed_index) = &mut self.listed_index else {
             return draw(&mut self.rng);
         };
         let count = items.len() as u64;
-        let at = *rest % count;
-        *rest /= count;
+        let at = *listed_index % count;
+        *listed_index /= count;
         self.combinations *= count;
         items[at as usize].clone()
     }
 
     /// Counts the errors of this case, in the order and units of the promises. NaN counts as the largest error; `None` is not counted.
-    pub(super) fn see<E: Into<Option<f64>>, const N: usize>(
+    pub(super) fn record_errors<E: Into<Option<f64>>, const N: usize>(
         &mut self,
         input: Arguments<'_>,
         errors: [E; N],
@@ -249,25 +249,25 @@ impl Cases<'_> {
             if let Some(error) = error.into() {
                 // The minimum of a number and NaN is the number.
                 let error = error.abs().min(f64::MAX);
-                self.seen[promise].add(1, error, || input.to_string());
+                self.tallies[promise].add(1, error, || input.to_string());
             }
         }
-        self.pause()
+        self.check_interrupt()
     }
 
     /// Counts whether this case keeps a promise with the bound 0.
-    pub(super) fn keeps(
+    pub(super) fn record_kept(
         &mut self,
         promise: usize,
         input: Arguments<'_>,
         is_kept: bool,
     ) -> anyhow::Result<()> {
-        self.seen[promise].add(1, f64::from(!is_kept), || input.to_string());
-        self.pause()
+        self.tallies[promise].add(1, f64::from(!is_kept), || input.to_string());
+        self.check_interrupt()
     }
 
     /// Returns an error if the user has interrupted. A long case calls this before it has an error to report.
-    pub(super) fn pause(&mut self) -> anyhow::Result<()> {
+    pub(super) fn check_interrupt(&mut self) -> anyhow::Result<()> {
         Ok(self.progress.advance(0)?)
     }
 }
@@ -289,25 +289,25 @@ mod tests {
             .promise("error", 310.0)
             .promise("other bits", 0.0)
             .promise("untried", 0.0)
-            .on("listed", Listed, |cases| {
-                let number = 100 * cases.each(&[1, 2, 3]) + 10 * cases.of(&[0, 1], |_| 9);
-                cases.see(format_args!("{number}"), [-f64::from(number), 0.0])
+            .check("listed", Listed, |cases| {
+                let number = 100 * cases.one_of(&[1, 2, 3]) + 10 * cases.listed_or(&[0, 1], |_| 9);
+                cases.record_errors(format_args!("{number}"), [-f64::from(number), 0.0])
             })
-            .on("drawn", Drawn(0.1), |cases| {
-                let number = cases.of(&[1000], |rng| rng.random_range(0..10));
-                cases.see(format_args!("{number}"), [f64::from(number)])
+            .check("drawn", Drawn(0.1), |cases| {
+                let number = cases.listed_or(&[1000], |rng| rng.random_range(0..10));
+                cases.record_errors(format_args!("{number}"), [f64::from(number)])
             })
-            .on("large", Listed, |cases| {
-                cases.see(format_args!("4"), [Some(f64::NAN), None])
+            .check("large", Listed, |cases| {
+                cases.record_errors(format_args!("4"), [Some(f64::NAN), None])
             })
-            .on("failing", Listed, |_| anyhow::bail!("no memory"));
+            .check("failing", Listed, |_| anyhow::bail!("no memory"));
         let settings = flags::read_settings(NAME, SETTINGS, true);
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
-        let seen = halving.run(&settings, rng, progress).unwrap();
-        halving.add(seen.clone());
-        halving.add(seen);
-        let rows = halving.tried();
+        let tallies = halving.run(&settings, rng, progress).unwrap();
+        halving.add_seed(tallies.clone());
+        halving.add_seed(tallies);
+        let rows = halving.into_tried_rows();
         let expected = [
             ("listed", 12, 310.0, "310", true),
             ("listed", 12, 0.0, "", true),
@@ -317,8 +317,8 @@ mod tests {
             ("none was tried", 0, 0.0, "", false),
         ];
         for (row, expected) in rows.iter().zip(expected) {
-            let (extreme, seen) = (&*row.extreme, &row.seen);
-            let found = (extreme, seen.cases, seen.worst, &*seen.input, row.is_kept());
+            let (extreme, t) = (&*row.extreme, &row.tally);
+            let found = (extreme, t.cases, t.worst, &*t.input, row.is_kept());
             assert_eq!(found, expected);
             assert_eq!(row.is_drawn, row.extreme == "drawn");
         }

@@ -25,12 +25,12 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
         Property::new("affinity, exact", counts)
             .promise("an entry, as a share of it", ENTRY_ERROR)
             .promise("a row's sum, beside 1", ROW_SUM_ERROR)
-            .on(COUNTS, Listed, exact),
+            .check(COUNTS, Listed, exact),
         Property::new("affinity, learned", "any pairs of 1 to 255 actions")
             .promise("a row's sum, beside 1, at any update", ROW_SUM_ERROR)
             // If there is only one pair, it does not tell how actions follow each other.
             .promise(ALWAYS, UNIFORM_ERROR)
-            .on(&updates, Listed, learned),
+            .check(&updates, Listed, learned),
     ]
 }
 
@@ -45,30 +45,30 @@ const LEARNED: LearnedSettings = LearnedSettings {
 };
 
 /// A way in which actions are used: its name, the number of pairs in a batch, and a function that draws a pair.
-type Use = (&'static str, usize, fn(u8, &mut ChaCha8Rng) -> (u8, u8));
+type ActionUse = (&'static str, usize, fn(u8, &mut ChaCha8Rng) -> (u8, u8));
 
-const USES: [Use; 5] = [
-    ("random", 64, any_pair),
+const USES: [ActionUse; 5] = [
+    ("random", 64, draw_any_pair),
     ("in a cycle", 64, |actions, rng| {
         let action = rng.random_range(0..actions);
         (action, (action + 1) % actions)
     }),
     ("always the same", 64, |all, _| (all - 1, all - 1)),
     ("half of them never", 64, |actions, rng| {
-        any_pair(actions / 2, rng)
+        draw_any_pair(actions / 2, rng)
     }),
-    ("one pair a batch", 1, any_pair),
+    ("one pair a batch", 1, draw_any_pair),
 ];
 
-fn any_pair(actions: u8, rng: &mut ChaCha8Rng) -> (u8, u8) {
+fn draw_any_pair(actions: u8, rng: &mut ChaCha8Rng) -> (u8, u8) {
     (rng.random_range(0..actions), rng.random_range(0..actions))
 }
 
 /// Returns the largest distance of a row's sum from 1; NaN if an entry is not a probability.
 fn row_sum_error(matrix: &[f32], actions: usize) -> f64 {
-    worst(matrix.chunks_exact(actions).map(|row| {
-        let are_chances = row.iter().all(|a| (0.0..=1.0 + 1e-6).contains(a));
-        only_if(are_chances, (exact_sum(widened(row)) - 1.0).abs())
+    max_error(matrix.chunks_exact(actions).map(|row| {
+        let are_probabilities = row.iter().all(|a| (0.0..=1.0 + 1e-6).contains(a));
+        nan_unless(are_probabilities, (exact_sum(to_f64(row)) - 1.0).abs())
     }))
 }
 
@@ -92,21 +92,21 @@ fn closed_form(counts: &[f64], actions: usize, smoothing: f64) -> Vec<f64> {
 }
 
 fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let actions = cases.each(&[2usize, 15, 60]);
+    let actions = cases.one_of(&[2usize, 15, 60]);
     let settings = ExactSettings {
-        decay: cases.each(&[1.0, 0.999, 0.5, 1e-300]),
-        smoothing: cases.each(&[1e-100, 1.0, 1e100]),
+        decay: cases.one_of(&[1.0, 0.999, 0.5, 1e-300]),
+        smoothing: cases.one_of(&[1e-100, 1.0, 1e100]),
     };
     // The initial count of each pair.
-    let start = cases.each(&[0.0, 2f64.powi(24), 2f64.powi(53), 1e299]);
-    let (used, count, pair) = cases.each(&USES);
+    let start = cases.one_of(&[0.0, 2f64.powi(24), 2f64.powi(53), 1e299]);
+    let (use_name, count, draw_pair) = cases.one_of(&USES);
     let exact = ExactAffinity::new(Alphabet::raw(actions)?, settings)?;
     let mut state = serde_json::to_value(AffinityEstimator::Exact(exact))?;
     state["counts"] = vec![start; actions * actions].into();
     let mut estimate: AffinityEstimator = serde_json::from_value(state)?;
     let mut counts = vec![start; actions * actions];
     for _ in 0..8 {
-        let pairs = (0..count).map(|_| pair(actions as u8, &mut cases.rng));
+        let pairs = (0..count).map(|_| draw_pair(actions as u8, &mut cases.rng));
         let pairs: Vec<_> = pairs.collect();
         estimate.observe(&pairs, &mut cases.rng)?;
         estimate.check_valid()?;
@@ -117,30 +117,30 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     }
     let found = estimate.matrix();
     let expected = closed_form(&counts, actions, settings.smoothing);
-    let of_entries = found.iter().zip(expected).map(|(&a, it)| off(a, it));
-    let errors = [worst(of_entries), row_sum_error(&found, actions)];
-    let input = format_args!("{actions} actions, {used}, counts from {start:e}, {settings:?}");
-    cases.see(input, errors)
+    let of_entries = found.iter().zip(expected).map(|(&a, it)| rel_error(a, it));
+    let errors = [max_error(of_entries), row_sum_error(&found, actions)];
+    let input = format_args!("{actions} actions, {use_name}, counts from {start:e}, {settings:?}");
+    cases.record_errors(input, errors)
 }
 
 fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let updates = cases.settings.affinity_updates;
-    let (actions, updates) = cases.each(&[(2u8, updates), (15, updates), (255, updates / 100)]);
+    let (actions, updates) = cases.one_of(&[(2u8, updates), (15, updates), (255, updates / 100)]);
     let alphabet = Alphabet::raw(actions.into())?;
     let learned = LearnedAffinity::new(alphabet, LEARNED, &mut cases.rng)?;
     let mut estimate = AffinityEstimator::Learned(learned);
-    let (used, count, pair) = cases.each(&USES);
+    let (use_name, count, draw_pair) = cases.one_of(&USES);
     for update in 1..=updates {
-        let pairs = (0..count).map(|_| pair(actions, &mut cases.rng));
+        let pairs = (0..count).map(|_| draw_pair(actions, &mut cases.rng));
         let pairs: Vec<_> = pairs.collect();
         estimate.observe(&pairs, &mut cases.rng)?;
         let matrix = estimate.matrix();
         let row_sum = row_sum_error(&matrix, actions.into());
-        let is_last_of_one_pair = update == updates && used == "always the same";
-        let off = |&a: &f32| (f64::from(a) - 1.0 / f64::from(actions)).abs();
-        let uniform = is_last_of_one_pair.then(|| worst(matrix.iter().map(off)));
-        let input = format_args!("{actions} actions, {used}, update {update}");
-        cases.see(input, [Some(row_sum), uniform])?;
+        let is_last_of_one_pair = update == updates && use_name == "always the same";
+        let deviation = |&a: &f32| (f64::from(a) - 1.0 / f64::from(actions)).abs();
+        let uniform = is_last_of_one_pair.then(|| max_error(matrix.iter().map(deviation)));
+        let input = format_args!("{actions} actions, {use_name}, update {update}");
+        cases.record_errors(input, [Some(row_sum), uniform])?;
     }
     Ok(())
 }

@@ -13,8 +13,8 @@ pub(super) fn properties() -> Vec<Property> {
         Property::new("augmentation", RANGE)
             .promise("a byte of a crop", CROP_ERROR)
             .promise("a recoloured byte", COLOUR_ERROR)
-            .on("states and crops of the sizes of worlds", Listed, check)
-            .on(STATES, Drawn(0.5), check),
+            .check("states and crops of the sizes of worlds", Listed, check)
+            .check(STATES, Drawn(0.5), check),
     ]
 }
 
@@ -43,7 +43,7 @@ impl Picture {
         let mut seen = vec![0u8; self.state.len()];
         augment.apply_view(&self.state, view, &mut seen);
         let seen = seen.into_iter().enumerate();
-        worst(seen.map(|(at, found)| (f64::from(found) - expected(at)).abs()))
+        max_error(seen.map(|(at, found)| (f64::from(found) - expected(at)).abs()))
     }
 
     fn crop_error(&self, augment: &Augmenter, view: &View) -> f64 {
@@ -103,7 +103,7 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         (9, 5, 1, 4, 0.6),
         (7, 8, 1, 5, 0.01),
     ];
-    let (height, width, frame_channels, stack, crop_side) = cases.of(&sizes, |rng| {
+    let (height, width, frame_channels, stack, crop_side) = cases.listed_or(&sizes, |rng| {
         let (height, width) = (rng.random_range(1..14), rng.random_range(1..14));
         let (channels, stack) = (one_of(&[1, 3], rng), rng.random_range(1..=4));
         (height, width, channels, stack, rng.random_range(0.01..=1.0))
@@ -144,5 +144,5 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let of_crop = picture.crop_error(&augment, &plain);
     let of_colour = picture.colour_error(&view);
     let input = format_args!("{:?}, crop_side {crop_side}: {view:?}", picture.size);
-    cases.see(input, [of_crop, of_colour])
+    cases.record_errors(input, [of_crop, of_colour])
 }

@@ -21,53 +21,53 @@ pub(super) fn properties() -> Vec<Property> {
             .promise("a probability, as a share of `entry_error`", 1.0)
             .promise("what a row sums to, before and after", MASS_ERROR)
             .promise("rows that hide it, or change others' bits", 0.0)
-            .on(STEPS, Listed, projection)
-            .on("drawn", Drawn(1.0), projection)
-            .on("not a number in one row", Drawn(0.1), projection_of_nan),
+            .check(STEPS, Listed, projection)
+            .check("drawn", Drawn(1.0), projection)
+            .check("not a number in one row", Drawn(0.1), projection_of_nan),
         Property::new("softmax", "logits finite")
             .promise("a probability, as a share of it", ENTRY_ERROR)
-            .on(LOGITS, Listed, softmax)
-            .on("drawn", Drawn(1.0), softmax),
+            .check(LOGITS, Listed, softmax)
+            .check("drawn", Drawn(1.0), softmax),
         Property::new("C51 loss (KL)", "logits finite; targets sum to 1")
             // The error is a share of 10 + sum of target (max logit - logit).
             .promise("the loss, as a share of its terms", KL_ERROR)
             .promise("a slope, as a share of 6.1e-8 of it + 1e-15", 1.0)
             .promise("cases in which the loss is finite all the same", 0.0)
-            .on(LOGITS, Listed, kl)
-            .on("drawn", Drawn(1.0), |cases| {
-                Batch::drawn(&mut cases.rng).see(cases)
+            .check(LOGITS, Listed, kl)
+            .check("drawn", Drawn(1.0), |cases| {
+                Batch::draw(&mut cases.rng).record_errors(cases)
             })
-            .on(GAPS, Drawn(1.0), |cases| {
-                with_gaps(&mut cases.rng).see(cases)
+            .check(GAPS, Drawn(1.0), |cases| {
+                draw_with_gaps(&mut cases.rng).record_errors(cases)
             })
-            .on(SPOILT, Drawn(2.0), kl_of_a_spoilt_atom),
+            .check(SPOILT, Drawn(2.0), kl_of_a_spoilt_atom),
     ]
 }
 
 /// Projects rows `probs` [B, N] with these rewards and discounts [B] on one support.
-fn projected(probs: &[f32], reward: &[f32], discount: &[f32], support: (f32, f32)) -> Vec<f32> {
+fn project_rows(probs: &[f32], reward: &[f32], discount: &[f32], support: (f32, f32)) -> Vec<f32> {
     let mut out = vec![f32::NAN; probs.len()];
     project(probs, reward, discount, support.0, support.1, &mut out);
     out
 }
 
 fn projection(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let atoms = cases.of(&[2, 51, 1001], |rng| rng.random_range(2..120));
-    let support = cases.of(&SUPPORTS, support);
+    let atoms = cases.listed_or(&[2, 51, 1001], |rng| rng.random_range(2..120));
+    let support = cases.listed_or(&SUPPORTS, draw_support);
     let sizes = [0.0, 1e-45, 1e-40, 1.0, 7.3, 1e30, f32::MAX, f32::INFINITY];
     let rewards: Vec<f32> = sizes.iter().flat_map(|&x| [x, -x]).collect();
     let rewards = [rewards, vec![support.0, support.1]].concat();
-    let reward = cases.of(&rewards, |rng| match rng.random_range(0..20) {
+    let reward = cases.listed_or(&rewards, |rng| match rng.random_range(0..20) {
         0 => f32::INFINITY,
         1 => f32::NEG_INFINITY,
-        _ => finite(rng),
+        _ => draw_finite(rng),
     });
     let discounts = [0.0, 1e-45, 1e-40, 0.932, 1.0 - f32::EPSILON / 2.0, 1.0];
-    let discount = cases.of(&discounts, probability);
-    let probs = match cases.of(&["even", "at an end", "any"], |_| "any") {
+    let discount = cases.listed_or(&discounts, draw_probability);
+    let probs = match cases.listed_or(&["even", "at an end", "any"], |_| "any") {
         "even" => vec![1.0 / atoms as f32; atoms],
         "at an end" => one_hot(atoms, atoms - 1),
-        _ => law(atoms, &mut cases.rng),
+        _ => draw_probs(atoms, &mut cases.rng),
     };
 
     // Each moved atom spreads its mass by hat functions: the hat of an atom is 1 there and 0 at its neighbours.
@@ -82,39 +82,39 @@ fn projection(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             *sum += f64::from(p) * (1.0 - (place - j as f64).abs()).max(0.0);
         }
     }
-    let out = projected(&probs, &[reward], &[discount], support);
+    let out = project_rows(&probs, &[reward], &[discount], support);
     let allowed = entry_error(atoms, support.0, support.1);
     let errors = out.iter().zip(hats).map(|(&p, expected)| {
         let error = (f64::from(p) - expected).abs() / allowed;
-        only_if((0.0..=f32::MAX).contains(&p), error)
+        nan_unless((0.0..=f32::MAX).contains(&p), error)
     });
-    let [before, after] = [&probs, &out].map(|law| exact_sum(widened(law)));
-    let errors = [worst(errors), after - before];
+    let [before, after] = [&probs, &out].map(|law| exact_sum(to_f64(law)));
+    let errors = [max_error(errors), after - before];
     let input = format_args!(
         "reward {reward:e}, discount {discount:e}, {atoms} atoms on [{low:e}, {high:e}]"
     );
-    cases.see(input, errors)
+    cases.record_errors(input, errors)
 }
 
 /// Puts a NaN row, which the batch's check would reject, between two good rows. The result must show the NaN in this row alone.
 fn projection_of_nan(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
-    let (atoms, support) = (rng.random_range(2..60), support(rng));
-    let mut probs: Vec<f32> = (0..3).flat_map(|_| law(atoms, rng)).collect();
-    let mut rewards = [(); 3].map(|()| finite(rng));
-    let mut discounts = [(); 3].map(|()| probability(rng));
-    let good = projected(&probs, &rewards, &discounts, support);
+    let (atoms, support) = (rng.random_range(2..60), draw_support(rng));
+    let mut probs: Vec<f32> = (0..3).flat_map(|_| draw_probs(atoms, rng)).collect();
+    let mut rewards = [(); 3].map(|()| draw_finite(rng));
+    let mut discounts = [(); 3].map(|()| draw_probability(rng));
+    let good = project_rows(&probs, &rewards, &discounts, support);
     let name = one_of(&["return", "discount", "probability"], rng);
     match name {
         "return" => rewards[1] = f32::NAN,
         "discount" => discounts[1] = f32::NAN,
         _ => probs[atoms + rng.random_range(0..atoms)] = f32::NAN,
     }
-    let mut bad = projected(&probs, &rewards, &discounts, support);
-    let shows = bad[atoms..2 * atoms].iter().any(|p| p.is_nan());
+    let mut bad = project_rows(&probs, &rewards, &discounts, support);
+    let shows_nan = bad[atoms..2 * atoms].iter().any(|p| p.is_nan());
     bad[atoms..2 * atoms].copy_from_slice(&good[atoms..2 * atoms]);
     let input = format_args!("{name}, {atoms} atoms on {support:?}");
-    cases.keeps(2, input, shows && bits(&good) == bits(&bad))
+    cases.record_kept(2, input, shows_nan && bits(&good) == bits(&bad))
 }
 
 fn one_hot(atoms: usize, at: usize) -> Vec<f32> {
@@ -124,13 +124,13 @@ fn one_hot(atoms: usize, at: usize) -> Vec<f32> {
 }
 
 fn softmax(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let atoms = cases.of(&[2, 51, 1001], |rng| rng.random_range(1..120));
-    let logits = cases.of(&listed(atoms), |rng| finites(atoms, rng));
+    let atoms = cases.listed_or(&[2, 51, 1001], |rng| rng.random_range(1..120));
+    let logits = cases.listed_or(&extremes(atoms), |rng| draw_finites(atoms, rng));
     let mut probs = vec![f32::NAN; logits.len()];
     c51::softmax(&logits, &mut probs);
-    let (expected, ..) = shares(&widened(&logits));
-    let errors = probs.iter().zip(expected).map(|(&p, it)| off(p, it));
-    cases.see(format_args!("{}", Shown(&logits)), [worst(errors)])
+    let (expected, ..) = softmax_f64(&to_f64(&logits));
+    let errors = probs.iter().zip(expected).map(|(&p, it)| rel_error(p, it));
+    cases.record_errors(format_args!("{}", Preview(&logits)), [max_error(errors)])
 }
 
 /// Logits and targets [B, N].
@@ -143,15 +143,15 @@ struct Batch {
 }
 
 impl Batch {
-    fn drawn(rng: &mut ChaCha8Rng) -> Self {
+    fn draw(rng: &mut ChaCha8Rng) -> Self {
         let (rows, atoms) = (rng.random_range(1..4), rng.random_range(2..60));
         Self {
             atoms,
-            logits: finites(rows * atoms, rng),
-            target: (0..rows).flat_map(|_| law(atoms, rng)).collect(),
+            logits: draw_finites(rows * atoms, rng),
+            target: (0..rows).flat_map(|_| draw_probs(atoms, rng)).collect(),
             weights: rng
                 .random::<bool>()
-                .then(|| (0..rows).map(|_| probability(rng)).collect()),
+                .then(|| (0..rows).map(|_| draw_probability(rng)).collect()),
         }
     }
 
@@ -162,40 +162,40 @@ impl Batch {
     }
 
     /// Counts the errors of the loss and of its slopes.
-    fn see(&self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    fn record_errors(&self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let rows = self.logits.len() / self.atoms;
         let (loss, gradient) = self.kl();
         let (mut terms, mut scale, mut slopes) = (Vec::new(), 0.0, Vec::new());
         for row in 0..rows {
             let weight = self.weights.as_ref().map_or(1.0, |it| f64::from(it[row]));
             let row = row * self.atoms..(row + 1) * self.atoms;
-            let [x, t] = [&self.logits, &self.target].map(|all| widened(&all[row.clone()]));
-            let (probs, max, sum) = shares(&x);
+            let [x, t] = [&self.logits, &self.target].map(|all| to_f64(&all[row.clone()]));
+            let (probs, max, sum) = softmax_f64(&x);
             let mass = exact_sum(t.iter().copied());
-            let there = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
+            let positive = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
             // t ln t, t (max - x) and t ln sum are separate terms because their sizes differ.
-            terms.extend(there().map(|(_, t)| weight * t * t.ln()));
-            terms.extend(there().map(|(x, t)| weight * t * (max - x)));
+            terms.extend(positive().map(|(_, t)| weight * t * t.ln()));
+            terms.extend(positive().map(|(x, t)| weight * t * (max - x)));
             terms.push(weight * mass * sum.ln());
-            scale += weight * (10.0 + exact_sum(there().map(|(x, t)| t * (max - x))));
+            scale += weight * (10.0 + exact_sum(positive().map(|(x, t)| t * (max - x))));
             slopes.extend(gradient[row].iter().zip(probs).zip(&t).map(|((g, p), t)| {
                 let expected = (mass * p - t) * weight / rows as f64;
-                let allowed = ENTRY_ERROR * expected.abs().max(LEAST) + SLOPE_ERROR;
+                let allowed = ENTRY_ERROR * expected.abs().max(MIN_NORMAL) + SLOPE_ERROR;
                 (f64::from(*g) - expected).abs() / allowed
             }));
         }
         // The scale is 0 if all weights are 0.
-        let of_loss = (loss * rows as f64 - exact_sum(terms)) / scale.max(LEAST);
-        let input = format_args!("{rows} rows, logits {}", Shown(&self.logits));
-        cases.see(input, [of_loss, worst(slopes)])
+        let of_loss = (loss * rows as f64 - exact_sum(terms)) / scale.max(MIN_NORMAL);
+        let input = format_args!("{rows} rows, logits {}", Preview(&self.logits));
+        cases.record_errors(input, [of_loss, max_error(slopes)])
     }
 }
 
 fn kl(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let atoms = cases.each(&[2, 51, 1001]);
-    let logits = cases.each(&listed(atoms));
-    let target = match cases.each(&["one-hot", "any"]) {
-        "any" => law(atoms, &mut cases.rng),
+    let atoms = cases.one_of(&[2, 51, 1001]);
+    let logits = cases.one_of(&extremes(atoms));
+    let target = match cases.one_of(&["one-hot", "any"]) {
+        "any" => draw_probs(atoms, &mut cases.rng),
         _ => one_hot(atoms, atoms / 2),
     };
     let batch = Batch {
@@ -204,12 +204,12 @@ fn kl(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         target,
         weights: None,
     };
-    batch.see(cases)
+    batch.record_errors(cases)
 }
 
 /// Draws a batch in which some atoms of the first row have probability 0 in logits and target. The first atom never has 0.
-fn with_gaps(rng: &mut ChaCha8Rng) -> Batch {
-    let mut batch = Batch::drawn(rng);
+fn draw_with_gaps(rng: &mut ChaCha8Rng) -> Batch {
+    let mut batch = Batch::draw(rng);
     batch.target[0] = 0.5;
     let gap = rng.random_range(1..batch.atoms);
     for i in 1..batch.atoms {
@@ -223,17 +223,17 @@ fn with_gaps(rng: &mut ChaCha8Rng) -> Batch {
 /// Checks that the loss shows a value that is not finite at one atom, whether its target is 0 or not.
 fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
-    let mut batch = with_gaps(rng);
+    let mut batch = draw_with_gaps(rng);
     let kind = rng.random_range(0..6);
     // Kinds 3 and above spare the first atom, which may be the only one left with a probability.
     let at = rng.random_range(usize::from(kind >= 3)..batch.atoms);
     (batch.logits[at], batch.target[at]) = match kind {
-        0..3 => (not_finite(rng), 1.0 / batch.atoms as f32),
+        0..3 => (draw_nonfinite(rng), 1.0 / batch.atoms as f32),
         3 => (f32::INFINITY, 0.0),
         4 => (f32::NAN, 0.0),
         _ => (batch.logits[at], f32::NAN),
     };
     let (logit, target) = (batch.logits[at], batch.target[at]);
     let input = format_args!("logit {logit} under {target} at {at} of {}", batch.atoms);
-    cases.keeps(2, input, !batch.kl().0.is_finite())
+    cases.record_kept(2, input, !batch.kl().0.is_finite())
 }

@@ -10,13 +10,13 @@ pub(super) fn properties() -> Vec<Property> {
     vec![
         Property::new("epsilon", "any counts of frames; start and end 0 to 1")
             .promise("epsilon; never back or beyond its ends", Schedule::ERROR)
-            .on(FRAMES, Listed, epsilon)
-            .on("drawn", Drawn(1.0), epsilon),
+            .check(FRAMES, Listed, epsilon)
+            .check("drawn", Drawn(1.0), epsilon),
     ]
 }
 
 /// Draws a number of any size.
-fn count(rng: &mut ChaCha8Rng) -> u64 {
+fn draw_count(rng: &mut ChaCha8Rng) -> u64 {
     rng.random::<u64>() >> rng.random_range(0..64)
 }
 
@@ -28,13 +28,13 @@ fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         (0.05, 0.05),
         (0.0, 1.0),
     ];
-    let (start, end) = cases.of(&ends, |rng| (rng.random(), rng.random()));
+    let (start, end) = cases.listed_or(&ends, |rng| (rng.random(), rng.random()));
     let decays = [0, 1, 100_000, 10_000_000_000, 1 << 32, 1 << 53, u64::MAX];
-    let decay_frames = cases.of(&decays, count);
+    let decay_frames = cases.listed_or(&decays, draw_count);
     let hundredths = (0..=100u32).map(|i| (u128::from(decay_frames) * u128::from(i) / 100) as u64);
-    let beside = hundredths.flat_map(|at| [at.saturating_sub(1), at, at.saturating_add(1)]);
-    let listed: Vec<u64> = beside.chain([u64::MAX]).collect();
-    let mut frames = cases.of(&[listed], |rng| (0..4).map(|_| count(rng)).collect());
+    let neighbours = hundredths.flat_map(|at| [at.saturating_sub(1), at, at.saturating_add(1)]);
+    let listed: Vec<u64> = neighbours.chain([u64::MAX]).collect();
+    let mut frames = cases.listed_or(&[listed], |rng| (0..4).map(|_| draw_count(rng)).collect());
     frames.sort_unstable();
     let schedule = Schedule::Linear {
         start,
@@ -50,9 +50,9 @@ fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             false => ((u128::from(frames) << 64) / u128::from(decay_frames)) as f64 / 2f64.powi(64),
         };
         let is_between = (before.min(end)..=before.max(end)).contains(&found);
-        let error = only_if(is_between, found - (start + (end - start) * share));
+        let error = nan_unless(is_between, found - (start + (end - start) * share));
         let input = format_args!("{start} to {end} over {decay_frames}, after {frames}: {found}");
-        cases.see(input, [error])?;
+        cases.record_errors(input, [error])?;
         before = found;
     }
     Ok(())

@@ -24,20 +24,20 @@ pub(super) fn properties() -> Vec<Property> {
         Property::new("gradient norm", "gradients finite")
             .promise("the norm, as a share of it", NORM_ERROR)
             .promise("cases not refused by the parameter's name", 0.0)
-            .on(NORMS, Listed, norm)
-            .on("drawn", Drawn(0.05), norm)
-            .on("one is infinite or not a number", Drawn(0.05), norm_of_none),
+            .check(NORMS, Listed, norm)
+            .check("drawn", Drawn(0.05), norm)
+            .check("one is infinite or not a number", Drawn(0.05), bad_gradient),
         Property::new("clipping", limits)
             .promise("share by which a norm is above the limit", 6.1e-8)
-            .on("norms 0 to 3.4e38, limits 1e-6 to 1e15", Listed, clipping)
-            .on("drawn, half of them near the limit", Drawn(10.0), clipping),
+            .check("norms 0 to 3.4e38, limits 1e-6 to 1e15", Listed, clipping)
+            .check("drawn, half of them near the limit", Drawn(10.0), clipping),
         Property::new("target network", "tau 1e-5 to 1; parameters within 1.7e38")
             // The error is relative to the largest value that the parameter had in either network.
             .promise("a parameter, as a share of `follow_error`", 1.0)
             .promise("copies of other bits", 0.0)
-            .on(MOVES, Listed, followed)
-            .on(A_FEW_MOVES, Drawn(0.02), followed)
-            .on("tau 1, drawn", Drawn(0.02), copied),
+            .check(MOVES, Listed, check_follow)
+            .check(A_FEW_MOVES, Drawn(0.02), check_follow)
+            .check("tau 1, drawn", Drawn(0.02), check_copy),
     ]
 }
 
@@ -55,10 +55,10 @@ fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> 
 }
 
 fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let sizes = cases.of(&[(2, 1), (512, 256)], |_| (17, 13));
+    let sizes = cases.listed_or(&[(2, 1), (512, 256)], |_| (17, 13));
     let config = small::config(sizes.0, sizes.1, (-1.0, 1.0));
     let len = small::scalar_count(&config);
-    let values = cases.of(&listed(len), |rng| finites(len, rng));
+    let values = cases.listed_or(&extremes(len), |rng| draw_finites(len, rng));
     let norm = gradients(&config, &values)?.norm(Kernels::FUSED)?;
     // The reference is the largest |value| times the norm of all values divided by it.
     let largest = f64::from(values.iter().fold(0.0f32, |most, x| most.max(x.abs())));
@@ -67,27 +67,27 @@ fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         0.0 => norm,
         _ => norm / (largest * exact_sum(squares).sqrt()) - 1.0,
     };
-    cases.see(format_args!("{}", Shown(&values)), [error])
+    cases.record_errors(format_args!("{}", Preview(&values)), [error])
 }
 
-fn norm_of_none(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn bad_gradient(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let config = small::config(17, 13, (-1.0, 1.0));
-    let mut values = finites(small::scalar_count(&config), &mut cases.rng);
+    let mut values = draw_finites(small::scalar_count(&config), &mut cases.rng);
     let at = cases.rng.random_range(0..values.len());
-    values[at] = not_finite(&mut cases.rng);
-    let said = gradients(&config, &values)?.norm(Kernels::FUSED);
-    let said = said.map_or_else(|e| e.to_string(), |norm| format!("a norm of {norm}"));
-    let by_name = said.starts_with("the gradient of ") && said.contains(" is not finite");
-    cases.keeps(1, format_args!("{said}"), by_name)
+    values[at] = draw_nonfinite(&mut cases.rng);
+    let text = gradients(&config, &values)?.norm(Kernels::FUSED);
+    let text = text.map_or_else(|e| e.to_string(), |norm| format!("a norm of {norm}"));
+    let is_named = text.starts_with("the gradient of ") && text.contains(" is not finite");
+    cases.record_kept(1, format_args!("{text}"), is_named)
 }
 
 fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let limits = [1e-6, 1e-3, 1.0, 10.0, 1e15];
-    let limit: f64 = cases.of(&limits, |rng| 10f64.powf(rng.random_range(-6.0..=15.0)));
+    let limit: f64 = cases.listed_or(&limits, |rng| 10f64.powf(rng.random_range(-6.0..=15.0)));
     let norms = [
         0.0, 1e-45, 1e-7, 1e-6, 1e-5, 1.0, 9.999, 10.0, 10.001, 1e15, 1e30, 3.4e38,
     ];
-    let norm = cases.of(&norms, |rng| match rng.random_bool(0.5) {
+    let norm = cases.listed_or(&norms, |rng| match rng.random_bool(0.5) {
         true => 10f64.powf(rng.random_range(-45.0..=38.6)),
         false => limit * (1.0 + rng.random_range(-1e-6..1e-6)),
     });
@@ -95,58 +95,58 @@ fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         // The optimiser step uses the factor as f32.
         let factor = f64::from(clip_factor(norm, limit) as f32);
         let is_right = factor == 1.0 || (norm + 1e-6 > limit && (0.0..1.0).contains(&factor));
-        let error = only_if(is_right, (factor * norm / limit - 1.0).max(0.0));
-        cases.see(format_args!("norm {norm:e}, limit {limit:e}"), [error])?;
+        let error = nan_unless(is_right, (factor * norm / limit - 1.0).max(0.0));
+        cases.record_errors(format_args!("norm {norm:e}, limit {limit:e}"), [error])?;
     }
     Ok(())
 }
 
 /// Checks a target network of the smallest kind that follows one online network after the other.
-fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn check_follow(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let start = vec![-0.4, -1.1, 0.6, 2.6, 0.0, 1e-45, -1e30, 1.0];
-    let start = cases.of(&[start], |rng| clamped(10, FOLLOWED_MAX, rng));
+    let start = cases.listed_or(&[start], |rng| draw_clamped(10, FOLLOWED_MAX, rng));
     let taus = [0.95, 0.5, 0.005, 1e-3, 1e-4, 1e-5];
-    let tau: f64 = cases.of(&taus, |rng| 10f64.powf(rng.random_range(-5.0..0.0)));
+    let tau: f64 = cases.listed_or(&taus, |rng| 10f64.powf(rng.random_range(-5.0..0.0)));
     // Each entry has the number of moves, and the online network that the target moves towards.
     let end = vec![0.7, -1.3, 0.011, 2.5, 1e-38, 1e-40, 1e30, -1.0];
-    let ways: Vec<(u64, Vec<f32>)> = cases.of(&[vec![((3.0 / tau) as u64, end)]], |rng| {
+    let stages: Vec<(u64, Vec<f32>)> = cases.listed_or(&[vec![((3.0 / tau) as u64, end)]], |rng| {
         let count = rng.random_range(1..8);
-        let way = |_| (rng.random_range(1..5), clamped(10, FOLLOWED_MAX, rng));
-        (0..count).map(way).collect()
+        let draw_stage = |_| (rng.random_range(1..5), draw_clamped(10, FOLLOWED_MAX, rng));
+        (0..count).map(draw_stage).collect()
     });
     let target = small::parameters(&small::minimal_config(), &start)?;
     // Each parameter in f64, and the largest absolute value that it had in either network.
-    let mut exact: Vec<_> = widened(&start).iter().map(|&x| (x, x.abs())).collect();
-    for (moves, online) in &ways {
+    let mut exact: Vec<_> = to_f64(&start).iter().map(|&x| (x, x.abs())).collect();
+    for (moves, online) in &stages {
         let source = small::parameters(&small::minimal_config(), online)?;
         for _ in 0..*moves {
             follow(&target, &source, tau, Kernels::FUSED)?;
         }
         // All moves at once: the remaining share of the distance is (1 - tau)^moves.
-        let left = (*moves as f64 * (-tau).ln_1p()).exp();
-        for ((exact, largest), online) in exact.iter_mut().zip(widened(online)) {
-            *exact = online + left * (*exact - online);
+        let share_left = (*moves as f64 * (-tau).ln_1p()).exp();
+        for ((exact, largest), online) in exact.iter_mut().zip(to_f64(online)) {
+            *exact = online + share_left * (*exact - online);
             *largest = largest.max(online.abs());
         }
     }
-    let found = widened(&small::scalars(&small::minimal_config(), &target)?);
+    let found = to_f64(&small::scalars(&small::minimal_config(), &target)?);
     let errors = found.iter().zip(exact).map(|(found, (exact, largest))| {
-        (found - exact).abs() / largest.max(LEAST) / follow_error(tau)
+        (found - exact).abs() / largest.max(MIN_NORMAL) / follow_error(tau)
     });
-    let moves: u64 = ways.iter().map(|(moves, _)| moves).sum();
-    let input = format_args!("tau {tau:e}, {moves} moves, from {}", Shown(&start));
-    cases.see(input, [worst(errors)])
+    let moves: u64 = stages.iter().map(|(moves, _)| moves).sum();
+    let input = format_args!("tau {tau:e}, {moves} moves, from {}", Preview(&start));
+    cases.record_errors(input, [max_error(errors)])
 }
 
-fn copied(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn check_copy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let config = small::minimal_config();
-    let target = small::parameters(&config, &finites(10, &mut cases.rng))?;
-    let online = finites(8, &mut cases.rng);
+    let target = small::parameters(&config, &draw_finites(10, &mut cases.rng))?;
+    let online = draw_finites(8, &mut cases.rng);
     let source = small::parameters(&config, &online)?;
     follow(&target, &source, 1.0, Kernels::FUSED)?;
     for (found, online) in small::scalars(&config, &target)?.iter().zip(&online) {
         let is_copied = found.to_bits() == online.to_bits();
-        cases.keeps(1, format_args!("{online:e}"), is_copied)?;
+        cases.record_kept(1, format_args!("{online:e}"), is_copied)?;
     }
     Ok(())
 }

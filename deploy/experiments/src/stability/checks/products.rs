@@ -17,7 +17,7 @@ const SPOILT: &str = "one operand infinite or not a number, before and after ReL
 const BEYOND: &str = "products beyond 3.4e38, all of one sign";
 
 const EXTREMES: [(&str, Inputs, Check); 6] = [
-    (SIZES, Listed, dense_of_sizes),
+    (SIZES, Listed, dense_by_size),
     (DRAWN, Drawn(0.02), dense),
     (MAPS, Drawn(0.02), convolution),
     (PROCGEN, Listed, layers_of_procgen),
@@ -36,7 +36,7 @@ pub(super) fn properties() -> Vec<Property> {
     let properties = properties.into_iter().map(|(precision, mut property)| {
         property = property.promise(PRODUCT, 1.0).promise(HIDDEN, 0.0);
         for (extreme, inputs, check) in EXTREMES {
-            property = property.on(extreme, inputs, move |cases| check(cases, precision));
+            property = property.check(extreme, inputs, move |cases| check(cases, precision));
         }
         property
     });
@@ -46,13 +46,13 @@ pub(super) fn properties() -> Vec<Property> {
 /// The layers of Procgen's network and of DIM's heads.
 const LAYERS: [Layer; 6] = [
     // From the feature maps to the hidden layer, from there to the atoms of 15 actions, and from each map location to a DIM embedding.
-    Layer::of([256, 1024, 512], [0; 3]),
-    Layer::of([256, 512, 765], [0; 3]),
-    Layer::of([4096, 64, 512], [0; 3]),
+    Layer::new([256, 1024, 512], [0; 3]),
+    Layer::new([256, 512, 765], [0; 3]),
+    Layer::new([4096, 64, 512], [0; 3]),
     // Convolutions, without the border that the first does not read.
-    Layer::of([32, 3, 32], [60, 8, 4]),
-    Layer::of([32, 32, 64], [14, 4, 2]),
-    Layer::of([32, 64, 64], [6, 3, 1]),
+    Layer::new([32, 3, 32], [60, 8, 4]),
+    Layer::new([32, 32, 64], [14, 4, 2]),
+    Layer::new([32, 64, 64], [6, 3, 1]),
 ];
 
 /// A fully connected layer if `kernel` is 0, else a convolution with ReLU of images [B, side, side, inputs].
@@ -73,7 +73,7 @@ type Operands = [Tensor; 4];
 type Draw<'a> = &'a mut dyn FnMut(usize, &mut ChaCha8Rng) -> Vec<f32>;
 
 impl Layer {
-    const fn of([rows, inputs, outputs]: [usize; 3], [side, kernel, stride]: [usize; 3]) -> Self {
+    const fn new([rows, inputs, outputs]: [usize; 3], [side, kernel, stride]: [usize; 3]) -> Self {
         Self {
             rows,
             inputs,
@@ -84,9 +84,9 @@ impl Layer {
         }
     }
 
-    fn drawn_dense(rng: &mut ChaCha8Rng) -> Self {
+    fn draw_dense(rng: &mut ChaCha8Rng) -> Self {
         let sizes = [40, 200, 40].map(|most| rng.random_range(1..most));
-        Self::of(sizes, [0; 3])
+        Self::new(sizes, [0; 3])
     }
 
     const fn is_convolution(&self) -> bool {
@@ -124,16 +124,16 @@ impl Layer {
 
     /// Returns the worst error of results and gradients, as a share of the promised bound.
     fn error(&self, operands: &Operands, precision: Precision) -> anyhow::Result<f64> {
-        let found = traced(operands, |[x, w, b]| match self.is_convolution() {
+        let found = backprop(operands, |[x, w, b]| match self.is_convolution() {
             false => linear(x, w, b, precision),
             true => conv2d_relu(x, w, b, self.stride, precision),
         })?;
-        let with_bytes = operands[0].dtype() == DType::U8;
+        let has_bytes = operands[0].dtype() == DType::U8;
         let mut exact = operands.clone();
         for tensor in &mut exact {
             *tensor = tensor.to_dtype(DType::F64)?;
         }
-        if with_bytes {
+        if has_bytes {
             exact[0] = (&exact[0] * (1.0 / 255.0))?;
         }
         if self.is_convolution() {
@@ -141,7 +141,7 @@ impl Layer {
             let y = Tensor::from_slice(&found[0], exact[3].shape(), &Device::Cpu)?;
             exact[3] = (&exact[3] * y.gt(0.0)?.to_dtype(DType::F64)?)?;
         }
-        let traced = |operands: &Operands| traced(operands, |vars| self.exact(vars));
+        let backprop = |operands: &Operands| backprop(operands, |vars| self.exact(vars));
         let [mut sizes, mut ones, mut sums] = [(); 3].map(|()| exact.clone());
         for (at, tensor) in exact.iter().enumerate() {
             sizes[at] = tensor.abs()?;
@@ -150,17 +150,17 @@ impl Layer {
         }
         // Biases are not part of a product.
         (ones[2], sums[2]) = (exact[2].zeros_like()?, sizes[2].clone());
-        let [exact, sizes] = [traced(&exact)?, traced(&sizes)?];
-        let [terms, sums] = [traced(&ones)?, traced(&sums)?];
+        let [exact, sizes] = [backprop(&exact)?, backprop(&sizes)?];
+        let [terms, sums] = [backprop(&ones)?, backprop(&sums)?];
         let mut errors = Vec::new();
-        for of in 0..4 {
+        for part in 0..4 {
             // The gradient of a bias is a sum without products, computed in f32 in either precision.
-            let precision = if of == 3 { Precision::F32 } else { precision };
+            let precision = if part == 3 { Precision::F32 } else { precision };
             // A byte / 255 is rounded twice.
-            let roundings = if with_bytes && of != 3 { 2.0 } else { 0.0 };
-            for (at, &found) in found[of].iter().enumerate() {
-                let (mut exact, size, terms) = (exact[of][at], sizes[of][at], terms[of][at]);
-                if of == 0 && self.is_convolution() {
+            let roundings = if has_bytes && part != 3 { 2.0 } else { 0.0 };
+            for (at, &found) in found[part].iter().enumerate() {
+                let (mut exact, size, terms) = (exact[part][at], sizes[part][at], terms[part][at]);
+                if part == 0 && self.is_convolution() {
                     exact = exact.max(0.0);
                 }
                 let error = (found - exact).abs();
@@ -169,17 +169,17 @@ impl Layer {
                     continue;
                 }
                 // The promise holds for the largest operand. The mean is stricter, and follows from (1 + a) (1 + b) = 1 + a + b + a b.
-                let mean = (sums[of][at] - size - terms) / (2.0 * terms);
+                let mean = (sums[part][at] - size - terms) / (2.0 * terms);
                 let terms = (terms + roundings) as usize;
                 let allowed = precision.product_error(terms) * size;
                 errors.push(error / (allowed + precision.product_floor(terms, mean)));
             }
         }
-        Ok(worst(errors))
+        Ok(max_error(errors))
     }
 
     /// Counts the errors on drawn operands, and for a convolution also on inputs of bytes.
-    fn see(
+    fn record_errors(
         &self,
         cases: &mut Cases<'_>,
         precision: Precision,
@@ -190,8 +190,8 @@ impl Layer {
             let error = self.error(&operands, precision)?;
             let [x, w, ..] = &operands;
             let w = w.flatten_all()?.to_vec1()?;
-            let input = format_args!("{self:?}, {:?}, w {}", x.dtype(), Shown(&w));
-            cases.see(input, [error])?;
+            let input = format_args!("{self:?}, {:?}, w {}", x.dtype(), Preview(&w));
+            cases.record_errors(input, [error])?;
             if !self.is_convolution() || x.dtype() == DType::U8 {
                 return Ok(());
             }
@@ -202,7 +202,7 @@ impl Layer {
 }
 
 /// Returns results and the gradients of inputs, weights and biases, flattened. Inputs of bytes have no gradient.
-fn traced(
+fn backprop(
     [x, w, b, g]: &Operands,
     layer: impl Fn(&[Var; 3]) -> candle_core::Result<Tensor>,
 ) -> anyhow::Result<[Vec<f64>; 4]> {
@@ -214,33 +214,33 @@ fn traced(
     ];
     let y = layer(&vars)?;
     let gradients = (&y * g)?.sum_all()?.backward()?;
-    let of = |var: &Var| match gradients.get(var) {
+    let grad = |var: &Var| match gradients.get(var) {
         Some(gradient) => Ok(flat(gradient)?),
         None if var.dtype() == DType::U8 => Ok(Vec::new()),
         None => anyhow::bail!("a layer without a gradient"),
     };
-    Ok([flat(&y)?, of(&vars[0])?, of(&vars[1])?, of(&vars[2])?])
+    Ok([flat(&y)?, grad(&vars[0])?, grad(&vars[1])?, grad(&vars[2])?])
 }
 
-fn usual(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+fn uniform(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
 }
 
 /// Operands of at most this size have finite sums of products.
 const MODERATE: f32 = 1e17;
 
-fn moderate(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
-    clamped(count, MODERATE, rng)
+fn draw_moderate(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    draw_clamped(count, MODERATE, rng)
 }
 
-fn dense_of_sizes(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
-    let size = cases.each(&[0.0, 1e-45, 1e-40, 1e-38, 1e-20, 1.0, 1e17]);
-    let other = cases.each(&[1e-40f32, 1e-20, 1.0, 1e17]);
-    let layer = Layer::drawn_dense(&mut cases.rng);
+fn dense_by_size(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+    let size = cases.one_of(&[0.0, 1e-45, 1e-40, 1e-38, 1e-20, 1.0, 1e17]);
+    let other = cases.one_of(&[1e-40f32, 1e-20, 1.0, 1e17]);
+    let layer = Layer::draw_dense(&mut cases.rng);
     let mut sizes = [other, size].into_iter().cycle();
-    layer.see(cases, precision, &mut |count, rng| {
+    layer.record_errors(cases, precision, &mut |count, rng| {
         let size = sizes.next().unwrap_or(size);
-        usual(count, rng).into_iter().map(|x| x * size).collect()
+        uniform(count, rng).into_iter().map(|x| x * size).collect()
     })
 }
 
@@ -250,10 +250,10 @@ fn dense(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
         // A larger operand would round to infinity.
         Precision::Bf16 => 3.38e38,
     };
-    let layer = Layer::drawn_dense(&mut cases.rng);
-    layer.see(cases, precision, &mut |count, rng| {
+    let layer = Layer::draw_dense(&mut cases.rng);
+    layer.record_errors(cases, precision, &mut |count, rng| {
         let is_moderate = rng.random_bool(0.7);
-        clamped(count, if is_moderate { MODERATE } else { most }, rng)
+        draw_clamped(count, if is_moderate { MODERATE } else { most }, rng)
     })
 }
 
@@ -262,42 +262,42 @@ fn convolution(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()
     let kernel = rng.random_range(1..5);
     let sizes = [3, rng.random_range(1..6), rng.random_range(1..20)];
     let side = kernel + rng.random_range(0..6);
-    let layer = Layer::of(sizes, [side, kernel, rng.random_range(1..4)]);
-    layer.see(cases, precision, &mut { moderate })
+    let layer = Layer::new(sizes, [side, kernel, rng.random_range(1..4)]);
+    layer.record_errors(cases, precision, &mut { draw_moderate })
 }
 
 fn layers_of_procgen(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
-    let layer = cases.each(&LAYERS);
-    let mut draw = cases.each(&[usual as fn(_, &mut _) -> _, moderate]);
-    layer.see(cases, precision, &mut draw)
+    let layer = cases.one_of(&LAYERS);
+    let mut draw = cases.one_of(&[uniform as fn(_, &mut _) -> _, draw_moderate]);
+    layer.record_errors(cases, precision, &mut draw)
 }
 
 fn infinite(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let inputs = cases.rng.random_range(1..200);
-    let large = finite(&mut cases.rng).abs().clamp(1e20, 1e38);
+    let large = draw_finite(&mut cases.rng).abs().clamp(1e20, 1e38);
     let line = |x: f32| Tensor::full(x, (1, inputs), &Device::Cpu);
     let bias = Tensor::zeros(1, DType::F32, &Device::Cpu)?;
     let y = linear(&line(large)?, &line(1e20)?, &bias, precision)?;
     let y = y.flatten_all()?.to_vec1::<f32>()?[0];
     let input = format_args!("{inputs} times {large:e} times 1e20: {y:e}");
-    cases.keeps(1, input, !y.is_finite())
+    cases.record_kept(1, input, !y.is_finite())
 }
 
 /// Checks that an infinity or NaN in a row shows in the results of this row, and changes no other row and no later call.
 fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
-    let mut layer = Layer::drawn_dense(rng);
+    let mut layer = Layer::draw_dense(rng);
     layer.rows += 1;
     let [clean, w, b, _] = layer.operands(
         &mut |count, rng| (0..count).map(|_| rng.random_range(0.1..1.0)).collect(),
         rng,
     )?;
-    let (bad, at) = (not_finite(rng), rng.random_range(0..clean.elem_count()));
+    let (bad, at) = (draw_nonfinite(rng), rng.random_range(0..clean.elem_count()));
     let mut x = clean.flatten_all()?.to_vec1::<f32>()?;
     x[at] = bad;
     let spoilt = Tensor::from_vec(x, clean.shape(), &Device::Cpu)?;
     let first = at / layer.inputs * layer.outputs;
-    let own = first..first + layer.outputs;
+    let own_outputs = first..first + layer.outputs;
     for with_relu in [false, true] {
         let results = |x: &Tensor| -> anyhow::Result<Vec<f32>> {
             let y = linear(x, &w, &b, precision)?.flatten_all()?;
@@ -307,10 +307,10 @@ fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
         let (before, mut spoilt, after) = (results(&clean)?, results(&spoilt)?, results(&clean)?);
         // ReLU may hide -inf, because max(0, -inf) is 0.
         let may_hide = with_relu && bad == f32::NEG_INFINITY;
-        let shows = may_hide || !spoilt[own.clone()].iter().any(|y| y.is_finite());
-        spoilt[own.clone()].copy_from_slice(&before[own.clone()]);
+        let shows = may_hide || !spoilt[own_outputs.clone()].iter().any(|y| y.is_finite());
+        spoilt[own_outputs.clone()].copy_from_slice(&before[own_outputs.clone()]);
         let kept = [spoilt, after].iter().all(|it| bits(it) == bits(&before));
-        cases.keeps(1, format_args!("{bad} at {at} of {layer:?}"), shows && kept)?;
+        cases.record_kept(1, format_args!("{bad} at {at} of {layer:?}"), shows && kept)?;
     }
     Ok(())
 }

@@ -15,13 +15,13 @@ pub(super) fn properties() -> Vec<Property> {
         Property::new("n-step return", terms)
             // The bound of a return is 6.1e-8 of it + 2.2e-16 n of the sum of its terms' sizes. A return is never infinite.
             .promise("return or discount, as a share of its bound", 1.0)
-            .on(REWARDS, Listed, returns)
-            .on("drawn", Drawn(0.1), returns),
+            .check(REWARDS, Listed, returns)
+            .check("drawn", Drawn(0.1), returns),
     ]
 }
 
 /// Returns the spec of a world in which each frame holds the number of its step.
-pub(super) fn spec() -> RunSpec {
+pub(super) fn numbered_spec() -> RunSpec {
     RunSpec {
         frame_width: 4,
         ..RunSpec::smallest()
@@ -29,7 +29,7 @@ pub(super) fn spec() -> RunSpec {
 }
 
 /// Creates a replay with these steps of actor 0, in which neither the actors nor the learner wait.
-pub(super) fn replay(
+pub(super) fn new_replay(
     spec: &RunSpec,
     sampling: Sampling,
     rows: u32,
@@ -64,12 +64,12 @@ pub(super) fn replay(
 }
 
 /// Returns the step number that a state [1, 4, 1] holds.
-pub(super) fn number(state: &[u8]) -> usize {
+pub(super) fn step_number(state: &[u8]) -> usize {
     u32::from_le_bytes([state[0], state[1], state[2], state[3]]) as usize
 }
 
 /// Returns the n-step return at the first of these steps, the sum of the sizes of its terms, and its discount.
-fn expected(spec: &RunSpec, steps: &[(f32, End)]) -> (f64, f64, f64) {
+fn expected_return(spec: &RunSpec, steps: &[(f32, End)]) -> (f64, f64, f64) {
     let n = spec.n_step as usize;
     let (mut terms, mut follows) = (Vec::new(), Some(n));
     for (i, (reward, end)) in steps.iter().take(n).enumerate() {
@@ -90,28 +90,28 @@ fn expected(spec: &RunSpec, steps: &[(f32, End)]) -> (f64, f64, f64) {
 }
 
 fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let n = cases.of(&[1usize, 7, 1000], |rng| rng.random_range(1..60));
+    let n = cases.listed_or(&[1usize, 7, 1000], |rng| rng.random_range(1..60));
     let gammas = [0.0, 1e-320, 0.5, 0.99, 1.0 - 1e-12, 1.0];
-    let gamma = cases.of(&gammas, |rng| match rng.random_range(0..3) {
+    let gamma = cases.listed_or(&gammas, |rng| match rng.random_range(0..3) {
         0 => rng.random(),
-        1 => f64::from(finite(rng)).abs().min(1.0),
+        1 => f64::from(draw_finite(rng)).abs().min(1.0),
         _ => one_of(&gammas, rng),
     });
-    let timeout = cases.each(&[TimeoutRule::Terminal, TimeoutRule::Bootstrap]);
-    let count = cases.of(&[2 * n + 40], |rng| n + rng.random_range(17..60));
-    let likely = cases.of(&[0.5 / n as f64], |rng| rng.random_range(0.0..0.2));
-    let most = f32::MAX / n as f32;
+    let timeout = cases.one_of(&[TimeoutRule::Terminal, TimeoutRule::Bootstrap]);
+    let count = cases.listed_or(&[2 * n + 40], |rng| n + rng.random_range(17..60));
+    let end_chance = cases.listed_or(&[0.5 / n as f64], |rng| rng.random_range(0.0..0.2));
+    let reward_max = f32::MAX / n as f32;
     let patterns = [
         vec![0.0],
         vec![1e-45],
         vec![1e30, 1.0, -1e30],
-        vec![most],
-        vec![-most, most],
+        vec![reward_max],
+        vec![-reward_max, reward_max],
     ];
     let repeated = patterns.map(|it| it.into_iter().cycle().take(count).collect());
-    let rewards: Vec<f32> = cases.of(&repeated, |rng| clamped(count, most, rng));
+    let rewards: Vec<f32> = cases.listed_or(&repeated, |rng| draw_clamped(count, reward_max, rng));
     let ends = [End::Terminal, End::TimedOut, End::LevelChange];
-    let end = |_| match cases.rng.random_bool(likely) {
+    let end = |_| match cases.rng.random_bool(end_chance) {
         true => one_of(&ends, &mut cases.rng),
         false => End::Running,
     };
@@ -122,9 +122,9 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         n_step: n as u32,
         gamma,
         timeout,
-        ..spec()
+        ..numbered_spec()
     };
-    let mut replay = replay(&spec, Sampling::default(), rows, &steps)?;
+    let mut replay = new_replay(&spec, Sampling::default(), rows, &steps)?;
     // If no row is complete, the replay has nothing to sample.
     let Ok(batch) = replay.sample(rows) else {
         return Ok(());
@@ -132,13 +132,13 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = batch.n_step_returns().into_iter();
     let found = found.zip(batch.bootstrap_discounts());
     for (state, (found, discount)) in batch.states_t().chunks_exact(4).zip(found) {
-        let t = number(state);
-        let (expected, sizes, expected_discount) = expected(&spec, &steps[t..]);
-        let allowed = RETURN_ERROR * expected.abs().max(LEAST) + return_sum_error(n) * sizes;
+        let t = step_number(state);
+        let (expected, sizes, expected_discount) = expected_return(&spec, &steps[t..]);
+        let allowed = RETURN_ERROR * expected.abs().max(MIN_NORMAL) + return_sum_error(n) * sizes;
         let of_return = (f64::from(found) - expected).abs() / allowed;
-        let of_discount = off(discount, expected_discount) / RETURN_ERROR;
+        let of_discount = rel_error(discount, expected_discount) / RETURN_ERROR;
         let input = format_args!("n = {n}, gamma = {gamma:e}, the row at {t}: {found:e}");
-        cases.see(input, [of_return.max(of_discount)])?;
+        cases.record_errors(input, [of_return.max(of_discount)])?;
     }
     Ok(())
 }

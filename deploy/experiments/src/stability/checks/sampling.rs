@@ -12,7 +12,7 @@ use driml_replay_server::{
 };
 use rand::RngCore;
 
-use super::replay::{number, replay, spec};
+use super::replay::{new_replay, numbered_spec, step_number};
 use crate::stability::property::*;
 
 /// The limit of the chi-square test in standard deviations. A correct sampler exceeds it once in two million tests.
@@ -32,17 +32,17 @@ pub(super) fn properties() -> Vec<Property> {
         Property::new("k by NHG", "A 0 to 1; k_max 1 to 1,000")
             .promise("the probability of a step, beside A", CONTINUE_ERROR)
             .promise("chi-square of k, in deviations", DEVIATIONS)
-            .on(EVERY, Listed, probability_of_a_step)
-            .on(WALKS, Listed, law_of_k),
+            .check(EVERY, Listed, probability_of_a_step)
+            .check(WALKS, Listed, distribution_of_k),
         Property::new("prioritised draw", priorities)
             .promise("a row's chance, as a share of it", PROBABILITY_ERROR)
             .promise("chi-square of the draws, in deviations", DEVIATIONS)
-            .on(PRIORITIES, Listed, prioritised)
-            .on("drawn", Drawn(0.01), prioritised),
+            .check(PRIORITIES, Listed, prioritised)
+            .check("drawn", Drawn(0.01), prioritised),
         Property::new("importance weight", "chances 1.2e-38 to 1; beta 0 to 1")
             // The weight of the least likely row is exactly 1.
             .promise("a weight, as a share of it", WEIGHT_ERROR)
-            .on(CHANCES, Drawn(1.0), weights),
+            .check(CHANCES, Drawn(1.0), weights),
     ]
 }
 
@@ -64,7 +64,7 @@ impl RngCore for EveryFloat {
     }
 }
 
-fn affinity(num_actions: u32, matrix: Vec<f32>) -> anyhow::Result<Affinity> {
+fn affinity_from(num_actions: u32, matrix: Vec<f32>) -> anyhow::Result<Affinity> {
     let mut affinity = Affinity::uniform(num_actions);
     affinity.update(&AffinityUpdate {
         learner: 1,
@@ -79,64 +79,63 @@ fn probability_of_a_step(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let listed = [0.0, -0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0];
     let mut all: Vec<Option<f32>> = listed.map(Some).to_vec();
     all.resize(all.len() + cases.settings.whole_draws as usize, None);
-    let listed = cases.each(&all);
-    let a = listed.unwrap_or_else(|| probability(&mut cases.rng));
-    let affinity = affinity(1, vec![a])?;
+    let listed = cases.one_of(&all);
+    let a = listed.unwrap_or_else(|| draw_probability(&mut cases.rng));
+    let affinity = affinity_from(1, vec![a])?;
     let mut every = EveryFloat(0);
     let draws = 1u32 << 24;
-    let further = (0..draws).filter(|_| draw_k(&affinity, &[0, 0], &mut every) == 2);
-    let found = further.count() as f64 / f64::from(draws);
+    let longer = (0..draws).filter(|_| draw_k(&affinity, &[0, 0], &mut every) == 2);
+    let found = longer.count() as f64 / f64::from(draws);
     // The probabilities 0 and 1 must be exact.
     let is_certain = a == 0.0 || a == 1.0;
     let error = found - f64::from(a);
-    let error = only_if(!is_certain || error == 0.0, error);
-    cases.see(format_args!("A = {a:e}: {found}"), [error])
+    let error = nan_unless(!is_certain || error == 0.0, error);
+    cases.record_errors(format_args!("A = {a:e}: {found}"), [error])
 }
 
-fn law_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let steps = cases.each(&[1usize, 2, 5, 50, 255, 1000]);
-    let kind = cases.each(&[0, 1, 2, 3, 4, 5, 6, 7]);
+fn distribution_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let steps = cases.one_of(&[1usize, 2, 5, 50, 255, 1000]);
+    let kind = cases.one_of(&[0, 1, 2, 3, 4, 5, 6, 7]);
     let rng = &mut cases.rng;
     let mut draw = || match [0.0, 1e-9, 0.5, 0.99, 1.0 - f32::EPSILON / 2.0, 1.0].get(kind) {
         Some(&a) => a,
         None if kind == 6 => rng.random(),
-        None => probability(rng),
+        None => draw_probability(rng),
     };
     let matrix: Vec<f32> = (0..16).map(|_| draw()).collect();
     let actions: Vec<u8> = (0..steps).map(|_| rng.random_range(0..4)).collect();
     // P(k = i) for i = 1, .., H along these actions.
-    let (mut reached, mut law) = (1.0, Vec::new());
+    let (mut reached, mut distribution) = (1.0, Vec::new());
     for pair in actions.windows(2) {
         let a = f64::from(matrix[usize::from(pair[0]) * 4 + usize::from(pair[1])]);
-        law.push(reached * (1.0 - a));
+        distribution.push(reached * (1.0 - a));
         reached *= a;
     }
-    law.push(reached);
-    let affinity = affinity(4, matrix)?;
+    distribution.push(reached);
+    let affinity = affinity_from(4, matrix)?;
     let mut counts = vec![0; steps];
     for _ in 0..cases.settings.law_draws / 10 {
         counts[draw_k(&affinity, &actions, rng) as usize - 1] += 1;
     }
-    let deviations = deviations(&counts, &law);
     let input = format_args!("H = {steps}, kind {kind} of A");
-    cases.see(input, [None, Some(deviations)])
+    cases.record_errors(input, [None, Some(deviations(&counts, &distribution))])
 }
 
 /// Returns how far counts deviate from a distribution: their chi-square as standard deviations of a normal with the same tail, 0 or more.
 ///
 /// Pearson's chi-square by Wilson and Hilferty 1931 (cube root). Cells that expect fewer than 5 are merged. Infinite for impossible values.
-fn deviations(counts: &[u64], law: &[f64]) -> f64 {
+fn deviations(counts: &[u64], distribution: &[f64]) -> f64 {
     let total = counts.iter().sum::<u64>() as f64;
-    let (mut cells, mut few) = (Vec::new(), (0.0, 0.0));
-    for (&count, &p) in counts.iter().zip(law) {
+    let (mut cells, mut rare) = (Vec::new(), (0.0, 0.0));
+    for (&count, &p) in counts.iter().zip(distribution) {
         match total * p {
             0.0 if count > 0 => return f64::INFINITY,
-            expected if expected < 5.0 => few = (few.0 + count as f64, few.1 + expected),
+            expected if expected < 5.0 => rare = (rare.0 + count as f64, rare.1 + expected),
             expected => cells.push((count as f64, expected)),
         }
     }
-    if few.1 >= 5.0 {
-        cells.push(few);
+    if rare.1 >= 5.0 {
+        cells.push(rare);
     }
     let degrees = cells.len().saturating_sub(1) as f64;
     if degrees == 0.0 {
@@ -149,7 +148,7 @@ fn deviations(counts: &[u64], law: &[f64]) -> f64 {
 }
 
 /// The number of transitions that can be drawn by priority.
-const HELD: usize = 300;
+const TRANSITIONS: usize = 300;
 const ROWS: u32 = 64;
 
 fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
@@ -158,16 +157,17 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         |_| 1e-45,
         |_| 1.0,
         |_| f32::MAX,
-        |at| if at == HELD / 2 { f32::MAX } else { 0.0 },
-        |at| 10f64.powf(-45.0 + 83.5 * at as f64 / HELD as f64) as f32,
+        |at| if at == TRANSITIONS / 2 { f32::MAX } else { 0.0 },
+        |at| 10f64.powf(-45.0 + 83.5 * at as f64 / TRANSITIONS as f64) as f32,
     ];
-    let priorities = cases.of(&kinds.map(|kind| (0..HELD).map(kind).collect()), |rng| {
-        let sizes = finites(HELD, rng).into_iter();
+    let listed = kinds.map(|kind| (0..TRANSITIONS).map(kind).collect());
+    let priorities = cases.listed_or(&listed, |rng| {
+        let sizes = draw_finites(TRANSITIONS, rng).into_iter();
         sizes.map(f32::abs).collect::<Vec<_>>()
     });
-    let alpha = cases.of(&[0.0, 0.5, 1.0], |rng| rng.random());
+    let alpha = cases.listed_or(&[0.0, 0.5, 1.0], |rng| rng.random());
     // Listed inputs draw many batches for the chi-square; a drawn input has only one batch, too few for it.
-    let batches = cases.of(&[cases.settings.law_draws / u64::from(ROWS)], |_| 1);
+    let batches = cases.listed_or(&[cases.settings.law_draws / u64::from(ROWS)], |_| 1);
 
     let sampling = Sampling::Prioritised {
         alpha,
@@ -177,11 +177,11 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     };
     let spec = RunSpec {
         seed: cases.rng.random(),
-        ..spec()
+        ..numbered_spec()
     };
     // One step more than transitions, because the last step has no successor.
-    let steps = [(1.0, End::Running); HELD + 1];
-    let mut replay = replay(&spec, sampling, ROWS, &steps)?;
+    let steps = [(1.0, End::Running); TRANSITIONS + 1];
+    let mut replay = new_replay(&spec, sampling, ROWS, &steps)?;
     let batch_of = |replay: &mut Replay| {
         let batch = replay.sample(ROWS);
         batch.map_err(|why| anyhow::anyhow!("no batch: {why:?}"))
@@ -192,41 +192,40 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         number: 1,
         parts: vec![PriorityPart {
             origin: origin.context("rows drawn by priority")?,
-            transitions: (0..HELD as u64).collect(),
+            transitions: (0..TRANSITIONS as u64).collect(),
             priorities: priorities.clone(),
         }],
     };
     replay.set_priorities(&update).map_err(anyhow::Error::msg)?;
     let mass = |&priority: &f32| (f64::from(priority) + PRIORITY_MIN).powf(alpha);
     let sum = exact_sum(priorities.iter().map(mass));
-    let law: Vec<f64> = priorities.iter().map(|it| mass(it) / sum).collect();
-    let mut counts = vec![0; HELD];
+    let distribution: Vec<f64> = priorities.iter().map(|it| mass(it) / sum).collect();
+    let mut counts = vec![0; TRANSITIONS];
     for _ in 0..batches {
         let batch = batch_of(&mut replay)?;
         let chances = batch.probabilities().context("rows drawn by priority")?;
         for (frame, chance) in batch.states_t().chunks_exact(4).zip(chances) {
-            let transition = number(frame);
+            let transition = step_number(frame);
             counts[transition] += 1;
             // A chance below the smallest normal number is reported as that number.
-            let expected = law[transition];
-            let error = f64::from(chance) / expected.max(LEAST) - 1.0;
+            let expected = distribution[transition];
+            let error = f64::from(chance) / expected.max(MIN_NORMAL) - 1.0;
             let input = format_args!("{chance:e}, which should be {expected:e}");
-            cases.see(input, [error])?;
+            cases.record_errors(input, [error])?;
         }
     }
     if batches > 1 {
-        let deviations = deviations(&counts, &law);
-        let input = format_args!("alpha {alpha}, priorities {}", Shown(&priorities));
-        cases.see(input, [None, Some(deviations)])?;
+        let input = format_args!("alpha {alpha}, priorities {}", Preview(&priorities));
+        cases.record_errors(input, [None, Some(deviations(&counts, &distribution))])?;
     }
     Ok(())
 }
 
 fn weights(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
-    let mut chances = finites(rng.random_range(2..=64), rng);
+    let mut chances = draw_finites(rng.random_range(2..=64), rng);
     if rng.random_bool(0.2) {
-        chances.fill(finite(rng));
+        chances.fill(draw_finite(rng));
     }
     for it in &mut chances {
         *it = it.abs().clamp(f32::MIN_POSITIVE, 1.0);
@@ -240,9 +239,9 @@ fn weights(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = importance_weights(&chances, beta);
     for (&found, &chance) in found.iter().zip(&chances) {
         let expected = (beta * (f64::from(least).ln() - f64::from(chance).ln())).exp();
-        let error = only_if(chance != least || found == 1.0, off(found, expected));
-        let input = format_args!("beta {beta}, chances {}", Shown(&chances));
-        cases.see(input, [error])?;
+        let error = nan_unless(chance != least || found == 1.0, rel_error(found, expected));
+        let input = format_args!("beta {beta}, chances {}", Preview(&chances));
+        cases.record_errors(input, [error])?;
     }
     Ok(())
 }

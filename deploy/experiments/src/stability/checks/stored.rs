@@ -9,20 +9,20 @@ const NEAREST: &str = "weights not read as the nearest, ties to even, with their
 const ALL: &str = "every number of the type, the middles between them and the floats beside those";
 
 pub(super) fn properties() -> Vec<Property> {
-    let of = |routine, range, stored: WeightDtype| {
+    let property = |routine, range, stored: WeightDtype| {
         let property = Property::new(routine, range)
             .promise(NEAREST, 0.0)
             .promise("a weight, as a share of it", stored.rounding_error());
         let property = match stored {
             WeightDtype::F32 => property,
-            _ => property.on(ALL, Listed, move |cases| {
-                see(cases, stored, &turning_points(stored))
+            _ => property.check(ALL, Listed, move |cases| {
+                check_stored(cases, stored, &turning_points(stored))
             }),
         };
-        property.on("drawn", Drawn(0.005), move |cases| {
+        property.check("drawn", Drawn(0.005), move |cases| {
             let count = cases.rng.random_range(1..4096);
-            let values = clamped(count, stored.largest(), &mut cases.rng);
-            see(cases, stored, &values)
+            let values = draw_clamped(count, stored.largest(), &mut cases.rng);
+            check_stored(cases, stored, &values)
         })
     };
     let [f32, f16, bf16] = [
@@ -31,9 +31,9 @@ pub(super) fn properties() -> Vec<Property> {
         "as published (learner.publish_dtype); within 3.3895e38",
     ];
     vec![
-        of("f32 weights", f32, WeightDtype::F32),
-        of("f16 weights", f16, WeightDtype::F16),
-        of("bf16 weights", bf16, WeightDtype::Bf16),
+        property("f32 weights", f32, WeightDtype::F32),
+        property("f16 weights", f16, WeightDtype::F16),
+        property("bf16 weights", bf16, WeightDtype::Bf16),
     ]
 }
 
@@ -68,7 +68,7 @@ fn turning_points(stored: WeightDtype) -> Vec<f32> {
 }
 
 /// Saves and loads the values as weights, and counts their errors.
-fn see(cases: &mut Cases<'_>, stored: WeightDtype, values: &[f32]) -> anyhow::Result<()> {
+fn check_stored(cases: &mut Cases<'_>, stored: WeightDtype, values: &[f32]) -> anyhow::Result<()> {
     let atoms = values.len().div_ceil(HIDDEN).max(2);
     let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
     let bytes = small::parameters(&config, values)?.to_safetensors_as(stored, |_| true)?;
@@ -81,7 +81,7 @@ fn see(cases: &mut Cases<'_>, stored: WeightDtype, values: &[f32]) -> anyhow::Re
         let scale = f64::from(x.abs().max(stored.min_normal()));
         let error = (f64::from(found) - f64::from(x)) / scale;
         let input = format_args!("{x:e} became {found:e}");
-        cases.see(input, [f64::from(!is_nearest), error])?;
+        cases.record_errors(input, [f64::from(!is_nearest), error])?;
     }
     Ok(())
 }

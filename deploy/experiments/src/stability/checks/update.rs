@@ -13,7 +13,7 @@ use driml_settings::flags::of_names;
 use crate::{small, stability::property::*};
 
 /// The largest allowed difference of two ways to compute an update. Each of them may be wrong by half of it.
-const UPDATES_APART: f64 = 2e-4;
+const ERROR_MAX: f64 = 2e-4;
 
 const UPDATES: &str = "our kernels beside candle's operations: initial weights times 1e-6 to 100; returns 0 to 3e38; supports 1e-3 to 2e30 wide; tanh_clip 1e-30 to 1e30; one state, four or all that differ, equal ones computed each and once";
 
@@ -21,9 +21,9 @@ pub(super) fn properties() -> Vec<Property> {
     let finite = "f32; weights, returns and supports of any size whose losses are finite";
     vec![
         Property::new("whole update", finite)
-            .promise("the loss, as a share of 1 + loss", UPDATES_APART)
-            .promise("gradients, as a share of their norm, median", UPDATES_APART)
-            .on(UPDATES, Listed, check),
+            .promise("the loss, as a share of 1 + loss", ERROR_MAX)
+            .promise("gradients, as a share of their norm, median", ERROR_MAX)
+            .check(UPDATES, Listed, check),
     ]
 }
 
@@ -54,7 +54,7 @@ struct Setting {
 }
 
 impl Setting {
-    fn drawn(scale: f32, rng: &mut ChaCha8Rng) -> Self {
+    fn draw(scale: f32, rng: &mut ChaCha8Rng) -> Self {
         let supports = [
             (-10.0, 10.0),
             (0.0, 1e-3),
@@ -151,10 +151,10 @@ fn median(mut errors: Vec<f64>) -> Option<f64> {
 }
 
 fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let scale = cases.each(&[1e-6, 1e-3, 0.1, 1.0, 3.0, 10.0, 100.0]);
+    let scale = cases.one_of(&[1e-6, 1e-3, 0.1, 1.0, 3.0, 10.0, 100.0]);
     let mut gradients = Vec::new();
-    for _ in 0..cases.draws(0.0015) {
-        let setting = Setting::drawn(scale, &mut cases.rng);
+    for _ in 0..cases.draw_count(0.0015) {
+        let setting = Setting::draw(scale, &mut cases.rng);
         let [mut agent, reference] = setting.agents(&mut cases.rng)?;
         let batch = setting.batch(agent.model().frame_len(), &mut cases.rng);
         // The errors with and without deduplication of equal states; the larger counts.
@@ -166,14 +166,14 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             // `None` if two nearly equal values swap their order: then the next action and the target differ, so gradients do too.
             gradient.push((found.same_next_action == 1.0).then_some(found.gradient));
         }
-        cases.see(format_args!("{setting:?}"), [worst(loss)])?;
+        cases.record_errors(format_args!("{setting:?}"), [max_error(loss)])?;
         let gradient: Option<Vec<f64>> = gradient.into_iter().collect();
-        gradients.extend(gradient.map(worst));
+        gradients.extend(gradient.map(max_error));
     }
     // Only the median counts: if states are equal or losses saturate, the terms of a gradient cancel and only rounding remains.
     // With few cases there may be none with comparable gradients.
     let input = format_args!("weights x {scale:e}");
-    cases.see(input, [None, median(gradients)])
+    cases.record_errors(input, [None, median(gradients)])
 }
 
 #[cfg(test)]

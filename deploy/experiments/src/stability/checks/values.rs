@@ -18,24 +18,24 @@ pub(super) fn properties() -> Vec<Property> {
         Property::new("Q-value", values)
             // An error in the last place of the value is not counted. A value outside the support breaks the promise.
             .promise("a value, as a share of the width", EXPECTED_RETURN_ERROR)
-            .on(LOGITS, Listed, expected)
-            .on("drawn, some logits -inf", Drawn(1.0), expected),
+            .check(LOGITS, Listed, expected_return)
+            .check("drawn, some logits -inf", Drawn(1.0), expected_return),
         Property::new("greedy action", "weights finite; 1 to 255 actions")
             // The values of both actions may round to the same f32.
             .promise("how far its value is below the largest", F32_STEP)
             .promise("actions of which a lower one has the same logits", 0.0)
             .promise("rows beyond the finite numbers not refused by number", 0.0)
-            .on(EQUAL, Listed, greedy)
-            .on("drawn logits, some of them equal", Drawn(0.05), greedy)
-            .on(TOO_LARGE, Drawn(0.05), too_large),
+            .check(EQUAL, Listed, greedy)
+            .check("drawn logits, some of them equal", Drawn(0.05), greedy)
+            .check(TOO_LARGE, Drawn(0.05), too_large),
     ]
 }
 
-fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let atoms = cases.of(&[2usize, 51, 1001], |rng| rng.random_range(2..120));
-    let support = cases.of(&SUPPORTS, support);
-    let mut logits = cases.of(&listed(atoms), |rng| finites(atoms, rng));
-    if cases.each(&[false, true]) {
+fn expected_return(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let atoms = cases.listed_or(&[2usize, 51, 1001], |rng| rng.random_range(2..120));
+    let support = cases.listed_or(&SUPPORTS, draw_support);
+    let mut logits = cases.listed_or(&extremes(atoms), |rng| draw_finites(atoms, rng));
+    if cases.one_of(&[false, true]) {
         let kept = cases.rng.random_range(0..atoms);
         for (atom, logit) in logits.iter_mut().enumerate() {
             if atom != kept && cases.rng.random_bool(0.2) {
@@ -48,20 +48,20 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let batch = Tensor::from_slice(&logits, (1, 1, atoms), &Device::Cpu)?;
     let found = network.q_values(&batch)?.flatten_all()?.to_vec1::<f32>()?[0];
     let (low, high) = (f64::from(support.0), f64::from(support.1));
-    let (shares, ..) = shares(&widened(&logits));
+    let (shares, ..) = softmax_f64(&to_f64(&logits));
     let places = shares.iter().enumerate();
     let place = exact_sum(places.map(|(i, p)| p * (i as f64 / (atoms - 1) as f64)));
     let expected = low + place * (high - low);
-    let last_place = expected.abs().max(LEAST) / 2f64.powi(24);
+    let last_place = expected.abs().max(MIN_NORMAL) / 2f64.powi(24);
     let error = (f64::from(found) - expected).abs() - last_place;
     let is_within = (support.0..=support.1).contains(&found);
-    let error = only_if(is_within, error.max(0.0) / (high - low));
-    let input = format_args!("support {support:?}, logits {}", Shown(&logits));
-    cases.see(input, [error])
+    let error = nan_unless(is_within, error.max(0.0) / (high - low));
+    let input = format_args!("support {support:?}, logits {}", Preview(&logits));
+    cases.record_errors(input, [error])
 }
 
 /// Creates a policy with two atoms on [-1, 1] for each action. `set` fills the parameters: four of the torso, then head weights, biases.
-fn policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<PolicyNetwork> {
+fn new_policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<PolicyNetwork> {
     let config = ModelConfig {
         num_actions,
         ..small::minimal_config()
@@ -74,9 +74,9 @@ fn policy(num_actions: usize, set: impl FnOnce(&mut [f32])) -> anyhow::Result<Po
 
 fn greedy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let num_actions = cases.rng.random_range(1..=255usize);
-    let logits = cases.of(&listed(num_actions), |rng| finites(num_actions, rng));
+    let logits = cases.listed_or(&extremes(num_actions), |rng| draw_finites(num_actions, rng));
     // The weights are 0, so the two logits of an action are its biases: 0 and the listed logit.
-    let mut policy = policy(num_actions, |values| {
+    let mut policy = new_policy(num_actions, |values| {
         let first = values.len() - 2 * num_actions;
         let biases = values[first..].chunks_exact_mut(2).zip(&logits);
         biases.for_each(|(biases, &logit)| biases[1] = logit);
@@ -87,12 +87,12 @@ fn greedy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     // The value is -1 + 2 / (1 + exp(-logit)).
     let value = |logit: f32| (f64::from(logit) / 2.0).tanh();
     let values = logits.iter().map(|&logit| value(logit));
-    let most = values.fold(f64::NEG_INFINITY, f64::max);
+    let value_max = values.fold(f64::NEG_INFINITY, f64::max);
     for action in actions.iter().map(|&action| usize::from(action)) {
         let is_lowest = !logits[..action].contains(&logits[action]);
-        let input = format_args!("action {action}, logits {}", Shown(&logits));
-        let below = most - value(logits[action]);
-        cases.see(input, [below, f64::from(!is_lowest)])?;
+        let input = format_args!("action {action}, logits {}", Preview(&logits));
+        let below = value_max - value(logits[action]);
+        cases.record_errors(input, [below, f64::from(!is_lowest)])?;
     }
     Ok(())
 }
@@ -101,7 +101,7 @@ fn too_large(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let num_actions = rng.random_range(1..=255usize);
     // If the pixel is not black, a logit is 2 (pixel / 255) 3.4e38, which overflows.
-    let mut policy = policy(num_actions, |values| {
+    let mut policy = new_policy(num_actions, |values| {
         (values[0], values[2]) = (1.0, 2.0);
         values[4 + rng.random_range(0..2 * num_actions)] = f32::MAX;
     })?;
@@ -110,11 +110,11 @@ fn too_large(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let frames: Vec<u8> = (0..rows).map(|_| pixel()).collect();
     let found = policy.greedy_actions(&frames, &mut vec![0; rows]);
     let first = frames.iter().position(|&pixel| pixel != 0);
-    let right = match (&found, first) {
+    let is_right = match (&found, first) {
         (Ok(()), None) => true,
         (Err(ModelError::NotFinite { row }), Some(first)) => *row == first,
         _ => false,
     };
     let input = format_args!("{rows} rows, the first {first:?}: {found:?}");
-    cases.keeps(2, input, right)
+    cases.record_kept(2, input, is_right)
 }
