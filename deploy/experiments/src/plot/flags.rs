@@ -16,8 +16,8 @@ pub struct PlotArgs {
     #[arg(long, value_name = "COLUMN")]
     pub(crate) column: Vec<String>,
     /// Horizontal axis
-    #[arg(long, value_name = "AXIS", value_enum, default_value_t = Over::Frames)]
-    pub(crate) x: Over,
+    #[arg(long, value_name = "AXIS", value_enum, default_value_t = XAxis::Frames)]
+    pub(crate) x: XAxis,
     /// Average over so many units of --x before each point
     #[arg(long, value_name = "N", value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) smooth: Option<u64>,
@@ -44,7 +44,7 @@ pub struct PlotArgs {
 
 /// What a curve is drawn over: columns that only grow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum Over {
+pub enum XAxis {
     /// Environment steps, over all actors
     #[default]
     Frames,
@@ -54,7 +54,7 @@ pub enum Over {
     Seconds,
 }
 
-impl Over {
+impl XAxis {
     /// Returns the column of `metrics.csv`, which is also the label of the axis.
     pub(super) const fn column(self) -> &'static str {
         match self {

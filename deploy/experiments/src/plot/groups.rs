@@ -8,16 +8,16 @@ use driml_figure::Series;
 use super::{
     flags::{Band, PlotArgs},
     names,
-    runs::{Run, SPREAD_OF_K},
+    runs::{Run, SD_OF_K},
 };
 use crate::stats::{Spread, interval};
 
 /// The number of grid intervals of a curve over several runs.
-const GRID_POINTS: usize = 240;
+const GRID_INTERVALS: usize = 240;
 /// The most points of a single run's curve. Of a longer curve only every second, third, ... point is drawn.
 const POINTS_MAX: usize = 600;
 /// Curves without a common x are still averaged if the gap is at most this share of x: evaluations of seeds are some frames apart.
-const APART_MAX: f64 = 0.05;
+const GAP_SHARE_MAX: f64 = 0.05;
 /// The smallest k, in environment steps.
 const K_MIN: f64 = 1.0;
 
@@ -36,7 +36,7 @@ pub(crate) struct Curve {
 
 impl Curve {
     /// Returns the mean of the values at each x, and their band. An x without values is left out.
-    pub(crate) fn of_means(all: impl IntoIterator<Item = (f64, Vec<f64>)>, band: Band) -> Self {
+    pub(crate) fn from_values(all: impl IntoIterator<Item = (f64, Vec<f64>)>, band: Band) -> Self {
         let mut curve = Self::default();
         for (x, values) in all {
             let Some(spread) = Spread::of(values.iter().copied()) else {
@@ -61,73 +61,73 @@ impl Curve {
     }
 }
 
-/// Groups the runs in the order in which they are named. If `together`, runs that differ only in their seed form one group.
+/// Groups the runs in the order in which they are named. If `merge_seeds`, runs that differ only in their seed form one group.
 ///
 /// Settings that depend on the machine (threads, sizes, the replay's capacity) do not separate runs; the number of actors does.
-pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
+pub(super) fn group_runs(runs: &[Run], merge_seeds: bool) -> Vec<Group<'_>> {
     let mut groups: Vec<Vec<&Run>> = Vec::new();
     for run in runs {
         let same = |group: &&mut Vec<&Run>| {
-            together && run.settings.is_some() && group[0].settings == run.settings
+            merge_seeds && run.settings.is_some() && group[0].settings == run.settings
         };
         match groups.iter_mut().find(same) {
             Some(group) => group.push(run),
             None => groups.push(vec![run]),
         }
     }
-    let named = names::of(&groups).into_iter().zip(groups);
+    let named = names::group_names(&groups).into_iter().zip(groups);
     named.map(|(name, runs)| Group { name, runs }).collect()
 }
 
 impl Group<'_> {
     /// Returns the group's mean of a column, and its band.
     pub(super) fn curve(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
-        let mean = self.over_seeds(column, args)?;
-        let has_spread = self.runs.iter().all(|run| run.has_values(SPREAD_OF_K));
+        let mean = self.combine_seeds(column, args)?;
+        let has_spread = self.runs.iter().all(|run| run.has_values(SD_OF_K));
         if column != "mean_k" || !has_spread {
             return Ok(mean);
         }
-        let spread = self.over_seeds(SPREAD_OF_K, args)?;
-        let around = mean.points.iter().map(|&(x, k)| {
-            let sd = between(&spread.points, x);
+        let spread = self.combine_seeds(SD_OF_K, args)?;
+        let band = mean.points.iter().map(|&(x, k)| {
+            let sd = interpolate(&spread.points, x);
             (x, (k - sd).max(K_MIN), k + sd)
         });
         Ok(Curve {
-            band: around.collect(),
+            band: band.collect(),
             points: mean.points.clone(),
         })
     }
 
-    fn over_seeds(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
+    fn combine_seeds(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
         // Some runs have no evaluations.
-        let having = self.runs.iter().filter(|run| run.has_values(column));
-        let each = having.map(|run| {
+        let with_values = self.runs.iter().filter(|run| run.has_values(column));
+        let each = with_values.map(|run| {
             let values = run.values(args.x.column(), column)?;
             Ok(match args.smooth {
-                Some(window) => smoothed(&values, window as f64),
+                Some(window) => smooth(&values, window as f64),
                 None => values,
             })
         });
         let each = each.collect::<anyhow::Result<Vec<_>>>()?;
-        Ok(over_seeds(&each, args.band))
+        Ok(combine_seeds(&each, args.band))
     }
 }
 
 /// Combines one or several curves into one, with a band if there are several.
-pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
+pub(crate) fn combine_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
     let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).collect();
     match &each[..] {
         [] => Curve::default(),
         [only] => Curve {
-            points: thinned(only),
+            points: thin(only),
             band: Vec::new(),
         },
-        many => together(many, band),
+        many => combine(many, band),
     }
 }
 
 /// Replaces each point by the mean over the points within `width` of x before it.
-pub(crate) fn smoothed(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
+pub(crate) fn smooth(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
     let mut window = VecDeque::new();
     let mut smooth = Vec::with_capacity(points.len());
     for &(x, y) in points {
@@ -141,7 +141,7 @@ pub(crate) fn smoothed(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
     smooth
 }
 
-fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let step = points.len().div_ceil(POINTS_MAX).max(1);
     let is_left_out = |_: &&_| !(points.len() - 1).is_multiple_of(step);
     let last = points.last().filter(is_left_out);
@@ -149,29 +149,29 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
 }
 
 /// Returns mean and band of several curves over their common range of x, or at the middle of a small gap between them.
-fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
+fn combine(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
     let starts = curves.iter().map(|curve| curve[0].0);
     let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
     let mut start = starts.fold(f64::NEG_INFINITY, f64::max);
     let mut end = ends.fold(f64::INFINITY, f64::min);
-    if start > end * (1.0 + APART_MAX) {
+    if start > end * (1.0 + GAP_SHARE_MAX) {
         return Curve::default();
     }
     if start > end {
         end = f64::midpoint(start, end);
         start = end;
     }
-    let last = if start == end { 0 } else { GRID_POINTS };
+    let last = if start == end { 0 } else { GRID_INTERVALS };
     let means = (0..=last).map(|i| {
-        let x = start + (end - start) * i as f64 / GRID_POINTS as f64;
-        let values = curves.iter().map(|points| between(points, x));
+        let x = start + (end - start) * i as f64 / GRID_INTERVALS as f64;
+        let values = curves.iter().map(|points| interpolate(points, x));
         (x, values.collect())
     });
-    Curve::of_means(means, band)
+    Curve::from_values(means, band)
 }
 
 /// Interpolates `points` linearly at `x`; beyond the ends, the value at the end. `points` must be sorted by x and not empty.
-fn between(points: &[(f64, f64)], x: f64) -> f64 {
+fn interpolate(points: &[(f64, f64)], x: f64) -> f64 {
     let after = points.partition_point(|point| point.0 < x);
     match (after.checked_sub(1).map(|i| points[i]), points.get(after)) {
         (Some((x0, y0)), Some(&(x1, y1))) => y0 + (y1 - y0) * (x - x0) / (x1 - x0),
@@ -187,7 +187,7 @@ mod tests {
     #[test]
     fn between_points_lies_the_line() {
         let points = [(0.0, 1.0), (10.0, 3.0), (10.0, 5.0), (20.0, 6.0)];
-        let found = [-1.0, 0.0, 5.0, 15.0, 99.0].map(|x| between(&points, x));
+        let found = [-1.0, 0.0, 5.0, 15.0, 99.0].map(|x| interpolate(&points, x));
         assert_eq!(found, [1.0, 1.0, 2.0, 5.5, 6.0]);
     }
 
@@ -200,14 +200,14 @@ mod tests {
             (Band::Sd, 0.697, 4.303),
             (Band::Ci, -1.979, 6.979),
         ] {
-            let curve = together(&curves.each_ref(), band);
+            let curve = combine(&curves.each_ref(), band);
             assert_eq!(curve.points[0], (0.0, 2.5));
             let (_, found_low, found_high) = curve.band[0];
             assert!((found_low - low).abs() < 1e-3 && (found_high - high).abs() < 1e-3);
         }
         for (later, points) in [(104.0, &[(102.0, 2.0)][..]), (150.0, &[])] {
             let apart = [vec![(100.0, 1.0)], vec![(later, 3.0)]];
-            assert_eq!(together(&apart.each_ref(), Band::Sd).points, points);
+            assert_eq!(combine(&apart.each_ref(), Band::Sd).points, points);
         }
     }
 }

@@ -23,13 +23,13 @@ use driml_machine::error::usage;
 
 pub(crate) use self::{
     flags::Band,
-    groups::{Curve, over_seeds, smoothed},
+    groups::{Curve, combine_seeds, smooth},
     runs::Run,
 };
 use self::{
     flags::PlotArgs,
     groups::Group,
-    runs::{C51_LOSS, SPREAD_OF_K},
+    runs::{C51_LOSS, SD_OF_K},
 };
 
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
@@ -38,7 +38,7 @@ const RETURN: &str = "mean_return";
 /// The column of the returns of evaluated checkpoints.
 const EVALUATED: &str = "evaluated_return";
 /// Short names of columns, which `--column` accepts.
-const WORDS: [(&str, &str); 4] = [
+const SHORT_NAMES: [(&str, &str); 4] = [
     ("return", RETURN),
     ("loss", C51_LOSS),
     ("k", "mean_k"),
@@ -62,8 +62,8 @@ const OVERVIEW: [&str; 7] = [
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     Format::from_path(&args.out).map_err(|e| usage!("{e}"))?;
     let figure = match args.affinity {
-        true => affinity::figure(&folders(args)?)?,
-        false => charts(args)?,
+        true => affinity::figure(&run_folders(args)?)?,
+        false => charts_figure(args)?,
     };
     let look = if args.plain { Look::Plain } else { Look::Card };
     figure.save(&args.out, look)?;
@@ -71,7 +71,7 @@ pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
 }
 
 /// Returns the columns of the [`OVERVIEW`] and the auxiliary losses for which some run has values.
-fn overview(runs: &[Run]) -> Vec<String> {
+fn overview_columns(runs: &[Run]) -> Vec<String> {
     let mut columns: Vec<&str> = OVERVIEW.into();
     let mut place = OVERVIEW.iter().position(|it| *it == C51_LOSS).unwrap_or(0) + 1;
     for loss in runs.iter().flat_map(Run::auxiliary_losses) {
@@ -85,7 +85,7 @@ fn overview(runs: &[Run]) -> Vec<String> {
 }
 
 /// Returns the named run folders, each once. Other folders and files are skipped with a message, because `runs/*` names them too.
-fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
+fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let mut seen = BTreeSet::new();
     // A folder given twice is one run, not two seeds.
     let whole = |folder: &PathBuf| folder.canonicalize().unwrap_or_else(|_| folder.clone());
@@ -105,24 +105,24 @@ fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     Ok(runs)
 }
 
-fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
-    let runs = folders(args)?.into_iter().map(|it| Run::read(&it));
+fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
+    let runs = run_folders(args)?.into_iter().map(|it| Run::read(&it));
     let runs = runs.collect::<anyhow::Result<Vec<_>>>()?;
     let named = |column: &String| {
-        let word = WORDS.iter().find(|(word, _)| word == column);
+        let word = SHORT_NAMES.iter().find(|(word, _)| word == column);
         word.map_or_else(|| column.clone(), |(_, column)| (*column).to_owned())
     };
     let columns = match &args.column[..] {
-        [] => overview(&runs),
+        [] => overview_columns(&runs),
         columns => columns.iter().map(named).collect(),
     };
-    let groups = groups::of(&runs, !args.separate);
+    let groups = groups::group_runs(&runs, !args.separate);
     let is_return = |column: &String| column == RETURN || column == EVALUATED;
     if args.random.is_some() && !columns.iter().any(is_return) {
         return Err(usage!("--random is a line over {RETURN:?}, which is not drawn").into());
     }
     let random = match args.random {
-        Some(episodes) => at_random(&runs, episodes as usize)?,
+        Some(episodes) => random_means(&runs, episodes as usize)?,
         None => Vec::new(),
     };
     let mut panels = Vec::new();
@@ -146,12 +146,12 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
         if column == RETURN || !(args.column.is_empty() || is_loss) {
-            absent(column, &runs).for_each(|line| console::eprintln(&line));
+            missing_messages(column, &runs).for_each(|line| console::eprintln(&line));
         }
         if is_return(column) {
-            series.extend(lines(&random, &series, groups.len()));
+            series.extend(random_lines(&random, &series, groups.len()));
         }
-        let (mut title, mut y) = words(column);
+        let (mut title, mut y) = title_and_label(column);
         if is_loss {
             title = format!("{} loss", loss_title(column));
             y = "auxiliary loss [nats]".into();
@@ -177,7 +177,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
 }
 
 /// Returns the title of a column's chart, and the axis label with its unit.
-fn words(column: &str) -> (String, String) {
+fn title_and_label(column: &str) -> (String, String) {
     if column == EVALUATED {
         return (
             "Return of checkpoints, played greedily".into(),
@@ -207,7 +207,7 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
         ));
     }
     let mut all = groups.iter().flat_map(|group| &group.runs);
-    let has_spread = all.any(|run| run.has_values(SPREAD_OF_K));
+    let has_spread = all.any(|run| run.has_values(SD_OF_K));
     if has_spread && columns.iter().any(|column| column == "mean_k") {
         let it = "The band around k is one standard deviation of k itself to each side, cut at 1.";
         notes.push(it.into());
@@ -226,7 +226,7 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
 }
 
 /// Returns a message for each run that has no value of a drawn column.
-fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
+fn missing_messages(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
     let why = match column {
         RETURN => "no episode has ended in it",
         _ => "it has no value yet",
@@ -239,7 +239,7 @@ fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
 }
 
 /// Returns the mean return of a random policy in each of the runs' worlds, with the name of the world.
-fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
+fn random_means(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
     let (mut known, mut found) = (Vec::new(), Vec::new());
     for run in runs {
         let config = read_config(&run.folder)?;
@@ -254,7 +254,7 @@ fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>
 }
 
 /// Returns horizontal lines from 0 to the end of the longest curve. Lines of several worlds have colours that no run uses.
-fn lines(random: &[(String, f64)], curves: &[Series], groups: usize) -> Vec<Series> {
+fn random_lines(random: &[(String, f64)], curves: &[Series], groups: usize) -> Vec<Series> {
     let xs = curves.iter().flat_map(|it| &it.points);
     let last = xs.map(|point| point.0).fold(0.0, f64::max);
     let line = |(at, (world, mean)): (usize, &(String, f64))| {

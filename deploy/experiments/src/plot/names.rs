@@ -6,33 +6,33 @@ use std::collections::BTreeSet;
 use super::runs::{Run, Settings};
 
 /// The most settings in a name. Of further settings the name has only the number.
-const TOLD_MAX: usize = 3;
+const SETTINGS_MAX: usize = 3;
 
 /// Returns a unique name for each group of runs. The runs of a group differ only in their seeds.
-pub(super) fn of(groups: &[Vec<&Run>]) -> Vec<String> {
+pub(super) fn group_names(groups: &[Vec<&Run>]) -> Vec<String> {
     let name = |runs: &Vec<&Run>| {
-        let (Some(what), Some(own)) = (&runs[0].what, &runs[0].settings) else {
+        let (Some(world_agent), Some(own)) = (&runs[0].world_agent, &runs[0].settings) else {
             return runs[0].name.clone();
         };
         let peers = groups.iter().map(|other| other[0]);
-        let peers = peers.filter(|other| other.what.as_ref() == Some(what));
+        let peers = peers.filter(|other| other.world_agent.as_ref() == Some(world_agent));
         let peers: Vec<_> = peers.filter_map(|other| other.settings.as_ref()).collect();
-        let mut parts = vec![what.clone()];
+        let mut parts = vec![world_agent.clone()];
         parts.extend(differences(own, &peers));
-        parts.push(seeds(runs));
+        parts.push(describe_seeds(runs));
         parts.join(", ")
     };
     let names: Vec<String> = groups.iter().map(name).collect();
-    let alike = |name: &String| names.iter().filter(|other| *other == name).count() > 1;
-    let told_apart = |(name, runs): (&String, &Vec<&Run>)| match alike(name) {
+    let is_ambiguous = |name: &String| names.iter().filter(|other| *other == name).count() > 1;
+    let unique_name = |(name, runs): (&String, &Vec<&Run>)| match is_ambiguous(name) {
         true if *name != runs[0].name => format!("{name} ({})", runs[0].name),
         _ => name.clone(),
     };
-    names.iter().zip(groups).map(told_apart).collect()
+    names.iter().zip(groups).map(unique_name).collect()
 }
 
 /// Describes the seeds of a group, and says if some seed has several runs: those are not independent samples.
-fn seeds(runs: &[&Run]) -> String {
+fn describe_seeds(runs: &[&Run]) -> String {
     let seeds: BTreeSet<_> = runs.iter().map(|run| run.seed).collect();
     let seed = |seed: Option<i64>| seed.map_or("unknown".into(), |seed| seed.to_string());
     match (runs.len(), seeds.len()) {
@@ -50,7 +50,7 @@ fn differences(own: &Settings, peers: &[&Settings]) -> Vec<String> {
     let keys: BTreeSet<&String> = keys.filter(differs).collect();
     let setting = |key: &&String| {
         let value = own.get(*key).map_or("unset", String::as_str);
-        format!("{}={value}", short(key, &keys))
+        format!("{}={value}", short_key(key, &keys))
     };
     // Named choices come first, because other settings often follow from them. Then numbers; last lists, and settings that some lack.
     let rank = |key: &&&String| {
@@ -62,16 +62,16 @@ fn differences(own: &Settings, peers: &[&Settings]) -> Vec<String> {
     };
     let mut in_order: Vec<&&String> = keys.iter().collect();
     in_order.sort_by_key(rank);
-    let told = in_order.into_iter().take(TOLD_MAX);
+    let told = in_order.into_iter().take(SETTINGS_MAX);
     let mut told: Vec<String> = told.map(setting).collect();
-    if keys.len() > TOLD_MAX {
-        told.push(format!("and {} more settings", keys.len() - TOLD_MAX));
+    if keys.len() > SETTINGS_MAX {
+        told.push(format!("and {} more settings", keys.len() - SETTINGS_MAX));
     }
     told
 }
 
 /// Returns the shortest suffix of a dotted key with which no other of these keys ends.
-fn short<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
+fn short_key<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
     let starts = key.rmatch_indices('.').map(|(at, _)| &key[at + 1..]);
     let unique = |end: &&str| {
         let mut others = keys.iter().filter(|other| other.as_str() != key);
@@ -83,7 +83,7 @@ fn short<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plot::runs::flat;
+    use crate::plot::runs::flatten;
 
     #[test]
     fn what_differs_is_told_by_its_shortest_name() {
@@ -100,7 +100,7 @@ mod tests {
             (deep, wide, "torso=impala, height=64, conv=unset"),
             (many, "", "a=1, b=1, c=1, and 2 more settings"),
         ] {
-            let [own, other] = [own, other].map(|text| flat(&text.parse().unwrap()));
+            let [own, other] = [own, other].map(|text| flatten(&text.parse().unwrap()));
             assert_eq!(differences(&own, &[&other, &own]).join(", "), expected);
         }
     }

@@ -12,12 +12,12 @@ use driml_machine::error::{Usage, did_you_mean, usage};
 use driml_settings::leaves;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
-pub(super) const SPREAD_OF_K: &str = "sd_k";
+pub(super) const SD_OF_K: &str = "sd_k";
 /// The columns right before and right after those of the auxiliary losses.
 pub(super) const C51_LOSS: &str = "c51_kl";
 const TOTAL_LOSS: &str = "total_loss";
 /// The columns of `metrics.csv` that hold words instead of numbers.
-const WORDS: [&str; 1] = ["waiting"];
+const TEXTS: [&str; 1] = ["waiting"];
 
 /// Settings as text, by their full dotted names.
 pub(crate) type Settings = BTreeMap<String, String>;
@@ -29,7 +29,7 @@ pub(crate) struct Run {
     /// The name of the folder.
     pub(super) name: String,
     /// World and agent, if the settings can be read.
-    pub(super) what: Option<String>,
+    pub(super) world_agent: Option<String>,
     pub(super) seed: Option<i64>,
     /// The settings without the seed and without those that depend on the machine; `None` if they cannot be read.
     pub(crate) settings: Option<Settings>,
@@ -51,13 +51,13 @@ impl Run {
                 path.display()
             )
         );
-        let (settings, seed) = settings(&folder.config()).unzip();
+        let (settings, seed) = read_settings(&folder.config()).unzip();
         let word = |name: &str| settings.as_ref()?.get(name);
-        let what = word("run.world").zip(word("run.agent"));
-        let what = what.map(|(world, agent)| format!("{world} {agent}"));
+        let world_agent = word("run.world").zip(word("run.agent"));
+        let world_agent = world_agent.map(|(world, agent)| format!("{world} {agent}"));
         Ok(Self {
             name: folder_name(folder.path()),
-            what,
+            world_agent,
             settings,
             seed: seed.flatten(),
             folder: folder.clone(),
@@ -70,9 +70,9 @@ impl Run {
     ///
     /// Rows with the same x become one point, their mean: a row is written each second, and a second may bring no new frame.
     pub(crate) fn values(&self, x: &str, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        let (table, path) = self.table(column);
-        let x = self.place(table, x)?;
-        let place = self.place(table, column)?;
+        let (table, path) = self.table_of(column);
+        let x = self.column_index(table, x)?;
+        let place = self.column_index(table, column)?;
         let mut values = Vec::new();
         let path = path.display();
         for (line, row) in (2..).zip(&table.rows) {
@@ -94,7 +94,7 @@ impl Run {
     }
 
     /// Returns the table that has the column, and its file; the metrics if neither table has the column.
-    fn table(&self, column: &str) -> (&Table, PathBuf) {
+    fn table_of(&self, column: &str) -> (&Table, PathBuf) {
         let in_metrics = self.columns.column_index(column).is_some();
         if !in_metrics && self.evaluations.column_index(column).is_some() {
             (&self.evaluations, self.folder.evaluations())
@@ -104,14 +104,14 @@ impl Run {
     }
 
     /// Returns the index of a numeric column.
-    fn place(&self, table: &Table, column: &str) -> Result<usize, Usage> {
+    fn column_index(&self, table: &Table, column: &str) -> Result<usize, Usage> {
         let place = table.column_index(column);
-        place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
+        place.filter(|_| !TEXTS.contains(&column)).ok_or_else(|| {
             let numbers = || {
                 let more = self.evaluations.header.iter();
                 let more = more.filter(|name| self.columns.column_index(name).is_none());
                 let all = self.columns.header.iter().chain(more);
-                all.map(String::as_str).filter(|name| !WORDS.contains(name))
+                all.map(String::as_str).filter(|name| !TEXTS.contains(name))
             };
             usage!(
                 "{} has no column of numbers {column:?}{}; it has {}",
@@ -133,7 +133,7 @@ impl Run {
 
     /// Whether the column exists and has a value.
     pub(crate) fn has_values(&self, column: &str) -> bool {
-        let (table, _) = self.table(column);
+        let (table, _) = self.table_of(column);
         let place = table.column_index(column);
         place.is_some_and(|place| table.rows.iter().any(|row| !row[place].is_empty()))
     }
@@ -147,10 +147,10 @@ pub(super) fn folder_name(folder: &Path) -> String {
 
 /// Returns the settings without the seed and without those that depend on the machine, and the seed. A run without settings is not
 /// grouped with others.
-fn settings(path: &Path) -> Option<(Settings, Option<i64>)> {
+fn read_settings(path: &Path) -> Option<(Settings, Option<i64>)> {
     let table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
     table.get("run")?.as_table()?;
-    let mut all = flat(&table);
+    let mut all = flatten(&table);
     let seed = all.remove("run.seed").and_then(|seed| seed.parse().ok());
     // Most launch settings depend on the machine, but the number of actors influences what is learned.
     let actors = all.remove("local.actors");
@@ -170,7 +170,7 @@ fn settings(path: &Path) -> Option<(Settings, Option<i64>)> {
 }
 
 /// Returns every setting of a table.
-pub(super) fn flat(table: &toml::Table) -> Settings {
+pub(super) fn flatten(table: &toml::Table) -> Settings {
     let text = |it: &toml::Value| it.as_str().map_or_else(|| it.to_string(), str::to_owned);
     let all = leaves(table).into_iter();
     all.map(|(name, value)| (name, text(value))).collect()

@@ -56,14 +56,14 @@ fn runs_that_differ_in_their_seed_are_one_line_with_a_band() {
     let b = root.run("a-2", "c51", 2, &METRICS.replace("2.5", "4.5"));
     let c = root.run("c", "driml-ada", 1, METRICS);
     let runs = [&a, &b, &c].map(read);
-    let groups = groups::of(&runs, true);
+    let groups = groups::group_runs(&runs, true);
     let names: Vec<_> = groups.iter().map(|group| group.name.as_str()).collect();
     assert_eq!(names, ["chain c51, 2 seeds", "chain driml-ada, seed 1"]);
     let args = PlotArgs::default();
     let curve = groups[0].curve("mean_return", &args).unwrap();
     assert_eq!(curve.points.last(), Some(&(20.0, 3.5)));
     assert_eq!(curve.band.last(), Some(&(20.0, 2.5, 4.5)));
-    assert_eq!(groups::of(&runs, false).len(), 3);
+    assert_eq!(groups::group_runs(&runs, false).len(), 3);
 
     let svg = drawn(&root.args(&[&a, &b, &c], &[]));
     assert!(svg.contains("the band is their smallest and largest value"));
@@ -105,7 +105,7 @@ fn smoothing_is_a_mean_over_the_frames_before_and_said() {
     let mut args = root.args(&[&a], &["mean_return"]);
     args.smooth = Some(15);
     let runs = [read(&a)];
-    let curve = groups::of(&runs, true)[0].curve("mean_return", &args);
+    let curve = groups::group_runs(&runs, true)[0].curve("mean_return", &args);
     assert_eq!(curve.unwrap().points, [(10.0, 1.5), (20.0, 2.0)]);
     let expected = "Smoothed: each point is the mean over the 15 frames before it.";
     assert!(drawn(&args).contains(expected));
@@ -130,7 +130,7 @@ fn lines_are_called_by_what_differs_and_by_their_seeds() {
         read(&folder)
     });
     let names = |together| -> Vec<String> {
-        let groups = groups::of(&runs, together).into_iter();
+        let groups = groups::group_runs(&runs, together).into_iter();
         groups.map(|group| group.name).collect()
     };
     let expected = [
@@ -173,12 +173,12 @@ fn a_random_policy_is_a_line() {
 fn random_policies_of_two_worlds_are_two_lines_that_can_be_told_apart() {
     let curve = Series::line("chain c51", 0, vec![(0.0, 1.0), (30.0, 2.0)]);
     let worlds = [("chain".to_owned(), 0.5), ("ising".to_owned(), 0.6)];
-    let drawn = lines(&worlds, std::slice::from_ref(&curve), 1);
+    let drawn = random_lines(&worlds, std::slice::from_ref(&curve), 1);
     let names: Vec<_> = drawn.iter().map(|it| it.name.as_str()).collect();
     assert_eq!(names, ["random policy, chain", "random policy, ising"]);
     assert_ne!(drawn[0].colour, drawn[1].colour);
     assert!(drawn.iter().all(|it| it.colour != curve.colour));
-    assert_eq!(lines(&worlds[..1], &[curve], 1)[0].colour, GREY);
+    assert_eq!(random_lines(&worlds[..1], &[curve], 1)[0].colour, GREY);
 }
 
 #[test]
@@ -191,7 +191,7 @@ fn a_run_without_an_episode_is_named() {
         "{} is not in the chart of mean_return: no episode has ended in it",
         empty.display()
     );
-    assert!(absent(RETURN, &runs).eq([expected]));
+    assert!(missing_messages(RETURN, &runs).eq([expected]));
 }
 
 #[test]

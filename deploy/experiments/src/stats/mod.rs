@@ -48,13 +48,13 @@ pub(crate) struct Difference {
     pub(crate) interval: Interval,
     /// Whether 0 is outside the interval and the exact permutation test gives p <= 5%. The second condition is needed because a few values
     /// may nearly coincide, and then the interval is too narrow. With more than 20 values the interval alone decides.
-    pub(crate) is_apart: bool,
+    pub(crate) differs: bool,
 }
 
 impl Difference {
     /// Returns the verdict as the end of a sentence.
     pub(crate) const fn verdict(&self) -> &'static str {
-        match (self.is_apart, self.interval.mean > 0.0) {
+        match (self.differs, self.interval.mean > 0.0) {
             (false, _) => "",
             (true, true) => ", better than its base",
             (true, false) => ", worse than its base",
@@ -64,77 +64,77 @@ impl Difference {
 
 /// Returns the mean of `to` minus the mean of `from`; `None` if either is empty.
 pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
-    let interval = welch(from, to)?;
+    let interval = welch_interval(from, to)?;
     let excludes_zero = |(low, high)| low > 0.0 || high < 0.0;
-    let is_apart = interval.ends.is_some_and(excludes_zero)
-        && chance_of_difference(from, to).is_none_or(|it| it <= CHANCE_MAX);
-    Some(Difference { interval, is_apart })
+    let differs = interval.ends.is_some_and(excludes_zero)
+        && permutation_p_value(from, to).is_none_or(|it| it <= P_VALUE_MAX);
+    Some(Difference { interval, differs })
 }
 
-fn welch(from: &[f64], to: &[f64]) -> Option<Interval> {
+fn welch_interval(from: &[f64], to: &[f64]) -> Option<Interval> {
     let [from, to] = [from, to].map(|it| Spread::of(it.iter().copied()));
     let (from, to) = from.zip(to)?;
     let mean = to.mean - from.mean;
     if from.count < 2 || to.count < 2 {
         return Some(Interval { mean, ends: None });
     }
-    let square = |it: &Spread| it.sd.powi(2) / it.count as f64;
-    let (a, b) = (square(&from), square(&to));
-    let by = match a + b {
+    let variance_of_mean = |it: &Spread| it.sd.powi(2) / it.count as f64;
+    let (a, b) = (variance_of_mean(&from), variance_of_mean(&to));
+    let half_width = match a + b {
         0.0 => 0.0,
         sum => {
             let each = a * a / (from.count - 1) as f64 + b * b / (to.count - 1) as f64;
             student_quantile((sum * sum / each) as usize) * sum.sqrt()
         }
     };
-    let ends = Some((mean - by, mean + by));
+    let ends = Some((mean - half_width, mean + half_width));
     Some(Interval { mean, ends })
 }
 
-/// The number of simulated pairs of samples in [`apart_by_chance`].
-const SAMPLES: usize = 2_000;
+/// The number of simulated pairs of samples in [`false_positive_rate`].
+const SIMULATIONS: usize = 2_000;
 
 /// Returns the share of pairs of samples of these sizes that [`difference`] calls apart although both have the same normal distribution.
-pub(crate) fn apart_by_chance(from: usize, to: usize) -> f64 {
+pub(crate) fn false_positive_rate(from: usize, to: usize) -> f64 {
     // The seed is fixed, so that the same sizes give the same page.
     let mut rng = ChaCha8Rng::seed_from_u64(0);
-    let mut sample = |count: usize| -> Vec<f64> { (0..count).map(|_| normal(&mut rng)).collect() };
-    let apart = (0..SAMPLES).filter(|_| {
+    let mut sample = |n: usize| -> Vec<f64> { (0..n).map(|_| draw_normal(&mut rng)).collect() };
+    let apart = (0..SIMULATIONS).filter(|_| {
         let found = difference(&sample(from), &sample(to));
-        found.is_some_and(|it| it.is_apart)
+        found.is_some_and(|it| it.differs)
     });
-    apart.count() as f64 / SAMPLES as f64
+    apart.count() as f64 / SIMULATIONS as f64
 }
 
 /// Draws from the standard normal distribution. Source: Box and Muller 1958.
-fn normal(rng: &mut impl Rng) -> f64 {
+fn draw_normal(rng: &mut impl Rng) -> f64 {
     let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
     radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
 }
 
 /// The largest p-value of the permutation test at which means count as apart.
-const CHANCE_MAX: f64 = 0.05;
-/// The most values for which [`chance_of_difference`] tries all ways to deal them: at most 184,756.
-const DEALT_MAX: usize = 20;
+const P_VALUE_MAX: f64 = 0.05;
+/// The most values for which [`permutation_p_value`] tries all ways to deal them: at most 184,756.
+const DEALT_VALUES_MAX: usize = 20;
 
 /// Returns the p-value of the exact permutation test: the chance that the means are at least as far apart if all values are dealt to the
 /// two sides at random. It assumes no distribution. `None` if either side is empty, or for more than 20 values.
-fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
+fn permutation_p_value(from: &[f64], to: &[f64]) -> Option<f64> {
     let all = [from, to].concat();
-    if from.is_empty() || to.is_empty() || all.len() > DEALT_MAX {
+    if from.is_empty() || to.is_empty() || all.len() > DEALT_VALUES_MAX {
         return None;
     }
     let total: f64 = all.iter().sum();
-    let apart = |dealt: u32| {
+    let distance = |dealt: u32| {
         let chosen = (0..all.len()).filter(|at| dealt >> at & 1 == 1);
         let sum: f64 = chosen.map(|at| all[at]).sum();
         (sum / to.len() as f64 - (total - sum) / from.len() as f64).abs()
     };
-    let seen = apart(((1 << to.len()) - 1) << from.len());
+    let observed = distance(((1 << to.len()) - 1) << from.len());
     // Sums in another order may differ in their last digits.
-    let least = seen - 1e-9 * (1.0 + seen);
+    let threshold = observed - 1e-9 * (1.0 + observed);
     let deals = (0..1u32 << all.len()).filter(|it| it.count_ones() as usize == to.len());
-    let (far, near): (Vec<_>, Vec<_>) = deals.partition(|&deal| apart(deal) >= least);
+    let (far, near): (Vec<_>, Vec<_>) = deals.partition(|&deal| distance(deal) >= threshold);
     Some(far.len() as f64 / (far.len() + near.len()) as f64)
 }
 
@@ -166,16 +166,16 @@ pub(crate) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
     (pairs.len() > 2 && scale > 0.0).then(|| product(&x, &y) / scale)
 }
 
-/// Returns the probability that a score of `yes` is above one of `no`, ties counting half: the area under the ROC curve.
+/// Returns the probability that a score of `positives` is above one of `negatives`, ties counting half: the area under the ROC curve.
 ///
 /// It is 0.5 for scores without information, and `None` if either is empty. Scores must be finite.
-pub(crate) fn auc(yes: &[f64], no: &[f64]) -> Option<f64> {
-    if yes.is_empty() || no.is_empty() {
+pub(crate) fn auc(positives: &[f64], negatives: &[f64]) -> Option<f64> {
+    if positives.is_empty() || negatives.is_empty() {
         return None;
     }
-    let all: Vec<f64> = yes.iter().chain(no).copied().collect();
-    let sum: f64 = ranks(&all)[..yes.len()].iter().sum();
-    let (n, m) = (yes.len() as f64, no.len() as f64);
+    let all: Vec<f64> = positives.iter().chain(negatives).copied().collect();
+    let sum: f64 = ranks(&all)[..positives.len()].iter().sum();
+    let (n, m) = (positives.len() as f64, negatives.len() as f64);
     Some((sum - n * (n + 1.0) / 2.0) / (n * m))
 }
 
@@ -191,7 +191,7 @@ mod tests {
         assert!((low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
         assert_eq!(found.interval.mean, 3.0);
         let one = difference(&[1.0], &[4.0, 5.0]).unwrap();
-        assert_eq!((one.interval.ends, one.is_apart), (None, false));
+        assert_eq!((one.interval.ends, one.differs), (None, false));
         let equal = difference(&[1.0; 2], &[2.0; 2]).unwrap();
         assert_eq!(equal.interval.ends, Some((1.0, 1.0)));
         assert_eq!(difference(&[], &[1.0]), None);
@@ -200,9 +200,9 @@ mod tests {
     #[test]
     fn two_tests_call_fewer_apart_by_chance_than_one() {
         // Three and six values can be dealt in 84 ways, and 4 of 84 is the largest p-value up to 5%.
-        let chance = apart_by_chance(6, 3);
+        let chance = false_positive_rate(6, 3);
         assert!((0.018..0.036).contains(&chance), "{chance}");
-        assert_eq!(apart_by_chance(6, 1), 0.0);
+        assert_eq!(false_positive_rate(6, 1), 0.0);
     }
 
     #[test]
@@ -224,14 +224,14 @@ mod tests {
 
     #[test]
     fn auc_is_the_share_of_pairs_in_order() {
-        for (yes, no, expected) in [
+        for (positives, negatives, expected) in [
             (&[2.0, 3.0][..], &[0.0, 1.0][..], Some(1.0)),
             (&[1.0], &[1.0], Some(0.5)),
             // Of the six pairs four are in order (2 > 1, 4 > 1, 4 > 3, 4 > 2), one is not (2 < 3), and one is a tie (2 = 2).
             (&[2.0, 4.0], &[1.0, 3.0, 2.0], Some(4.5 / 6.0)),
             (&[], &[1.0], None),
         ] {
-            assert_eq!(auc(yes, no), expected);
+            assert_eq!(auc(positives, negatives), expected);
         }
     }
 
@@ -239,17 +239,17 @@ mod tests {
     fn a_permutation_test_counts_deals() {
         let is = |found: Option<f64>, chance: f64| (found.unwrap() - chance).abs() < 1e-12;
         // Of the 10 ways to deal five values, one is as far apart in this direction, and one in the other.
-        let found = chance_of_difference(&[1.0, 2.0, 3.0], &[4.0, 5.0]);
+        let found = permutation_p_value(&[1.0, 2.0, 3.0], &[4.0, 5.0]);
         assert!(is(found, 0.2), "{found:?}");
-        let found = chance_of_difference(&[1.0, 1.1, 0.9, 1.2, 0.8, 1.0], &[3.0, 3.1, 2.9]);
+        let found = permutation_p_value(&[1.0, 1.1, 0.9, 1.2, 0.8, 1.0], &[3.0, 3.1, 2.9]);
         assert!(is(found, 1.0 / 84.0), "{found:?}");
         // Three values that nearly coincide with two of six: Welch's interval excludes 0, but the permutation test finds chance.
         let (from, to) = ([2.0, 2.02, 0.0, 0.0, 0.0, 0.02], [2.0, 2.01, 2.04]);
         let judged = difference(&from, &to).unwrap();
-        assert!(judged.interval.ends.unwrap().0 > 0.0 && !judged.is_apart);
-        let found = chance_of_difference(&from, &to);
+        assert!(judged.interval.ends.unwrap().0 > 0.0 && !judged.differs);
+        let found = permutation_p_value(&from, &to);
         assert!(is(found, 9.0 / 84.0), "{found:?}");
-        assert_eq!(chance_of_difference(&[1.0], &[]), None);
-        assert_eq!(chance_of_difference(&[1.0; 20], &[2.0]), None);
+        assert_eq!(permutation_p_value(&[1.0], &[]), None);
+        assert_eq!(permutation_p_value(&[1.0; 20], &[2.0]), None);
     }
 }

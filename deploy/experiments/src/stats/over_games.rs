@@ -9,15 +9,15 @@ pub(crate) type Scores = Vec<Vec<f64>>;
 
 /// Returns the interquartile mean (the mean of the middle half of all scores) and its interval.
 pub(crate) fn iqm(scores: &Scores) -> Option<Interval> {
-    estimate(&[scores], |it| interquartile_mean(it[0].iter().flatten()))
+    jackknife(&[scores], |it| interquartile_mean(it[0].iter().flatten()))
 }
 
 /// Returns the probability that a run of `x` scores higher than a run of `y` in a game drawn at random, and its interval.
 ///
 /// `1/M sum_m 1/(N_x N_y) sum_ij [x_mi > y_mj] + [x_mi = y_mj] / 2` over the M games, which `x` and `y` share.
-pub(crate) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
+pub(crate) fn improvement_chance(x: &Scores, y: &Scores) -> Option<Interval> {
     assert_eq!(x.len(), y.len(), "the same games");
-    let found = estimate(&[x, y], |it| {
+    let found = jackknife(&[x, y], |it| {
         let games = it[0].iter().zip(&it[1]);
         games.filter_map(|(x, y)| auc(x, y)).sum::<f64>() / it[0].len() as f64
     })?;
@@ -34,24 +34,24 @@ fn interquartile_mean<'a>(scores: impl Iterator<Item = &'a f64>) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// Returns `of(groups)` and its interval over seeds by the jackknife: Student's interval of the pseudo-values `p_i = n v - (n - 1) v_i`.
+/// Returns `statistic(groups)` and its interval over seeds by the jackknife: Student's interval of pseudo-values `p_i = n v - (n - 1) v_i`.
 /// `v` uses all scores, `v_i` those without seed i of each game. A game with one seed leaves no ends. Seeds beyond the smallest number
 /// in a game are never left out. For a mean this is Student's interval itself. Source: Tukey 1958.
-fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Interval> {
+fn jackknife(groups: &[&Scores], statistic: impl Fn(&[Scores]) -> f64) -> Option<Interval> {
     let all: Vec<Scores> = groups.iter().map(|&scores| scores.clone()).collect();
     let seeds = all.iter().flatten().map(Vec::len).min();
     let seeds = seeds.filter(|seeds| *seeds > 0)?;
-    let mean = of(&all);
+    let mean = statistic(&all);
     let pseudo_value = |seed: usize| {
         let mut others = all.clone();
         others.iter_mut().flatten().for_each(|scores| {
             scores.remove(seed);
         });
-        seeds as f64 * mean - (seeds - 1) as f64 * of(&others)
+        seeds as f64 * mean - (seeds - 1) as f64 * statistic(&others)
     };
     let found = interval(&(0..seeds).map(pseudo_value).collect::<Vec<_>>())?;
-    let around = |end: f64| mean + end - found.mean;
-    let ends = found.ends.map(|(low, high)| (around(low), around(high)));
+    let shifted = |end: f64| mean + end - found.mean;
+    let ends = found.ends.map(|(low, high)| (shifted(low), shifted(high)));
     Some(Interval { mean, ends })
 }
 
@@ -76,16 +76,16 @@ mod tests {
         let x = vec![vec![1.0, 3.0], vec![5.0]];
         let y = vec![vec![2.0, 3.0], vec![4.0]];
         // First game: 1 < 2, 1 < 3, 3 > 2, 3 = 3: 1.5 of 4. Second: 1.
-        let found = improvement(&x, &y).unwrap();
+        let found = improvement_chance(&x, &y).unwrap();
         assert_eq!(found.mean, (1.5 / 4.0 + 1.0) / 2.0);
-        let other = improvement(&y, &x).unwrap();
+        let other = improvement_chance(&y, &x).unwrap();
         assert!((found.mean + other.mean - 1.0).abs() < 1e-12);
         assert_eq!(found.ends, None, "of one game there is one seed");
         let one_each = iqm(&vec![vec![0.1], vec![0.3]]).unwrap();
         assert_eq!((one_each.mean, one_each.ends), (0.2, None));
-        assert_eq!(improvement(&vec![], &vec![]), None);
+        assert_eq!(improvement_chance(&vec![], &vec![]), None);
         // In one game no run has finished an episode.
-        assert_eq!(improvement(&vec![vec![], vec![1.0]], &y), None);
+        assert_eq!(improvement_chance(&vec![vec![], vec![1.0]], &y), None);
     }
 
     #[test]
@@ -106,7 +106,7 @@ mod tests {
                     u32::from((low..=high).contains(&0.5))
                 };
                 of_iqm += has(iqm(&x));
-                of_improvement += has(improvement(&x, &y));
+                of_improvement += has(improvement_chance(&x, &y));
             }
             for count in [of_iqm, of_improvement] {
                 let share = f64::from(count) / f64::from(rounds);

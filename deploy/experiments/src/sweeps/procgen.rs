@@ -16,10 +16,10 @@ use self::settings::{CHECKPOINTS, NAME, Point, Settings};
 use crate::{
     cache::Session,
     flags::ProcgenArgs,
-    plot::{Band, Run, over_seeds},
+    plot::{Band, Run, combine_seeds},
     stats::{
         Spread, mean,
-        over_games::{Scores, improvement, iqm},
+        over_games::{Scores, improvement_chance, iqm},
     },
     sweep::{
         plan::{FinishedRun, PlannedRun, PointRun, install_worlds},
@@ -157,7 +157,7 @@ fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
         for (index, agent) in settings.agents.iter().enumerate() {
             let each = of(scored, game, agent).map(|it| it.metrics.values("frames", "mean_return"));
             let each = each.collect::<Result<Vec<_>, _>>()?;
-            let curve = over_seeds(&each, Band::Range);
+            let curve = combine_seeds(&each, Band::Range);
             if curve.points.is_empty() {
                 continue;
             }
@@ -206,7 +206,7 @@ fn values(settings: &Settings, scored: &[Scored]) -> Value {
     let others = others.filter(|_| has_seeds(settings, scored));
     let improvements = others.filter_map(|agent| {
         let [own, first] = [agent, &agents[0]].map(|agent| scores(agent, |it| it.training));
-        let chance = format!("{:.3}", improvement(&own, &first)?);
+        let chance = format!("{:.3}", improvement_chance(&own, &first)?);
         Some(context! { agent, chance })
     });
     let games = games.iter().map(|name| {

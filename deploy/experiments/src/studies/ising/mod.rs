@@ -161,7 +161,7 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
             let values = trained.iter().map(|one| value(&one.checks[at].1));
             (*update as f64, values.collect())
         });
-        Curve::of_means(means, Band::Range).series(name, index)
+        Curve::from_values(means, Band::Range).series(name, index)
     };
     let ends = vec![(0.0, 0.5), (task.settings.updates as f64, 0.5)];
     let nothing = Series::line("nothing told", 0, ends).with_colour(GREY);

@@ -67,7 +67,7 @@ fn numerical(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
 fn information(results: &Results) -> Panel {
     let alphas = results.settings.alphas.iter();
     let learnt = alphas.map(|&alpha| (alpha, results.learnt_information(alpha)));
-    let learnt = Curve::of_means(learnt, Band::Range).series("learnt", 1);
+    let learnt = Curve::from_values(learnt, Band::Range).series("learnt", 1);
     let of_a_ring = Chain::mutual_information_of_a_ring;
     let ring = closed_form(results, "a ring, no ends", of_a_ring).with_colour(GREY);
     let series = vec![
@@ -136,7 +136,7 @@ fn by_sampling(
             let x = x(&results.chain(alpha), index as f64 - 1.0);
             (x, values.collect())
         });
-        let curve = Curve::of_means(means, Band::Range).series(sampling.name(), index);
+        let curve = Curve::from_values(means, Band::Range).series(sampling.name(), index);
         curve.with_mark(Mark::Bars)
     };
     Sampling::ALL.iter().enumerate().map(of).collect()

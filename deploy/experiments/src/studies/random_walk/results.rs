@@ -98,7 +98,7 @@ impl Results {
             let values = each.iter().map(|one| one.learnt.tv[at]);
             (update as f64, values.collect())
         });
-        Curve::of_means(means, Band::Range)
+        Curve::from_values(means, Band::Range)
     }
 
     /// Returns for each seed the rank correlation over alpha between 1 / gap and the updates until convergence.

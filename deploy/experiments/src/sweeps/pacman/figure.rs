@@ -5,7 +5,7 @@ use driml_protocol::RETURNS_OF;
 
 use super::results::{LOSSES, Results};
 use crate::{
-    plot::{Band, over_seeds, smoothed},
+    plot::{Band, combine_seeds, smooth},
     stats::Spread,
 };
 
@@ -21,8 +21,8 @@ pub(super) fn figure(results: &Results) -> Figure {
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
             let window = settings.predictability.frames as f64 * SMOOTH;
             let each = results.losses(column, epsilon);
-            let each: Vec<_> = each.map(|it| smoothed(&it.points, window)).collect();
-            let curve = over_seeds(&each, Band::Range);
+            let each: Vec<_> = each.map(|it| smooth(&it.points, window)).collect();
+            let curve = combine_seeds(&each, Band::Range);
             series.push(curve.series(&format!("epsilon {epsilon}"), index));
         }
         let title = format!("(a) DIM loss, {what} features");
@@ -67,7 +67,7 @@ fn task_series(results: &Results, part: usize) -> Vec<Series> {
     for (index, agent) in results.settings.agents.iter().enumerate() {
         let own = || results.traces(part, agent);
         let each: Vec<_> = own().map(|trace| trace.points.clone()).collect();
-        let curve = over_seeds(&each, Band::Range);
+        let curve = combine_seeds(&each, Band::Range);
         series.push(curve.series(agent, index));
         let tasks = if index == 0 { continual.tasks } else { 0 };
         for task in 0..tasks {

@@ -4,7 +4,7 @@ use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
 use super::results::{FRAMES_PER_SECOND, Measure, PointResult, Results};
 use crate::{
-    plot::{Band, over_seeds},
+    plot::{Band, combine_seeds},
     stats::Spread,
 };
 
@@ -90,7 +90,7 @@ pub(super) fn wall(results: &Results) -> Figure {
     let panels = results.by_dial().map(|rows| {
         let series = rows.iter().enumerate().map(|(index, row)| {
             let each = row.result.seeds.iter().map(|it| it.curve.clone());
-            let curve = over_seeds(&each.collect::<Vec<_>>(), Band::Range);
+            let curve = combine_seeds(&each.collect::<Vec<_>>(), Band::Range);
             curve.series(row.name, index)
         });
         let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));

@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     cache::Session,
-    stats::{Interval, apart_by_chance, difference, mean},
+    stats::{Interval, difference, false_positive_rate, mean},
 };
 
 /// The columns of the benchmark and of the errors against the reference.
@@ -194,7 +194,7 @@ fn by_chance(results: &Results) -> (usize, f64) {
     let judged = each.filter(|counts| counts.iter().all(|&it| it > 1));
     let chances = judged.map(|counts| {
         let known = known.entry(counts);
-        *known.or_insert_with(|| apart_by_chance(counts[0], counts[1]))
+        *known.or_insert_with(|| false_positive_rate(counts[0], counts[1]))
     });
     chances.fold((0, 0.0), |(count, sum), chance| (count + 1, sum + chance))
 }
