@@ -43,7 +43,7 @@ impl DimLearner {
     }
 
     /// Makes one update with the InfoNCE loss of the only pair (of 3t3, 3t4, 4t3, 4t4) with a weight. Returns the loss before the update.
-    pub(super) fn learn(&mut self, now: &Features, next: &Features) -> anyhow::Result<f32> {
+    pub(super) fn update(&mut self, now: &Features, next: &Features) -> anyhow::Result<f32> {
         let rows = now.f4.dim(0)?;
         let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
         let (network, valid) = (&self.network, vec![1; rows]);

@@ -33,7 +33,7 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let results = Results::read(settings, made)?;
     session.save_figure("fig3", &figure::figure(&results))?;
     write_data(&session, &results)?;
-    session.write_page(include_str!("pacman.md.j2"), values(&results))
+    session.write_page(include_str!("pacman.md.j2"), page_values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -71,20 +71,20 @@ fn differences(part: usize, results: &Results) -> Vec<Value> {
         row(agent, None, gains.collect())
     });
     let above_first = agents.iter().skip(1).map(|agent| {
-        let above = results.traces(part, agent).filter_map(|it| {
+        let gains_over_first = results.traces(part, agent).filter_map(|it| {
             let mut of_first = results.traces(part, &agents[0]);
             let other = of_first.find(|other| other.seed == it.seed)?;
-            Some(it.over_tasks()? - other.over_tasks()?)
+            Some(it.mean_over_tasks()? - other.mean_over_tasks()?)
         });
-        row(agent, Some(&agents[0]), above.collect())
+        row(agent, Some(&agents[0]), gains_over_first.collect())
     });
     gains.chain(above_first).flatten().collect()
 }
 
-fn values(results: &Results) -> Value {
+fn page_values(results: &Results) -> Value {
     let settings = &results.settings;
     let ranks = LOSSES.iter().filter_map(|(column, what)| {
-        let (rank, runs) = results.order_of_epsilon(column)?;
+        let (rank, runs) = results.epsilon_correlation(column)?;
         Some(context! { what, rank, runs })
     });
     let differences = (0..PARTS).flat_map(|part| differences(part, results));

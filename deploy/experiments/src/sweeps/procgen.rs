@@ -12,7 +12,7 @@ use driml_protocol::RETURNS_OF;
 use minijinja::{Value, context};
 use serde::Serialize;
 
-use self::settings::{CHECKPOINTS, NAME, Point, Settings};
+use self::settings::{CHECKPOINTS_PLAYED, NAME, Point, Settings};
 use crate::{
     cache::Session,
     flags::ProcgenArgs,
@@ -25,18 +25,18 @@ use crate::{
         plan::{FinishedRun, PlannedRun, PointRun, install_worlds},
         queue,
     },
-    sweeps::published::{normalised, paper},
+    sweeps::published::{normalise, paper_return},
 };
 
 /// A mean return counts as above that of the random policy if the difference exceeds this many standard errors.
-const ERRORS: f64 = 2.0;
+const STANDARD_ERRORS: f64 = 2.0;
 const PAPER_FRAMES: f64 = 50e6;
 /// The fewest seeds for each game and agent with which scores over all games are computed.
 const SEEDS_MIN: usize = 3;
 
 /// Makes the runs, plays with them, and writes the table, the figure and the page.
 pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
-    let settings = Settings::of(args)?;
+    let settings = Settings::from_args(args)?;
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
     let play = settings.play_settings(Levels::Train);
@@ -52,11 +52,11 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
         let greedy = play.play_greedy(&mut session, &format!("{}-greedy", plan.name), &run)?;
         let greedy = greedy.unwrap_or_default();
         let random = play.play_random(&mut session, &format!("{}-at-random", point.game), &run)?;
-        scored.push(Scored {
+        scored.push(Row {
             training: run.summary.mean_return,
             greedy: mean(&greedy),
             random: mean(&random),
-            is_above_random: is_above(&greedy, &random),
+            is_above_random: is_clearly_above(&greedy, &random),
             single: None,
             metrics: Run::read(&run.folder)?,
             point,
@@ -66,23 +66,23 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     }
     write_data(&session, &scored)?;
     session.save_figure("curves", &figure(&settings, &scored)?)?;
-    if has_seeds(&settings, &scored) {
+    if has_enough_seeds(&settings, &scored) {
         let play = settings.play_settings(Levels::TrainSingle);
         for it in &mut scored {
             session.progress().add_work(play.units);
             let key = format!("{}-single", it.plan.name);
             let returns = play.play_greedy(&mut session, &key, &it.run)?;
             let score = returns.and_then(|it| mean(&it));
-            it.single = score.and_then(|score| normalised(&it.point.game, score));
+            it.single = score.and_then(|score| normalise(&it.point.game, score));
         }
     }
-    let values = values(&settings, &scored);
+    let values = page_values(&settings, &scored);
     session.write_page(include_str!("procgen.md.j2"), values)
 }
 
 /// A finished run and its mean returns: a line of the table, and an entry of the page.
 #[derive(Serialize)]
-struct Scored {
+struct Row {
     #[serde(flatten)]
     point: Point,
     #[serde(skip)]
@@ -102,32 +102,32 @@ struct Scored {
     single: Option<f64>,
 }
 
-fn is_above(greedy: &[f64], random: &[f64]) -> bool {
+fn is_clearly_above(greedy: &[f64], random: &[f64]) -> bool {
     let spreads = [greedy, random].map(|it| Spread::of(it.iter().copied()));
     let [Some(greedy), Some(random)] = spreads else {
         return false;
     };
     let error = |it: Spread| it.sd.powi(2) / it.count as f64;
-    greedy.mean - random.mean > ERRORS * (error(greedy) + error(random)).sqrt()
+    greedy.mean - random.mean > STANDARD_ERRORS * (error(greedy) + error(random)).sqrt()
 }
 
 /// Returns the games that have a run, sorted by name.
-fn games(all: &[Scored]) -> BTreeSet<&str> {
+fn games(all: &[Row]) -> BTreeSet<&str> {
     all.iter().map(|it| it.point.game.as_str()).collect()
 }
 
 /// Returns the runs of an agent in a game.
-fn of<'a>(all: &'a [Scored], game: &str, agent: &str) -> impl Iterator<Item = &'a Scored> {
+fn runs_of<'a>(all: &'a [Row], game: &str, agent: &str) -> impl Iterator<Item = &'a Row> {
     let all = all.iter();
     all.filter(move |it| it.point.game == game && it.point.agent == agent)
 }
 
-fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
+fn write_data(session: &Session, scored: &[Row]) -> anyhow::Result<()> {
     let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
     let mut rows = Vec::new();
     for it in scored {
         let (point, summary) = (&it.point, &it.run.summary);
-        let paper = paper(&point.game, &point.agent);
+        let paper = paper_return(&point.game, &point.agent);
         let returns = [it.training, it.greedy, it.random, paper];
         let settings = it.metrics.settings.as_ref();
         let settings = settings
@@ -145,25 +145,26 @@ fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
 }
 
 /// Draws the training return over frames, with a chart for each game.
-fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
+fn figure(settings: &Settings, scored: &[Row]) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
     for game in games(scored) {
-        let level = |value: f64| vec![(0.0, value), (settings.frames as f64, value)];
+        let constant = |value: f64| vec![(0.0, value), (settings.frames as f64, value)];
         let mut series = Vec::new();
         let first = scored.iter().find(|it| it.point.game == game);
         if let Some(random) = first.and_then(|it| it.random) {
-            series.push(Series::line("random", 0, level(random)).with_colour(GREY));
+            series.push(Series::line("random", 0, constant(random)).with_colour(GREY));
         }
         for (index, agent) in settings.agents.iter().enumerate() {
-            let each = of(scored, game, agent).map(|it| it.metrics.values("frames", "mean_return"));
+            let each =
+                runs_of(scored, game, agent).map(|it| it.metrics.values("frames", "mean_return"));
             let each = each.collect::<Result<Vec<_>, _>>()?;
             let curve = combine_seeds(&each, Band::Range);
             if curve.points.is_empty() {
                 continue;
             }
             series.push(curve.series(agent, index));
-            if let Some(paper) = paper(game, agent) {
-                series.push(Series::line("", index, level(paper)).with_mark(Mark::Dashed));
+            if let Some(paper) = paper_return(game, agent) {
+                series.push(Series::line("", index, constant(paper)).with_mark(Mark::Dashed));
             }
         }
         let (x, y) = (Axis::linear("frames"), Axis::linear("mean return"));
@@ -182,18 +183,18 @@ fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
 }
 
 /// Whether each game and agent has enough seeds for an interval of scores over all games.
-fn has_seeds(settings: &Settings, scored: &[Scored]) -> bool {
+fn has_enough_seeds(settings: &Settings, scored: &[Row]) -> bool {
     games(scored).into_iter().all(|game| {
         let mut agents = settings.agents.iter();
-        agents.all(|agent| of(scored, game, agent).count() >= SEEDS_MIN)
+        agents.all(|agent| runs_of(scored, game, agent).count() >= SEEDS_MIN)
     })
 }
 
 /// Returns the values for the page template.
-fn values(settings: &Settings, scored: &[Scored]) -> Value {
+fn page_values(settings: &Settings, scored: &[Row]) -> Value {
     let (agents, games) = (&settings.agents, games(scored));
-    let scores = |agent: &String, score: fn(&Scored) -> Option<f64>| -> Scores {
-        let of_game = |game: &&str| of(scored, game, agent).filter_map(score).collect();
+    let scores = |agent: &String, score: fn(&Row) -> Option<f64>| -> Scores {
+        let of_game = |game: &&str| runs_of(scored, game, agent).filter_map(score).collect();
         games.iter().map(of_game).collect()
     };
     let iqms = agents.iter().filter_map(|agent| {
@@ -203,14 +204,14 @@ fn values(settings: &Settings, scored: &[Scored]) -> Value {
         Some(context! { agent, games => scores.len(), score })
     });
     let others = agents.iter().skip(1);
-    let others = others.filter(|_| has_seeds(settings, scored));
+    let others = others.filter(|_| has_enough_seeds(settings, scored));
     let improvements = others.filter_map(|agent| {
         let [own, first] = [agent, &agents[0]].map(|agent| scores(agent, |it| it.training));
         let chance = format!("{:.3}", improvement_chance(&own, &first)?);
         Some(context! { agent, chance })
     });
     let games = games.iter().map(|name| {
-        let paper = agents.iter().map(|agent| paper(name, agent));
+        let paper = agents.iter().map(|agent| paper_return(name, agent));
         context! { name, paper => paper.collect::<Vec<_>>() }
     });
     context! {
@@ -222,9 +223,9 @@ fn values(settings: &Settings, scored: &[Scored]) -> Value {
         iqms => iqms.collect::<Vec<_>>(),
         improvements => improvements.collect::<Vec<_>>(),
         percent => percent(settings.frames as f64 / PAPER_FRAMES),
-        errors => ERRORS,
+        errors => STANDARD_ERRORS,
         returns_of => RETURNS_OF,
-        episodes => CHECKPOINTS * settings.episodes,
+        episodes => CHECKPOINTS_PLAYED * settings.episodes,
         some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),
     }
 }

@@ -5,22 +5,22 @@
 const TABLE: &str = include_str!("published.csv");
 
 /// Returns the lines of the table as cells, beginning with the header.
-fn lines() -> impl Iterator<Item = Vec<&'static str>> {
+fn rows() -> impl Iterator<Item = Vec<&'static str>> {
     let lines = TABLE.lines().filter(|line| !line.starts_with('#'));
     lines.map(|line| line.split(',').collect())
 }
 
 /// Returns the paper's training return of an agent in a game, both by their command-line names; `None` for other worlds or agents.
-pub(super) fn paper(game: &str, agent: &str) -> Option<f64> {
-    let column = lines().next()?.iter().position(|name| *name == agent)?;
-    let line = lines().find(|line| line[0] == game)?;
+pub(super) fn paper_return(game: &str, agent: &str) -> Option<f64> {
+    let column = rows().next()?.iter().position(|name| *name == agent)?;
+    let line = rows().find(|line| line[0] == game)?;
     let mean = line[column].split(' ').next()?;
     Some(mean.parse().expect("it is built in, and a test reads it"))
 }
 
 /// Normalises a return on single levels: `(return - min) / (max - min)`. `None` for worlds other than Procgen.
-pub(super) fn normalised(game: &str, score: f64) -> Option<f64> {
-    let [min, max] = ["easy-min", "easy-max"].map(|what| paper(game, what));
+pub(super) fn normalise(game: &str, score: f64) -> Option<f64> {
+    let [min, max] = ["easy-min", "easy-max"].map(|what| paper_return(game, what));
     let (min, max) = min.zip(max)?;
     Some((score - min) / (max - min))
 }
@@ -32,10 +32,10 @@ mod tests {
     /// Every game has eleven numbers: nine agents, including those of the ablation, and the two ends of the normalisation.
     #[test]
     fn the_table_is_whole_and_is_read_by_name() {
-        let header = lines().next().unwrap();
-        assert_eq!((header.len(), lines().skip(1).count()), (1 + 11, 16));
-        for line in lines().skip(1) {
-            let is_read = |what: &&str| paper(line[0], what).is_some();
+        let header = rows().next().unwrap();
+        assert_eq!((header.len(), rows().skip(1).count()), (1 + 11, 16));
+        for line in rows().skip(1) {
+            let is_read = |what: &&str| paper_return(line[0], what).is_some();
             assert!(header[1..].iter().all(is_read), "{line:?}");
         }
         for (game, agent, wanted) in [
@@ -44,10 +44,10 @@ mod tests {
             ("coinrun", "driml-ada", Some(22.88)),
             ("chain", "c51", None),
         ] {
-            assert_eq!(paper(game, agent), wanted);
+            assert_eq!(paper_return(game, agent), wanted);
         }
-        assert_eq!(normalised("fruitbot", -1.5), Some(0.0));
-        assert_eq!(normalised("bossfight", 13.0), Some(1.0));
-        assert_eq!(normalised("chain", 1.0), None);
+        assert_eq!(normalise("fruitbot", -1.5), Some(0.0));
+        assert_eq!(normalise("bossfight", 13.0), Some(1.0));
+        assert_eq!(normalise("chain", 1.0), None);
     }
 }

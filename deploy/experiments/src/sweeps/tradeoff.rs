@@ -22,9 +22,9 @@ use driml_settings::{config::RunConfig, presets};
 use minijinja::context;
 
 use self::{
-    menu::{LevelOf, Point, Settings},
+    menu::{DialLevel, Point, Settings},
     plan::{Budget, Cost},
-    results::{Measured, PointResult, Results, SeedResult},
+    results::{Numbers, PointResult, Results, SeedResult},
 };
 use crate::{
     cache::{self, Session},
@@ -41,7 +41,7 @@ use crate::{
 };
 
 /// The piece with the list of command lines that made runs in this folder.
-const CALLS: &str = "calls";
+const COMMANDS_KEY: &str = "calls";
 /// A measurement counts as 1 / this of the work of a run, used only to estimate the time left.
 const PIECE_SHARE: u64 = 20;
 /// The factor for what a run does besides updates and actions: replay, messages, and processes that wait for each other.
@@ -54,7 +54,7 @@ struct Tradeoff<'a> {
     settings: Settings,
     session: Session,
     /// The benchmarks of points, by their keys.
-    speeds: BTreeMap<String, Measured>,
+    speeds: BTreeMap<String, Numbers>,
 }
 
 /// Measures what each dial that buys speed costs: plans, benchmarks, trains, and writes the page.
@@ -64,8 +64,8 @@ struct Tradeoff<'a> {
 pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let world = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let name = format!("tradeoff-{}", world.to_string().replace("procgen:", ""));
-    let found = cache::settings_of(&name, &args.flags);
-    let mut settings = Settings::of(args, world, found)?;
+    let stored = cache::settings_of(&name, &args.flags);
+    let mut settings = Settings::from_args(args, world, stored)?;
     let report_only = args.queue.report;
     if !report_only {
         let base = settings.common.config(&settings.levels[0].base)?;
@@ -73,24 +73,24 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     }
     // The budget is the machine time for the runs of this call.
     let (started, budget_seconds) = (Instant::now(), f64::from(args.budget) * 60.0);
-    if settings.frames_open {
-        shorten(&mut settings, args.flags.smoke, budget_seconds)?;
+    if settings.may_shorten {
+        shorten_runs(&mut settings, args.flags.smoke, budget_seconds)?;
     }
-    let mut it = Tradeoff {
+    let mut tradeoff = Tradeoff {
         args,
         session: Session::open(&name, &args.flags, &settings.common, 0, report_only)?,
         settings,
         speeds: BTreeMap::new(),
     };
-    it.measure_speeds()?;
+    tradeoff.measure_speeds()?;
     let left = (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
-    let chosen = it.choose(left)?;
+    let chosen = tradeoff.choose_levels(left)?;
     if args.plan {
         return Ok(());
     }
-    let results = it.make(&chosen)?;
+    let results = tradeoff.make_runs(&chosen)?;
     if results.levels.is_empty() {
-        it.session.check_none_missing()?;
+        tradeoff.session.check_none_missing()?;
         let what = match results.points.is_empty() {
             true => "no run is finished yet",
             false => "no level has a finished run beside its base's",
@@ -99,12 +99,12 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
             usage!("{what}, and none fits into the budget: there is nothing to report").into(),
         );
     }
-    report::report(it.session, &results)
+    report::write_report(tradeoff.session, &results)
 }
 
 /// Makes the runs shorter if not even the first requested level fits into the budget.
-fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow::Result<()> {
-    let Some(level) = settings.levels.iter().find(|it| it.is_asked) else {
+fn shorten_runs(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow::Result<()> {
+    let Some(level) = settings.levels.iter().find(|it| it.is_requested) else {
         return Ok(());
     };
     let base = settings.common.config(&level.base)?;
@@ -112,13 +112,13 @@ fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow:
     for (point, is_base) in [(&level.base, true), (&level.point, false)] {
         let config = settings.common.config(point)?;
         let speed = measured::speeds(&base, &config, smoke)?;
-        seconds += f64::from(settings.seeds_of(is_base)) * estimate(&config, &speed);
+        seconds += f64::from(settings.seed_count(is_base)) * estimate_seconds(&config, &speed);
     }
-    settings.common.frames = plan::frames(settings.common.frames, seconds, budget_seconds);
+    settings.common.frames = plan::choose_frames(settings.common.frames, seconds, budget_seconds);
     Ok(())
 }
 
-fn estimate(config: &RunConfig, speed: &Measured) -> f64 {
+fn estimate_seconds(config: &RunConfig, speed: &Numbers) -> f64 {
     let updates = config.updates() as f64 * speed["update_seconds"];
     let actions = config.frames() as f64 * speed["act_seconds"];
     START_SECONDS + OVERHEAD * (updates + actions)
@@ -133,16 +133,16 @@ impl Tradeoff<'_> {
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
         let (smoke, settings) = (self.args.flags.smoke, &self.settings);
         let (units, program) = (self.piece_units(), cache::program_id()?);
-        for point in settings.levels.iter().flat_map(LevelOf::points) {
+        for point in settings.levels.iter().flat_map(DialLevel::points) {
             if self.speeds.contains_key(&point.key) {
                 continue;
             }
             let key = format!("speed-{}", point.key);
-            let speed = if self.args.queue.report || !settings.asks_for(point) {
+            let speed = if self.args.queue.report || !settings.requests(point) {
                 // Accept the result of any program: only requested points are measured again.
                 self.session.read_piece(&key)
             } else {
-                let base = settings.common.config(settings.base_of(point))?;
+                let base = settings.common.config(settings.timing_base(point))?;
                 let config = settings.common.config(point)?;
                 self.session.progress().add_work(units);
                 let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
@@ -154,20 +154,21 @@ impl Tradeoff<'_> {
     }
 
     /// Returns for each level whether it is run: it is requested and fits into the `left` seconds. Prints this plan. A report runs nothing.
-    fn choose(&self, left: f64) -> anyhow::Result<Vec<bool>> {
+    fn choose_levels(&self, left: f64) -> anyhow::Result<Vec<bool>> {
         let levels = &self.settings.levels;
         if self.args.queue.report {
             return Ok(vec![false; levels.len()]);
         }
         let runs = Runs::open(self.session.folder())?;
-        let mut budget = Budget::of(left);
+        let mut budget = Budget::new(left);
         let (mut chosen, mut asked) = (vec![false; levels.len()], Vec::new());
-        for (of, is_chosen) in levels.iter().zip(&mut chosen).filter(|it| it.0.is_asked) {
-            let [base, level] = of.points().map(|it| self.cost(&runs, it, &of.base));
-            let costs = [base?, level?];
-            *is_chosen = budget.takes(&costs);
+        let all = levels.iter().zip(&mut chosen);
+        for (level, is_chosen) in all.filter(|it| it.0.is_requested) {
+            let [base, level_cost] = level.points().map(|it| self.cost(&runs, it, &level.base));
+            let costs = [base?, level_cost?];
+            *is_chosen = budget.try_take(&costs);
             let [_, Cost { seconds, .. }] = costs;
-            asked.push(context! { name => of.name(), seconds, fits => *is_chosen });
+            asked.push(context! { name => level.name(), seconds, fits => *is_chosen });
         }
         let values = context! {
             settings => self.settings.common,
@@ -185,18 +186,18 @@ impl Tradeoff<'_> {
         let common = &self.settings.common;
         // The seconds of machine time for each finished run of a point.
         let taken = |point: &Point| {
-            let seeds = self.settings.seeds_of(point == base);
-            let plans = (1..=seeds).map(|seed| common.run(point, seed));
+            let seeds = self.settings.seed_count(point == base);
+            let plans = (1..=seeds).map(|seed| common.plan_run(point, seed));
             let finished = plans.filter_map(|plan| runs.get_finished(&plan));
-            Spread::of(finished.map(|ran| ran.summary.wall_seconds / f64::from(common.jobs)))
+            Spread::of(finished.map(|it| it.summary.wall_seconds / f64::from(common.jobs)))
         };
         let estimated = |point: &Point| -> anyhow::Result<Option<f64>> {
             let config = common.config(point)?;
             let speed = self.speeds.get(&point.key);
-            Ok(speed.map(|speed| estimate(&config, speed)))
+            Ok(speed.map(|speed| estimate_seconds(&config, speed)))
         };
         let finished = taken(point);
-        let seeds = self.settings.seeds_of(point == base) as usize;
+        let seeds = self.settings.seed_count(point == base) as usize;
         let unfinished = seeds - finished.map_or(0, |it| it.count);
         let each = match finished {
             _ if unfinished == 0 => 0.0,
@@ -215,19 +216,19 @@ impl Tradeoff<'_> {
     }
 
     /// Returns the runs of the chosen levels and their bases, and all runs that are already finished.
-    fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<PointPlan<Point>>> {
+    fn planned_runs(&self, chosen: &[bool]) -> anyhow::Result<Vec<PointPlan<Point>>> {
         let runs = Runs::open(self.session.folder())?;
         let mut wanted: Vec<PointPlan<Point>> = Vec::new();
         // Ordered by seed, so that a stopped call has one seed of every point before two of any. The page also has further seeds that
         // another call made.
         for seed in 1..=SEEDS_MAX {
-            for (of, &is_chosen) in self.settings.levels.iter().zip(chosen) {
-                for (point, is_base) in [(&of.base, true), (&of.point, false)] {
-                    let run = self.settings.common.run(point, seed);
-                    let is_asked = is_chosen && seed <= self.settings.seeds_of(is_base);
+            for (level, &is_chosen) in self.settings.levels.iter().zip(chosen) {
+                for (point, is_base) in [(&level.base, true), (&level.point, false)] {
+                    let run = self.settings.common.plan_run(point, seed);
+                    let is_requested = is_chosen && seed <= self.settings.seed_count(is_base);
                     // Levels share bases, and a level may be the base of another.
                     let is_new = wanted.iter().all(|(_, known)| known.name != run.name);
-                    if is_new && (is_asked || runs.get_finished(&run).is_some()) {
+                    if is_new && (is_requested || runs.get_finished(&run).is_some()) {
                         wanted.push((point.clone(), run));
                     }
                 }
@@ -237,10 +238,10 @@ impl Tradeoff<'_> {
     }
 
     /// Makes the chosen runs, and plays with the weights of these and of the runs that are already finished.
-    fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
-        let wanted = self.wanted(chosen)?;
-        let (units, report_only) = (self.piece_units(), self.args.queue.report);
-        install_worlds(&wanted, report_only)?;
+    fn make_runs(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
+        let wanted = self.planned_runs(chosen)?;
+        let (units, report) = (self.piece_units(), self.args.queue.report);
+        install_worlds(&wanted, report)?;
         // The agent of each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
         self.session.progress().add_work(units * plays);
@@ -252,7 +253,7 @@ impl Tradeoff<'_> {
             episodes: common.episodes,
             units,
         };
-        let commands = self.commands()?;
+        let commands = self.record_command()?;
         let mut points = BTreeMap::<String, PointResult>::new();
         let mut random = Vec::new();
         for PointRun { point, plan, run } in made {
@@ -264,24 +265,24 @@ impl Tradeoff<'_> {
             let result = points.entry(point.key.clone()).or_default();
             // One run suffices: seeds differ in what they learned, not in the numeric error of the computation.
             if result.seeds.is_empty() {
-                result.measured = self.exactness(&point, &run)?;
+                result.measured = self.measure_errors(&point, &run)?;
                 let speed = self.speeds.get(&point.key).cloned();
                 result.measured.extend(speed.unwrap_or_default());
             }
             result.seeds.push(SeedResult {
                 seed: plan.call.seed,
                 curve: Run::read(&run.folder)?.values("seconds", "mean_return")?,
-                ran: run,
+                run,
                 greedy: greedy.unwrap_or_default(),
             });
         }
         let is_made = |point: &Point| points.contains_key(&point.key);
         let (mut levels, mut left_out) = (Vec::new(), Vec::new());
-        for (of, is_chosen) in self.settings.levels.iter().zip(chosen) {
-            if is_made(&of.point) && is_made(&of.base) && (!report_only || of.is_asked) {
-                levels.push(of.clone());
-            } else if of.is_asked && !is_chosen {
-                left_out.push(of.name());
+        for (level, is_chosen) in self.settings.levels.iter().zip(chosen) {
+            if is_made(&level.point) && is_made(&level.base) && (!report || level.is_requested) {
+                levels.push(level.clone());
+            } else if level.is_requested && !is_chosen {
+                left_out.push(level.name());
             }
         }
         Ok(Results {
@@ -294,7 +295,7 @@ impl Tradeoff<'_> {
         })
     }
 
-    fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
+    fn measure_errors(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Numbers> {
         // Read the config of this run, whose seed may not be 1.
         let (units, config) = (self.piece_units(), read_config(&run.folder)?);
         self.session.progress().add_work(units);
@@ -307,12 +308,12 @@ impl Tradeoff<'_> {
     }
 
     /// Returns the command lines that made the folder's runs, with this one last unless it only reports.
-    fn commands(&self) -> anyhow::Result<Vec<String>> {
-        let mut all: Vec<String> = self.session.read_piece(CALLS).unwrap_or_default();
+    fn record_command(&self) -> anyhow::Result<Vec<String>> {
+        let mut all: Vec<String> = self.session.read_piece(COMMANDS_KEY).unwrap_or_default();
         let this = this_command_line();
         if !all.contains(&this) && !self.args.queue.report {
             all.push(this);
-            self.session.store(CALLS, &all)?;
+            self.session.store(COMMANDS_KEY, &all)?;
         }
         Ok(all)
     }

@@ -10,7 +10,7 @@ use driml_machine::{error::usage, resources::Machine};
 use driml_settings::flags::of_names;
 use minijinja::{Value, context};
 
-use self::training::{Episodes, Measured, Settings, Task, Trained, View, train};
+use self::training::{Episodes, Measurement, Outcome, ReceptiveFields, Settings, Task, train};
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags},
@@ -24,7 +24,7 @@ const SETTINGS: &str = include_str!("config.toml");
 const LOSS_WINDOW: usize = 10;
 
 /// Returns the world, the network and the optimiser as a run would have them.
-fn task(settings: &Settings) -> anyhow::Result<Task> {
+fn new_task(settings: &Settings) -> anyhow::Result<Task> {
     let sets: Vec<_> = settings.sets.iter().map(String::as_str).collect();
     // `driml-fix` gives DIM with k = 1. Nothing else of the agent is used here.
     let config = of_names("paper", "ising", "driml-fix", &sets, &Machine::detect())?;
@@ -44,25 +44,24 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
-    let task = task(&settings)?;
+    let task = new_task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
     let mut session = Session::open(NAME, args, &task, units, false)?;
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
-        let key = format!("seed{seed}");
-        trained.push(
-            session.load_or_make("", &key, settings.updates, |progress| {
+        let piece =
+            session.load_or_make("", &format!("seed{seed}"), settings.updates, |progress| {
                 train(&task, seed.into(), progress)
-            })?,
-        );
+            })?;
+        trained.push(piece);
     }
     write_data(&session, &trained)?;
     session.save_figure("fig2", &fig2(&task, &trained[0])?)?;
-    session.save_figure("learning", &learning(&task, &trained))?;
-    session.write_page(include_str!("page.md.j2"), values(&task, &trained))
+    session.save_figure("learning", &learning_figure(&task, &trained))?;
+    session.write_page(include_str!("page.md.j2"), page_values(&task, &trained))
 }
 
-fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
+fn write_data(session: &Session, trained: &[Outcome]) -> anyhow::Result<()> {
     let seeds = || (1u32..).zip(trained);
     let checks = seeds().flat_map(|(seed, one)| {
         one.checks.iter().map(move |(update, it)| {
@@ -73,7 +72,7 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
     let columns = "seed,updates,auc,auc_raw_score,auc_clear,auc_pairs,loss_nats";
     session.write_csv("auc", columns, checks)?;
     let losses = seeds().flat_map(|(seed, one)| {
-        smoothed(&one.loss).map(move |(update, loss)| (seed, update as u64, rounded(loss)))
+        window_means(&one.loss).map(move |(update, loss)| (seed, update as u64, rounded(loss)))
     });
     session.write_csv("loss", "seed,updates,loss_nats", losses)?;
     let maps = (1u32..).zip(&trained[0].maps).flat_map(|(episode, map)| {
@@ -84,7 +83,7 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
 }
 
 /// Returns (update, mean loss) for each window of `LOSS_WINDOW` updates; the update is the last of its window.
-fn smoothed(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
+fn window_means(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
     loss.chunks(LOSS_WINDOW).enumerate().map(|(index, chunk)| {
         let mean = chunk.iter().copied().map(f64::from).sum::<f64>() / chunk.len() as f64;
         ((index * LOSS_WINDOW + chunk.len()) as f64, mean)
@@ -92,11 +91,11 @@ fn smoothed(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
 }
 
 /// Draws lattices and scores of the first measured episodes.
-fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
+fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
     let settings = &task.settings;
     let early_t = settings.from_t + 1;
     let steps = settings.late_t.max(early_t);
-    let played = Episodes::measured(task, steps)?;
+    let played = Episodes::play_measured(task, steps)?;
     let (side, patch) = (task.world.lattice_size, task.world.patch_size);
     let shown = first.maps.len();
     let outline = |episode: usize| {
@@ -118,7 +117,7 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
         })
     };
     let range = Spread::of(first.maps.iter().flatten().copied());
-    let view = View::of(&task.model);
+    let fields = ReceptiveFields::of(&task.model);
     let title = format!("Scores, t = {} to {early_t}", settings.from_t);
     let scores = |episode: usize| {
         let map = first.maps[episode].iter().map(|score| Some(*score));
@@ -127,11 +126,11 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
             range: range.map(|it| (it.min, it.max)),
             field: Some(Field {
                 side: side as f64,
-                first: (view.side - view.step) as f64 / 2.0,
-                cell: view.step as f64,
+                first: (fields.side - fields.step) as f64 / 2.0,
+                cell: fields.step as f64,
             }),
             outline: Some(outline(episode)),
-            ..Heat::new(&title, view.columns, map.collect())
+            ..Heat::new(&title, fields.columns, map.collect())
         })
     };
     let panels = (0..shown)
@@ -145,7 +144,7 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
              {} episodes, plus ln {}, at each of the {} places of the last convolution.",
             settings.batch_size,
             settings.batch_size,
-            view.columns * view.columns,
+            fields.columns * fields.columns,
         )],
         columns: shown,
         panel_size: (336.0, 280.0),
@@ -154,8 +153,8 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
 }
 
 /// Draws the loss, and how well the scores tell patch from noise, over updates.
-fn learning(task: &Task, trained: &[Trained]) -> Figure {
-    let over = |name: &str, index: usize, value: fn(&Measured) -> f64| {
+fn learning_figure(task: &Task, trained: &[Outcome]) -> Figure {
+    let auc_series = |name: &str, index: usize, value: fn(&Measurement) -> f64| {
         let checks = trained[0].checks.iter().enumerate();
         let means = checks.map(|(at, (update, _))| {
             let values = trained.iter().map(|one| value(&one.checks[at].1));
@@ -164,17 +163,17 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
         Curve::from_values(means, Band::Range).series(name, index)
     };
     let ends = vec![(0.0, 0.5), (task.settings.updates as f64, 0.5)];
-    let nothing = Series::line("nothing told", 0, ends).with_colour(GREY);
-    let pairs = over("in the patch: true pair or other", 1, |it| it.auc_pairs);
+    let no_information = Series::line("nothing told", 0, ends).with_colour(GREY);
+    let pairs = auc_series("in the patch: true pair or other", 1, |it| it.auc_pairs);
     let areas = vec![
-        nothing.with_mark(Mark::Dashed),
-        over("patch or noise", 0, |it| it.auc),
-        over("patch or noise, clear places", 2, |it| it.auc_clear),
+        no_information.with_mark(Mark::Dashed),
+        auc_series("patch or noise", 0, |it| it.auc),
+        auc_series("patch or noise, clear places", 2, |it| it.auc_clear),
         pairs.with_mark(Mark::Dashed),
     ];
     let losses = trained.iter().enumerate().map(|(seed, one)| {
         let name = format!("seed {}", seed + 1);
-        Series::line(&name, seed, smoothed(&one.loss).collect())
+        Series::line(&name, seed, window_means(&one.loss).collect())
     });
     let updates = || Axis::linear("updates");
     let loss = Axis::linear("InfoNCE [nats]");
@@ -195,7 +194,7 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
     }
 }
 
-fn values(task: &Task, trained: &[Trained]) -> Value {
+fn page_values(task: &Task, trained: &[Outcome]) -> Value {
     let last = trained.iter().map(|one| one.checks.last());
     let last: Vec<_> = last.flatten().map(|check| check.1).collect();
     let untrained: Vec<_> = trained.iter().map(|one| one.checks[0].1.auc).collect();
@@ -203,7 +202,7 @@ fn values(task: &Task, trained: &[Trained]) -> Value {
         task,
         settings => task.settings,
         seeds => trained.len(),
-        view => View::of(&task.model).side,
+        view => ReceptiveFields::of(&task.model).side,
         last,
         untrained,
         blind_loss => (task.settings.batch_size as f64).ln(),
@@ -222,7 +221,7 @@ mod tests {
     #[test]
     fn both_lengths_read_and_ask_for_local_dim_alone() {
         for settings in [smoke(), flags::read_settings(NAME, SETTINGS, false)] {
-            let task = task(&settings).unwrap();
+            let task = new_task(&settings).unwrap();
             // From the paper's table of parameters.
             let local = [true, false, false, false];
             assert_eq!(task.learner.lambda.active_pairs(), local);

@@ -48,18 +48,18 @@ pub(super) struct Task {
 const MEASURED_SEED: u64 = 1 << 40;
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct Trained {
+pub(super) struct Outcome {
     /// The InfoNCE loss at each update, in nats.
     pub(super) loss: Vec<f32>,
     /// Measurements, each with its number of updates. The last one is at the end, on more episodes.
-    pub(super) checks: Vec<(u64, Measured)>,
+    pub(super) checks: Vec<(u64, Measurement)>,
     /// Scores at each location, for the first episodes of the last measurement, in nats: log-softmax of the true pair plus ln B.
     pub(super) maps: Vec<Vec<f64>>,
 }
 
 /// How well the scores from `from_t` to the next step classify. Areas under ROC curves: 0.5 is chance, 1 is perfect.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Measured {
+pub(super) struct Measurement {
     /// Locations in the patch against the others. A location is in the patch if the centre of its receptive field is.
     pub(super) auc: f64,
     /// As `auc`, by the raw score without the softmax over other episodes.
@@ -72,16 +72,16 @@ pub(super) struct Measured {
     pub(super) loss: f64,
 }
 
-pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::Result<Trained> {
+pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::Result<Outcome> {
     let settings = &task.settings;
-    let given = &task.learner;
+    let update_settings = &task.learner;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let dim = Dim {
-        lambda: given.lambda,
-        tanh_clip: given.tanh_clip,
+        lambda: update_settings.lambda,
+        tanh_clip: update_settings.tanh_clip,
     };
-    let norm_max = given.max_grad_norm;
-    let mut learner = DimLearner::new(&task.model, dim, given.adam, norm_max, &mut rng)?;
+    let norm_max = update_settings.max_grad_norm;
+    let mut learner = DimLearner::new(&task.model, dim, update_settings.adam, norm_max, &mut rng)?;
     let (mut episodes, mut batches_left) = (Episodes::default(), 0);
     let (mut loss, mut checks) = (Vec::new(), Vec::new());
     let period = (settings.updates / settings.checks.max(1)).max(1);
@@ -97,14 +97,14 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
             episodes = Episodes::play(&task.world, settings.batch_size, batches_left, seed)?;
         }
         batches_left -= 1;
-        let (now, next) = episodes.pairs(settings.batch_size, &mut rng);
+        let (now, next) = episodes.draw_pairs(settings.batch_size, &mut rng);
         let [now, next] = [now, next].map(|frames| features(task, &learner, &frames));
-        loss.push(learner.learn(&now?, &next?)?);
+        loss.push(learner.update(&now?, &next?)?);
         progress.advance(1)?;
     }
     let (last, maps) = measure(task, &learner, settings.episodes)?;
     checks.push((settings.updates, last));
-    Ok(Trained { loss, checks, maps })
+    Ok(Outcome { loss, checks, maps })
 }
 
 /// Frames [T, N, H * W] of whole episodes of N environments, and the first row and column of each patch.
@@ -146,13 +146,13 @@ impl Episodes {
     }
 
     /// Plays the first batch of episodes that [`measure`] uses.
-    pub(super) fn measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
+    pub(super) fn play_measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
         let seed = MEASURED_SEED;
         Self::play(&task.world, task.settings.batch_size, steps, seed)
     }
 
     /// Draws a batch of pairs (s_t, s_{t+1}). Each row is another episode at a random t.
-    fn pairs(&self, rows: usize, rng: &mut ChaCha8Rng) -> (Vec<u8>, Vec<u8>) {
+    fn draw_pairs(&self, rows: usize, rng: &mut ChaCha8Rng) -> (Vec<u8>, Vec<u8>) {
         let (mut now, mut next) = (Vec::new(), Vec::new());
         for row in 0..rows {
             let t = rng.random_range(0..self.frames.len() - 1);
@@ -179,10 +179,10 @@ fn measure(
     task: &Task,
     learner: &DimLearner,
     episodes: usize,
-) -> anyhow::Result<(Measured, Vec<Vec<f64>>)> {
+) -> anyhow::Result<(Measurement, Vec<Vec<f64>>)> {
     let (world, settings) = (&task.world, &task.settings);
     let (rows, t) = (settings.batch_size, settings.from_t as usize);
-    let view = View::of(&task.model);
+    let fields = ReceptiveFields::of(&task.model);
     let mut tally = Tally::default();
     let mut maps = Vec::new();
     for batch in 0..episodes.div_ceil(rows).max(1) {
@@ -194,21 +194,21 @@ fn measure(
         let logs = log_softmax(&scores, rows);
         let locations = scores.len() / (rows * rows);
         for location in 0..locations {
-            let place = (location / view.columns, location % view.columns);
-            let of = |origin: &(usize, usize)| view.cover(place, *origin, world.patch_size);
+            let place = (location / fields.columns, location % fields.columns);
+            let of = |origin: &(usize, usize)| fields.cover(place, *origin, world.patch_size);
             let cover: Vec<Cover> = played.origins.iter().map(of).collect();
             tally.add(location, &cover, &scores, &logs, rows);
         }
         if batch == 0 {
-            let most = (rows as f64).ln();
+            let score_max = (rows as f64).ln();
             let map = |row: usize| {
                 let at = |location: usize| logs[(location * rows + row) * rows + row];
-                (0..locations).map(|it| at(it) + most).collect()
+                (0..locations).map(|it| at(it) + score_max).collect()
             };
             maps = (0..rows.min(3)).map(map).collect();
         }
     }
-    Ok((tally.measured(), maps))
+    Ok((tally.measurement(), maps))
 }
 
 /// Normalises scores [L, B, B] over the candidates of each anchor.
@@ -236,7 +236,7 @@ struct Cover {
 
 /// The receptive fields of the locations of the last convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct View {
+pub(super) struct ReceptiveFields {
     /// The side of a receptive field, in pixels.
     pub(super) side: usize,
     /// The distance between the fields of neighbouring locations, in pixels.
@@ -244,7 +244,7 @@ pub(super) struct View {
     pub(super) columns: usize,
 }
 
-impl View {
+impl ReceptiveFields {
     /// Returns the receptive fields of a network's feature map f3.
     pub(super) fn of(model: &ModelConfig) -> Self {
         let (mut side, mut step) = (1, 1);
@@ -308,12 +308,12 @@ impl Tally {
     }
 
     /// Computes the areas and the loss. An area is 0.5 if a class has no example, which only a very short measurement leaves.
-    fn measured(&self) -> Measured {
+    fn measurement(&self) -> Measurement {
         let area = |[no, yes]: &[Vec<f64>; 2]| auc(yes, no).unwrap_or(0.5);
         let [outside, inside] = &self.inside;
         let all = inside.iter().chain(outside);
         let count = (inside.len() + outside.len()) as f64;
-        Measured {
+        Measurement {
             auc: area(&self.inside),
             auc_raw: area(&self.inside_raw),
             auc_clear: area(&self.whole),
@@ -334,12 +334,12 @@ mod tests {
             kernel,
             stride,
         };
-        let task = super::super::task(&super::super::tests::smoke()).unwrap();
+        let task = super::super::new_task(&super::super::tests::smoke()).unwrap();
         let model = ModelConfig {
             conv: vec![layer(32, 8, 4), layer(64, 4, 2), layer(64, 3, 1)],
             ..task.model
         };
-        let view = View::of(&model);
+        let view = ReceptiveFields::of(&model);
         assert_eq!((view.side, view.step, view.columns), (36, 8, 7));
         assert_eq!(6 * view.step + view.side, 84);
         for (place, centre, whole) in [
@@ -363,10 +363,10 @@ mod tests {
 
     #[test]
     fn episodes_are_whole_and_their_patch_stays() {
-        let task = super::super::task(&super::super::tests::smoke()).unwrap();
-        let played = Episodes::measured(&task, 32).unwrap();
+        let task = super::super::new_task(&super::super::tests::smoke()).unwrap();
+        let played = Episodes::play_measured(&task, 32).unwrap();
         assert_eq!(played.frames.len(), 33);
-        let shorter = Episodes::measured(&task, 3).unwrap();
+        let shorter = Episodes::play_measured(&task, 3).unwrap();
         assert_eq!(shorter.origins, played.origins);
         assert_eq!(shorter.frames[3], played.frames[3]);
     }

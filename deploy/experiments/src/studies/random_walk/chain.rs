@@ -21,7 +21,7 @@ impl Chain {
     }
 
     /// Returns T [K, K], row-major: T[i, j] is the probability of a step from i to j.
-    pub(super) fn transitions(&self) -> Vec<f64> {
+    pub(super) fn transition_matrix(&self) -> Vec<f64> {
         let k = self.states;
         let mut matrix = vec![0.0; k * k];
         for i in 0..k {
@@ -38,12 +38,12 @@ impl Chain {
     fn log_stationary(&self) -> Vec<f64> {
         // The rate is infinite for a walk that only moves in one direction.
         let rate = (self.alpha / (1.0 - self.alpha)).ln().abs();
-        let fall = |away: usize| match away {
+        let log_weight = |d: usize| match d {
             0 => 0.0,
-            away => -(away as f64) * rate,
+            d => -(d as f64) * rate,
         };
-        let sum: f64 = (0..self.states).map(|away| fall(away).exp()).sum();
-        let law = (0..self.states).map(|away| fall(away) - sum.ln());
+        let sum: f64 = (0..self.states).map(|d| log_weight(d).exp()).sum();
+        let law = (0..self.states).map(|d| log_weight(d) - sum.ln());
         match self.alpha > 0.5 {
             true => law.rev().collect(),
             false => law.collect(),
@@ -90,21 +90,21 @@ impl Chain {
     /// Source: Feller, An Introduction to Probability Theory, vol. 1, XVI.3.
     pub(super) fn spectral_gap(&self) -> f64 {
         let (up, down) = (self.alpha.sqrt(), (1.0 - self.alpha).sqrt());
-        let apart = (1.0 - 2.0 * self.alpha) / (up + down);
+        let difference = (1.0 - 2.0 * self.alpha) / (up + down);
         let sine = (std::f64::consts::PI / (2 * self.states) as f64).sin();
-        apart * apart + 4.0 * up * down * sine * sine
+        difference * difference + 4.0 * up * down * sine * sine
     }
 
     /// Returns the stationary distribution as the first row of T^(2^40), scaled to trace 1. All rows are equal.
     fn stationary_numerically(&self) -> Vec<f64> {
-        let mut rows = high_power(self.transitions(), self.states);
+        let mut rows = high_power(self.transition_matrix(), self.states);
         rows.truncate(self.states);
         rows
     }
 
     /// Returns the mutual information as the sum of rho_i T_ij ln(T_ij / rho_j), in nats.
     pub(super) fn mutual_information_numerically(&self) -> f64 {
-        let (t, k) = (self.transitions(), self.states);
+        let (t, k) = (self.transition_matrix(), self.states);
         let rho = self.stationary_numerically();
         let term = |at: usize| match t[at] {
             0.0 => 0.0,
@@ -118,7 +118,7 @@ impl Chain {
     /// The first eigenvalue, 1 with eigenvector sqrt(rho), is removed. Then lambda_2 is the largest, and a high power of 1 + matrix is
     /// v v^T of its eigenvector v.
     pub(super) fn spectral_gap_numerically(&self) -> f64 {
-        let (t, k) = (self.transitions(), self.states);
+        let (t, k) = (self.transition_matrix(), self.states);
         let rho = self.stationary_numerically();
         let entry = |at: usize| {
             let (i, j) = (at / k, at % k);

@@ -5,7 +5,7 @@ use driml_figure::{Axis, Chart, Figure, GREY, Heat, Mark, Panel, Series};
 
 use super::{
     chain::Chain,
-    results::{Measure, Results, SHARE, TV, Trained},
+    results::{Results, TO_SHARE, TO_TV, Trained, UpdatesTo},
     training::Sampling,
 };
 use crate::plot::{Band, Curve};
@@ -40,68 +40,68 @@ pub(super) fn fig1(results: &Results) -> Figure {
         panels: vec![
             heat(of_truth, truth.into_iter().map(Some).collect()),
             heat(of_learnt, learnt.collect()),
-            information(results),
-            inverse_gap(results),
+            information_panel(results),
+            inverse_gap_panel(results),
         ],
     }
 }
 
-fn by_alpha() -> Axis {
+fn alpha_axis() -> Axis {
     Axis::linear("\u{3b1}, probability of a step up").covering(&[0.0, 1.0])
 }
 
 /// Draws a closed form over many biases, so that its curve is smooth.
-fn closed_form(results: &Results, name: &str, value: impl Fn(&Chain) -> f64) -> Series {
+fn closed_form_series(results: &Results, name: &str, value: impl Fn(&Chain) -> f64) -> Series {
     let fine = (1..=97).map(|i| 0.02 + f64::from(i - 1) * 0.01);
     let points = fine.map(|alpha| (alpha, value(&results.chain(alpha))));
     Series::line(name, 0, points.collect())
 }
 
 /// Draws a numerical result as a ring at each alpha of the settings.
-fn numerical(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
+fn numerical_series(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
     let alphas = results.settings.alphas.iter();
     let points = alphas.map(|&alpha| (alpha, value(&results.chain(alpha))));
     Series::line("numerical", 0, points.collect()).with_mark(Mark::Rings)
 }
 
-fn information(results: &Results) -> Panel {
+fn information_panel(results: &Results) -> Panel {
     let alphas = results.settings.alphas.iter();
     let learnt = alphas.map(|&alpha| (alpha, results.learnt_information(alpha)));
     let learnt = Curve::from_values(learnt, Band::Range).series("learnt", 1);
     let of_a_ring = Chain::mutual_information_of_a_ring;
-    let ring = closed_form(results, "a ring, no ends", of_a_ring).with_colour(GREY);
+    let ring = closed_form_series(results, "a ring, no ends", of_a_ring).with_colour(GREY);
     let series = vec![
         ring.with_mark(Mark::Dashed),
-        closed_form(results, "closed form", Chain::mutual_information),
-        numerical(results, Chain::mutual_information_numerically),
+        closed_form_series(results, "closed form", Chain::mutual_information),
+        numerical_series(results, Chain::mutual_information_numerically),
         learnt.with_mark(Mark::Bars),
     ];
     let title = "(c) Mutual information of successive states";
     let y = Axis::linear("I(S, S') [nats]").covering(&[0.0]);
-    Panel::Chart(Chart::new(title, by_alpha(), y, series))
+    Panel::Chart(Chart::new(title, alpha_axis(), y, series))
 }
 
-fn inverse_gap(results: &Results) -> Panel {
+fn inverse_gap_panel(results: &Results) -> Panel {
     let series = vec![
-        closed_form(results, "closed form", |it| 1.0 / it.spectral_gap()),
-        numerical(results, |it| 1.0 / it.spectral_gap_numerically()),
+        closed_form_series(results, "closed form", |it| 1.0 / it.spectral_gap()),
+        numerical_series(results, |it| 1.0 / it.spectral_gap_numerically()),
     ];
     let y = Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").covering(&[0.0]);
     let title = "(d) Inverse spectral gap";
-    Panel::Chart(Chart::new(title, by_alpha(), y, series))
+    Panel::Chart(Chart::new(title, alpha_axis(), y, series))
 }
 
 /// Draws the speed of learning against the spectral gap.
-pub(super) fn convergence(results: &Results) -> Figure {
+pub(super) fn convergence_figure(results: &Results) -> Figure {
     let settings = &results.settings;
-    let times = |title: String, measure: Measure| {
-        let at = |chain: &Chain, aside: f64| (1.0 + 0.035 * aside) / chain.spectral_gap();
-        let series = by_sampling(results, at, |one| measure(one).map(|time| time as f64));
+    let times = |title: String, measure: UpdatesTo| {
+        let at = |chain: &Chain, x_offset: f64| (1.0 + 0.035 * x_offset) / chain.spectral_gap();
+        let series = sampling_series(results, at, |one| measure(one).map(|time| time as f64));
         let x = Axis::log("1 / (1 - \u{3bb}\u{2082}) [steps]");
         Panel::Chart(Chart::new(&title, x, Axis::log("updates"), series))
     };
-    let at = |chain: &Chain, aside: f64| chain.alpha + 0.012 * aside;
-    let last = by_sampling(results, at, |one| Some(one.final_tv()));
+    let at = |chain: &Chain, x_offset: f64| chain.alpha + 0.012 * x_offset;
+    let last = sampling_series(results, at, |one| Some(one.final_tv()));
     let of_tv = format!("Updates until the law is within {}", settings.tv_reached);
     let share = 100.0 * (1.0 - settings.share_reached);
     let of_share = format!("Updates until {share:.0}% of I(S, S') is learnt");
@@ -116,23 +116,23 @@ pub(super) fn convergence(results: &Results) -> Figure {
         columns: 2,
         panel_size: (430.0, 350.0),
         panels: vec![
-            curves(results),
-            times(of_tv, TV),
-            times(of_share, SHARE),
-            Panel::Chart(Chart::new(&of_last, by_alpha(), y, last)),
+            curves_panel(results),
+            times(of_tv, TO_TV),
+            times(of_share, TO_SHARE),
+            Panel::Chart(Chart::new(&of_last, alpha_axis(), y, last)),
         ],
     }
 }
 
 /// Returns for each sampling the mean and range over seeds at each alpha. `x` receives an offset in -1..=1, so that no point hides another.
-fn by_sampling(
+fn sampling_series(
     results: &Results,
     x: impl Fn(&Chain, f64) -> f64,
     value: impl Fn(&Trained) -> Option<f64>,
 ) -> Vec<Series> {
     let of = |(index, &sampling): (usize, &Sampling)| {
         let means = results.settings.alphas.iter().map(|&alpha| {
-            let values = results.of(sampling, alpha).filter_map(&value);
+            let values = results.select(sampling, alpha).filter_map(&value);
             let x = x(&results.chain(alpha), index as f64 - 1.0);
             (x, values.collect())
         });
@@ -142,8 +142,8 @@ fn by_sampling(
     Sampling::ALL.iter().enumerate().map(of).collect()
 }
 
-fn curves(results: &Results) -> Panel {
-    let shown = results.shown().into_iter().enumerate();
+fn curves_panel(results: &Results) -> Panel {
+    let shown = results.shown_alphas().into_iter().enumerate();
     let series = shown.map(|(index, alpha)| {
         let gap = results.chain(alpha).spectral_gap();
         let name = format!("\u{3b1} = {alpha}, gap {gap:.2}");

@@ -11,7 +11,7 @@ use minijinja::{Value, context};
 
 use self::{
     chain::Chain,
-    results::{Measure, Results, SHARE, TV, Trained},
+    results::{Results, TO_SHARE, TO_TV, Trained, UpdatesTo},
     training::{Sampling, Settings, train},
 };
 use crate::{
@@ -55,8 +55,8 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let results = Results { settings, trained };
     write_data(&session, &results)?;
     session.save_figure("fig1", &figures::fig1(&results))?;
-    session.save_figure("convergence", &figures::convergence(&results))?;
-    session.write_page(include_str!("page.md.j2"), values(&results))
+    session.save_figure("convergence", &figures::convergence_figure(&results))?;
+    session.write_page(include_str!("page.md.j2"), page_values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -91,13 +91,13 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         let gap = rounded(one.chain.spectral_gap());
         let of = (one.sampling.name(), one.chain.alpha, one.seed, gap);
         let last = [one.final_tv(), one.final_excess()].map(rounded);
-        (of, TV(one), SHARE(one), last)
+        (of, TO_TV(one), TO_SHARE(one), last)
     });
     let columns =
         "sampling,alpha,seed,gap,updates_to_tv,updates_to_share,final_tv,final_excess_nats";
     session.write_csv("convergence", columns, times)?;
 
-    let curves = results.shown().into_iter().flat_map(|alpha| {
+    let curves = results.shown_alphas().into_iter().flat_map(|alpha| {
         let Curve { points, band } = results.tv_curve(alpha);
         let rows = points.into_iter().zip(band);
         rows.map(move |((updates, mean), (_, min, max))| {
@@ -107,23 +107,23 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     session.write_csv("curves", "alpha,updates,tv_mean,tv_min,tv_max", curves)
 }
 
-fn values(results: &Results) -> Value {
+fn page_values(results: &Results) -> Value {
     let settings = &results.settings;
     let truth = results.true_ratio();
     let of_seed = |one: &Trained| {
         let pairs = one.learnt.ratio.iter().zip(&truth);
         Spread::of(pairs.map(|(learnt, truth)| (learnt - truth).abs()))
     };
-    let at_figure = || results.of(Sampling::Stationary, settings.figure_alpha);
+    let at_figure = || results.select(Sampling::Stationary, settings.figure_alpha);
     let errors: Vec<Spread> = at_figure().filter_map(of_seed).collect();
     let of_errors = |part: fn(&Spread) -> f64| errors.iter().map(part).collect::<Vec<_>>();
-    let holds = |measure: Measure| {
+    let holds = |measure: UpdatesTo| {
         let found = results.gap_correlations(Sampling::Stationary, measure);
         mean(&found).is_some_and(|mean| mean > 0.5)
     };
     let samplings = Sampling::ALL.map(|sampling| {
         let trained = results.trained.iter().filter(|it| it.sampling == sampling);
-        let [tv, share] = [TV, SHARE].map(|measure| results.gap_correlations(sampling, measure));
+        let [tv, share] = [TO_TV, TO_SHARE].map(|it| results.gap_correlations(sampling, it));
         context! {
             name => sampling.name(),
             trained => trained.collect::<Vec<_>>(),
@@ -149,8 +149,8 @@ fn values(results: &Results) -> Value {
         samplings,
         missed => 1.0 - settings.share_reached,
         tv_reached => settings.tv_reached,
-        absolute => holds(TV),
-        relative => holds(SHARE),
+        absolute => holds(TO_TV),
+        relative => holds(TO_SHARE),
         closed_forms,
         most => (settings.states as f64).ln(),
     }

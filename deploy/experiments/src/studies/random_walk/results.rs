@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::{
     chain::Chain,
-    training::{Learnt, Sampling, Settings},
+    training::{Measurements, Sampling, Settings},
 };
 use crate::{
     plot::{Band, Curve},
@@ -19,7 +19,7 @@ pub(super) struct Trained {
     pub(super) sampling: Sampling,
     pub(super) seed: u32,
     #[serde(skip)]
-    pub(super) learnt: Learnt,
+    pub(super) learnt: Measurements,
     /// The updates until the next-state distribution is within `tv_reached`, even if an untrained one is; `None` if it never is.
     pub(super) updates_to_tv: Option<u64>,
     /// The updates until only `share_reached` of the mutual information is missing, however small that is; `None` if that never happens.
@@ -37,9 +37,9 @@ impl Trained {
 }
 
 /// Returns the updates until a training counts as converged, by one criterion.
-pub(super) type Measure = fn(&Trained) -> Option<u64>;
-pub(super) const TV: Measure = |it| it.updates_to_tv;
-pub(super) const SHARE: Measure = |it| it.updates_to_share;
+pub(super) type UpdatesTo = fn(&Trained) -> Option<u64>;
+pub(super) const TO_TV: UpdatesTo = |it| it.updates_to_tv;
+pub(super) const TO_SHARE: UpdatesTo = |it| it.updates_to_share;
 
 pub(super) struct Results {
     pub(super) settings: Settings,
@@ -48,7 +48,7 @@ pub(super) struct Results {
 
 impl Results {
     /// Returns the trainings of one sampling and one bias, over all seeds.
-    pub(super) fn of(&self, sampling: Sampling, alpha: f64) -> impl Iterator<Item = &Trained> {
+    pub(super) fn select(&self, sampling: Sampling, alpha: f64) -> impl Iterator<Item = &Trained> {
         let all = self.trained.iter();
         all.filter(move |one| one.sampling == sampling && one.chain.alpha == alpha)
     }
@@ -60,14 +60,14 @@ impl Results {
     /// Returns T / rho at the figure's bias, [K, K].
     pub(super) fn true_ratio(&self) -> Vec<f64> {
         let chain = self.chain(self.settings.figure_alpha);
-        let (t, rho) = (chain.transitions(), chain.stationary());
+        let (t, rho) = (chain.transition_matrix(), chain.stationary());
         let k = self.settings.states;
         (0..k * k).map(|at| t[at] / rho[at % k]).collect()
     }
 
     /// Returns the learnt ratio at the figure's bias, [K, K], over the seeds of stationary sampling.
     pub(super) fn learnt_ratio(&self) -> Vec<Spread> {
-        let of = || self.of(Sampling::Stationary, self.settings.figure_alpha);
+        let of = || self.select(Sampling::Stationary, self.settings.figure_alpha);
         let k = self.settings.states;
         let entry = |at: usize| Spread::of(of().map(|one| one.learnt.ratio[at]));
         (0..k * k).filter_map(entry).collect()
@@ -76,12 +76,12 @@ impl Results {
     /// Returns for each seed the mutual information, in nats, that the scores of stationary sampling have learnt.
     pub(super) fn learnt_information(&self, alpha: f64) -> Vec<f64> {
         let all = self.chain(alpha).mutual_information();
-        let each = self.of(Sampling::Stationary, alpha);
+        let each = self.select(Sampling::Stationary, alpha);
         each.map(|one| all - one.final_excess()).collect()
     }
 
     /// Returns the biases of the drawn curves: the first of `alphas`, the figure's, and one halfway between.
-    pub(super) fn shown(&self) -> Vec<f64> {
+    pub(super) fn shown_alphas(&self) -> Vec<f64> {
         let alphas = &self.settings.alphas;
         let is_figure = |alpha: &f64| *alpha == self.settings.figure_alpha;
         let figure = alphas.iter().position(is_figure).unwrap_or(0);
@@ -92,7 +92,7 @@ impl Results {
 
     /// Returns the total variation over updates, averaged over the seeds of stationary sampling.
     pub(super) fn tv_curve(&self, alpha: f64) -> Curve {
-        let each: Vec<_> = self.of(Sampling::Stationary, alpha).collect();
+        let each: Vec<_> = self.select(Sampling::Stationary, alpha).collect();
         let updates = each.iter().take(1).flat_map(|one| &one.learnt.updates);
         let means = updates.enumerate().map(|(at, &update)| {
             let values = each.iter().map(|one| one.learnt.tv[at]);
@@ -104,7 +104,7 @@ impl Results {
     /// Returns for each seed the rank correlation over alpha between 1 / gap and the updates until convergence.
     ///
     /// A training that never converges counts as one update more than a full training.
-    pub(super) fn gap_correlations(&self, sampling: Sampling, measure: Measure) -> Vec<f64> {
+    pub(super) fn gap_correlations(&self, sampling: Sampling, measure: UpdatesTo) -> Vec<f64> {
         let of_seed = |seed: u32| {
             let all = self.trained.iter();
             let of_seed = all.filter(|one| one.sampling == sampling && one.seed == seed);

@@ -73,7 +73,7 @@ impl Sampling {
 
 /// The results of a training, measured without sampling noise from the scores of all K * K pairs.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub(super) struct Learnt {
+pub(super) struct Measurements {
     /// The updates after which the training was measured.
     pub(super) updates: Vec<u64>,
     /// The InfoNCE loss with infinitely many negatives, above its minimum, in nats: E_rho KL(T_i || learnt T_i).
@@ -90,36 +90,36 @@ pub(super) fn train(
     sampling: Sampling,
     seed: u64,
     progress: &mut Progress,
-) -> anyhow::Result<Learnt> {
+) -> anyhow::Result<Measurements> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut learner = heads(chain.states, settings, &mut rng)?;
-    let all = one_hot(chain.states, 0..chain.states)?;
-    let mut source = source(chain, settings, sampling, &mut rng);
-    let (mut learnt, mut measure_next) = (Learnt::default(), 0);
+    let mut learner = learner(chain.states, settings, &mut rng)?;
+    let all = one_hot_features(chain.states, 0..chain.states)?;
+    let mut source = pair_source(chain, settings, sampling, &mut rng);
+    let (mut learnt, mut measure_next) = (Measurements::default(), 0);
     for update in 0..=settings.updates {
         if update >= measure_next || update == settings.updates {
-            learnt.measure(update, chain, learner.scores(&all, &all)?);
+            learnt.add_measurement(update, chain, learner.scores(&all, &all)?);
             measure_next = ((update as f64 * MEASURE_GROWTH).ceil() as u64).max(update + 1);
         }
         if update < settings.updates {
             let pairs = source(&mut rng);
-            let now = one_hot(chain.states, pairs.iter().map(|pair| pair.0))?;
-            let next = one_hot(chain.states, pairs.iter().map(|pair| pair.1))?;
-            learner.learn(&now, &next)?;
+            let now = one_hot_features(chain.states, pairs.iter().map(|pair| pair.0))?;
+            let next = one_hot_features(chain.states, pairs.iter().map(|pair| pair.1))?;
+            learner.update(&now, &next)?;
             progress.advance(1)?;
         }
     }
     Ok(learnt)
 }
 
-impl Learnt {
+impl Measurements {
     /// Adds a measurement from the scores [K, K].
     ///
     /// At the optimum the score is ln(T_ij / rho_j) plus a constant for each i, which does not change the softmax. The constant comes from
     /// sum_j rho_j ratio_ij = 1, which T / rho fulfils.
-    fn measure(&mut self, update: u64, chain: &Chain, scores: Vec<f64>) {
+    fn add_measurement(&mut self, update: u64, chain: &Chain, scores: Vec<f64>) {
         let k = chain.states;
-        let (t, rho) = (chain.transitions(), chain.stationary());
+        let (t, rho) = (chain.transition_matrix(), chain.stationary());
         let mut ratio = Vec::with_capacity(k * k);
         for row in scores.chunks(k) {
             let largest = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -154,7 +154,7 @@ impl Learnt {
 /// Creates the heads Psi_4 and Phi_4 with their loss and optimiser.
 ///
 /// The heads read f4, which is the one-hot state here. Torso and C51 head have the smallest possible size, and no loss reaches them.
-fn heads(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<DimLearner> {
+fn learner(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<DimLearner> {
     let lambda = Lambda {
         l4t4: 1.0,
         ..Lambda::NONE
@@ -170,7 +170,7 @@ fn heads(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Re
 }
 
 /// Returns the features of these states of a chain with `count` states, a row for each.
-fn one_hot(
+fn one_hot_features(
     count: usize,
     states: impl ExactSizeIterator<Item = usize>,
 ) -> candle_core::Result<Features> {
@@ -184,19 +184,19 @@ fn one_hot(
 }
 
 /// Draws a batch of pairs.
-type Source<'a> = Box<dyn FnMut(&mut ChaCha8Rng) -> Vec<(usize, usize)> + 'a>;
+type PairSource<'a> = Box<dyn FnMut(&mut ChaCha8Rng) -> Vec<(usize, usize)> + 'a>;
 
-fn source<'a>(
+fn pair_source<'a>(
     chain: &'a Chain,
     settings: &Settings,
     sampling: Sampling,
     rng: &mut ChaCha8Rng,
-) -> Source<'a> {
+) -> PairSource<'a> {
     let rows = settings.batch_size;
     match sampling {
         Sampling::Stationary => {
             let law = chain.stationary();
-            let pair = move |rng: &mut ChaCha8Rng| walk(chain, &mut draw(&law, rng), rng);
+            let pair = move |rng: &mut ChaCha8Rng| walk(chain, &mut draw_state(&law, rng), rng);
             Box::new(move |rng| (0..rows).map(|_| pair(rng)).collect())
         }
         Sampling::FromOneEnd => {
@@ -226,7 +226,7 @@ fn walk(chain: &Chain, state: &mut usize, rng: &mut ChaCha8Rng) -> (usize, usize
     (before, *state)
 }
 
-fn draw(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
+fn draw_state(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
     let mut left: f64 = rng.random();
     for (index, p) in law.iter().enumerate() {
         left -= p;
@@ -253,18 +253,18 @@ mod tests {
     #[test]
     fn true_ratios_measure_as_no_error_and_constant_scores_as_the_mutual_information() {
         let chain = Chain::new(6, 0.3);
-        let (t, rho) = (chain.transitions(), chain.stationary());
+        let (t, rho) = (chain.transition_matrix(), chain.stationary());
         // Each row may have an arbitrary constant. A pair that never occurs has a score far below the others.
         let score = |at: usize| (t[at] / rho[at % 6]).max(1e-300).ln() + (at / 6) as f64;
-        let mut learnt = Learnt::default();
-        learnt.measure(3, &chain, (0..36).map(score).collect());
+        let mut learnt = Measurements::default();
+        learnt.add_measurement(3, &chain, (0..36).map(score).collect());
         assert!(learnt.excess[0] < 1e-12 && learnt.tv[0] < 1e-12);
         for (at, ratio) in learnt.ratio.iter().enumerate() {
             assert!((ratio - t[at] / rho[at % 6]).abs() < 1e-9);
         }
         assert_eq!(learnt.updates_to(&learnt.tv, 0.1), Some(3));
         assert_eq!(learnt.updates_to(&learnt.tv, -1.0), None);
-        learnt.measure(4, &chain, vec![0.5; 36]);
+        learnt.add_measurement(4, &chain, vec![0.5; 36]);
         assert!((learnt.excess[1] - chain.mutual_information()).abs() < 1e-12);
     }
 

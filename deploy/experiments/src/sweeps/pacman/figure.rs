@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// The share of a run over which the drawn loss is averaged.
-const SMOOTH: f64 = 0.1;
+const SMOOTHED_SHARE: f64 = 0.1;
 
 /// Draws the DIM losses by epsilon, and the returns under one lethal ghost after another.
 pub(super) fn figure(results: &Results) -> Figure {
@@ -19,7 +19,7 @@ pub(super) fn figure(results: &Results) -> Figure {
     for (column, what) in LOSSES {
         let mut series = Vec::new();
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
-            let window = settings.predictability.frames as f64 * SMOOTH;
+            let window = settings.predictability.frames as f64 * SMOOTHED_SHARE;
             let each = results.losses(column, epsilon);
             let each: Vec<_> = each.map(|it| smooth(&it.points, window)).collect();
             let curve = combine_seeds(&each, Band::Range);
@@ -53,7 +53,7 @@ pub(super) fn figure(results: &Results) -> Figure {
 }
 
 fn task_series(results: &Results, part: usize) -> Vec<Series> {
-    let continual = results.settings.tasks(part);
+    let continual = results.settings.continual(part);
     let mut series = Vec::new();
     let points = results.traces[part].iter().flat_map(|it| &it.points);
     let length = continual.episodes_per_task as f64;
@@ -65,13 +65,13 @@ fn task_series(results: &Results, part: usize) -> Vec<Series> {
         }
     }
     for (index, agent) in results.settings.agents.iter().enumerate() {
-        let own = || results.traces(part, agent);
-        let each: Vec<_> = own().map(|trace| trace.points.clone()).collect();
+        let traces = || results.traces(part, agent);
+        let each: Vec<_> = traces().map(|trace| trace.points.clone()).collect();
         let curve = combine_seeds(&each, Band::Range);
         series.push(curve.series(agent, index));
         let tasks = if index == 0 { continual.tasks } else { 0 };
         for task in 0..tasks {
-            let ends = own().filter_map(|trace| trace.tasks[task as usize]);
+            let ends = traces().filter_map(|trace| trace.tasks[task as usize]);
             if let Some(end) = Spread::of(ends.map(|it| it.0)) {
                 let x = length * task as f64;
                 let line = vec![(x, end.mean), (x + length, end.mean)];

@@ -12,7 +12,7 @@ use crate::{
 /// The DIM losses of the preset: the column of the metrics, and the kind of features that the loss compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];
 /// The final loss is the mean over this share of a run, at its end.
-const FINAL: f64 = 0.2;
+const FINAL_SHARE: f64 = 0.2;
 
 /// Points (x, y), sorted by x.
 pub(super) type Points = Vec<(f64, f64)>;
@@ -64,7 +64,7 @@ impl Results {
                             epsilon,
                             seed,
                             column,
-                            last: mean_from(&points, frames * (1.0 - FINAL)),
+                            last: mean_from(&points, frames * (1.0 - FINAL_SHARE)),
                             whole: mean_from(&points, 0.0),
                             episodes: run.summary.episodes as f64,
                             points,
@@ -72,13 +72,13 @@ impl Results {
                     }
                 }
                 Point::Tasks(part, agent) => {
-                    let continual = settings.tasks(part);
+                    let continual = settings.continual(part);
                     let mut points = metrics.values("episodes", "mean_return")?;
                     points.retain(|point| point.0 <= continual.episodes() as f64);
                     traces[part].push(Trace {
                         agent,
                         seed,
-                        tasks: tasks(&points, continual),
+                        tasks: task_returns(&points, continual),
                         points,
                     });
                 }
@@ -101,7 +101,7 @@ impl Results {
     }
 
     /// Returns the rank correlation of epsilon and a final loss, and the number of runs in it.
-    pub(super) fn order_of_epsilon(&self, column: &str) -> Option<(f64, usize)> {
+    pub(super) fn epsilon_correlation(&self, column: &str) -> Option<(f64, usize)> {
         let pairs = self.losses.iter().filter(|it| it.column == column);
         let pairs = pairs.filter_map(|it| Some((it.epsilon, it.last?)));
         let pairs: Points = pairs.collect();
@@ -115,7 +115,7 @@ fn mean_from(points: &Points, frames: f64) -> Option<f64> {
 }
 
 /// Computes [`Trace::tasks`].
-fn tasks(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
+fn task_returns(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
     let length = continual.episodes_per_task as f64;
     let of_task = |task: u64| {
         let (start, end) = (length * task as f64, length * (task + 1) as f64);
@@ -128,7 +128,7 @@ fn tasks(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
 
 impl Trace {
     /// Returns the mean over all tasks; `None` if the run lacks a task.
-    pub(super) fn over_tasks(&self) -> Option<f64> {
+    pub(super) fn mean_over_tasks(&self) -> Option<f64> {
         let tasks = self.tasks.iter().map(|task| Some((*task)?.1));
         mean(&tasks.collect::<Option<Vec<_>>>()?)
     }
@@ -149,6 +149,6 @@ mod tests {
         };
         let points = vec![(4.0, 1.0), (10.0, 3.0), (11.0, 0.0), (18.0, 5.0)];
         let expected = [Some((3.0, 2.0)), Some((5.0, 2.5)), None];
-        assert_eq!(tasks(&points, &continual), expected);
+        assert_eq!(task_returns(&points, &continual), expected);
     }
 }

@@ -80,22 +80,22 @@ pub(super) enum Point {
 }
 
 impl Settings {
-    pub(super) const fn tasks(&self, part: usize) -> &Continual {
+    pub(super) const fn continual(&self, part: usize) -> &Continual {
         [&self.continual, &self.noise][part]
     }
 
     pub(super) fn plans(&self, seed: u32) -> Vec<PointPlan<Point>> {
         let mut plans = Vec::new();
-        let of = &self.predictability;
-        for &epsilon in &of.epsilons {
+        let predictability = &self.predictability;
+        for &epsilon in &predictability.epsilons {
             let name = format!("epsilon{epsilon}-seed{seed}");
             let set = [format!("world.epsilon={epsilon}")];
-            let call = self.call(&of.agent, seed, of.frames, &set);
-            let plan = PlannedRun::new(&name, call, of.frames);
+            let call = self.call(&predictability.agent, seed, predictability.frames, &set);
+            let plan = PlannedRun::new(&name, call, predictability.frames);
             plans.push((Point::Epsilon(epsilon), plan));
         }
         for (part, part_name) in PART_NAMES.iter().enumerate() {
-            let continual = self.tasks(part);
+            let continual = self.continual(part);
             let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
             let schedule = format!(
                 "world.lethal_schedule={{episodes_per_task={},order=[{}]}}",

@@ -16,13 +16,13 @@ use crate::{
 
 pub(super) const NAME: &str = "procgen";
 /// The number of newest checkpoints of a run that play.
-pub(super) const CHECKPOINTS: u32 = 3;
+pub(super) const CHECKPOINTS_PLAYED: u32 = 3;
 /// Playing counts as 1 / this of the work of a run, used only to estimate the time left.
 const PLAY_SHARE: u64 = 10;
 /// The paper's agents, in the order of its table 1.
-const AGENTS: &str = "c51 cpc curl driml-noact driml-randk driml-fix driml-ada";
+const PAPER_AGENTS: &str = "c51 cpc curl driml-noact driml-randk driml-fix driml-ada";
 /// The agents with a fixed k, for which a name such as `driml-fix-k5` chooses another k.
-const OF_FIXED_K: [&str; 2] = ["driml-fix", "driml-noact"];
+const FIXED_K_AGENTS: [&str; 2] = ["driml-fix", "driml-noact"];
 
 /// A table of `procgen.toml`, overridden by the flags.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -52,7 +52,7 @@ pub(super) struct Point {
 }
 
 impl Settings {
-    pub(super) fn of(args: &ProcgenArgs) -> Result<Self, Usage> {
+    pub(super) fn from_args(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self =
             flags::read_settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
         if !args.games.is_empty() {
@@ -61,8 +61,8 @@ impl Settings {
         if !args.agents.is_empty() {
             settings.agents.clone_from(&args.agents);
         }
-        settings.games = worlds(&settings.games)?;
-        settings.agents = agents(&settings.agents)?;
+        settings.games = resolve_worlds(&settings.games)?;
+        settings.agents = resolve_agents(&settings.agents)?;
         settings.seeds = args.flags.seeds.unwrap_or(settings.seeds);
         settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
         settings.frames = args.frames.unwrap_or(settings.frames);
@@ -78,7 +78,7 @@ impl Settings {
         let mut plans = Vec::new();
         let games = self.games.iter();
         for (world, name) in games.flat_map(|it| self.agents.iter().map(move |name| (it, name))) {
-            let (agent, k) = with_k(name);
+            let (agent, k) = split_k(name);
             let k = k.map(|k| format!("run.horizon.k={k}"));
             let call = TrainCall {
                 env: Some(world.clone()),
@@ -102,15 +102,15 @@ impl Settings {
     pub(super) fn play_settings(&self, levels: Levels) -> PlaySettings {
         PlaySettings {
             levels,
-            checkpoints: CHECKPOINTS as usize,
-            episodes: CHECKPOINTS * self.episodes,
+            checkpoints: CHECKPOINTS_PLAYED as usize,
+            episodes: CHECKPOINTS_PLAYED * self.episodes,
             units: (self.frames / PLAY_SHARE).max(1),
         }
     }
 }
 
 /// Resolves names of worlds or games and drops duplicates. `all` means every Procgen game.
-fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
+fn resolve_worlds(names: &[String]) -> Result<Vec<String>, Usage> {
     expand_unique(names, |name| match name {
         "all" => {
             let games = WorldName::all().filter(|it| it.kind() == "procgen");
@@ -124,19 +124,19 @@ fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
 }
 
 /// Splits a name such as `driml-noact-k5` into the agent and its k. Other names have no k.
-fn with_k(name: &str) -> (&str, Option<u32>) {
+fn split_k(name: &str) -> (&str, Option<u32>) {
     let split = name.rsplit_once("-k");
     match split.and_then(|(agent, k)| Some((agent, k.parse().ok()?))) {
-        Some((agent, k)) if OF_FIXED_K.contains(&agent) => (agent, Some(k)),
+        Some((agent, k)) if FIXED_K_AGENTS.contains(&agent) => (agent, Some(k)),
         _ => (name, None),
     }
 }
 
 /// Resolves names of agents, with or without a k, and drops duplicates. `all` means every agent of the paper.
-fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
+fn resolve_agents(names: &[String]) -> Result<Vec<String>, Usage> {
     expand_unique(names, |name| {
-        Ok(match (name, with_k(name)) {
-            ("all", _) => AGENTS.split(' ').map(String::from).collect(),
+        Ok(match (name, split_k(name)) {
+            ("all", _) => PAPER_AGENTS.split(' ').map(String::from).collect(),
             (_, (agent, None)) => vec![presets::agent(agent)?.name.to_owned()],
             (_, (agent, Some(k))) => vec![format!("{}-k{k}", presets::agent(agent)?.name)],
         })
@@ -154,8 +154,8 @@ mod tests {
     #[test]
     fn the_full_length_is_sixteen_games_of_two_agents() {
         let full = settings(false);
-        assert_eq!(worlds(&full.games).unwrap().len(), 16);
-        assert_eq!(agents(&full.agents).unwrap(), ["c51", "driml-ada"]);
+        assert_eq!(resolve_worlds(&full.games).unwrap().len(), 16);
+        assert_eq!(resolve_agents(&full.agents).unwrap(), ["c51", "driml-ada"]);
         for settings in [full, settings(true)] {
             assert!(presets::preset(&settings.preset).is_ok());
         }
@@ -168,15 +168,15 @@ mod tests {
             of(&names).map(|it| it.join(" "))
         };
         let both = "driml-noact-k1 driml-noact-k5";
-        assert_eq!(found(both, agents).unwrap(), both);
-        assert_eq!(found("all", agents).unwrap().split(' ').count(), 7);
-        let worlds = |names| found(names, worlds);
+        assert_eq!(found(both, resolve_agents).unwrap(), both);
+        assert_eq!(found("all", resolve_agents).unwrap().split(' ').count(), 7);
+        let worlds = |names| found(names, resolve_worlds);
         let both = worlds("chain bigfish chain").unwrap();
         assert_eq!(both, "chain procgen:bigfish");
         let said = worlds("bigfihs").unwrap_err().to_string();
         assert!(said.contains("did you mean"), "{said}");
         for wrong in ["driml-ada-k5", "driml-noact-kx"] {
-            assert!(found(wrong, agents).is_err(), "{wrong}");
+            assert!(found(wrong, resolve_agents).is_err(), "{wrong}");
         }
     }
 

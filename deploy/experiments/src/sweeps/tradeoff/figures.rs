@@ -12,7 +12,7 @@ const COLUMNS: usize = 3;
 const PANEL: (f64, f64) = (330.0, 250.0);
 
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Placed {
+struct Marker {
     speed: f64,
     value: f64,
     ends: [f64; 2],
@@ -20,17 +20,17 @@ struct Placed {
 
 /// Draws return against frames per second: a panel for each dial with its base, all with the same axes. A dashed line joins the Pareto
 /// front of all dials. `returns` selects the return, and `name` is its name.
-pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure {
+pub(super) fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
     let of_runs = results.points.values().flat_map(|it| it.values(returns));
     let all = Spread::of(of_runs);
     let (least, greatest) = all.map_or((0.0, 0.0), |it| (it.min, it.max));
     let place = |point: &PointResult| place(point, returns, (least, greatest));
-    let placed: Vec<Placed> = results.points.values().filter_map(place).collect();
+    let placed: Vec<Marker> = results.points.values().filter_map(place).collect();
     let front: Vec<(f64, f64)> = front(&placed).map(|it| (it.speed, it.value)).collect();
     let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();
     let values: Vec<f64> = placed.iter().flat_map(|it| it.ends).collect();
     let label = format!("{name} return");
-    let panels = results.by_dial().map(|rows| {
+    let panels = results.rows_by_dial().map(|rows| {
         let line = Series::line("", 0, front.clone());
         let mut series = vec![line.with_colour(GREY).with_mark(Mark::Dashed)];
         for (index, row) in rows.iter().enumerate() {
@@ -61,10 +61,10 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
 }
 
 /// Returns the position of a point. Its interval is cut to the range of all returns, because few seeds may give a far wider one.
-fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -> Option<Placed> {
+fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -> Option<Marker> {
     let value = point.mean(returns)?;
     let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
-    Some(Placed {
+    Some(Marker {
         speed: point.mean(FRAMES_PER_SECOND)?.mean,
         value: value.mean,
         ends: [low.max(least), high.min(greatest)],
@@ -72,8 +72,8 @@ fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -
 }
 
 /// Returns the Pareto front, the slowest point first: no other point is faster and no worse, or better and no slower.
-fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
-    let beaten = |it: &Placed| {
+fn front(placed: &[Marker]) -> impl Iterator<Item = Marker> {
+    let beaten = |it: &Marker| {
         placed.iter().any(|other| {
             other.speed >= it.speed
                 && other.value >= it.value
@@ -86,8 +86,8 @@ fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
 }
 
 /// Draws the training return over seconds, with a panel for each dial and its base.
-pub(super) fn wall(results: &Results) -> Figure {
-    let panels = results.by_dial().map(|rows| {
+pub(super) fn wall_figure(results: &Results) -> Figure {
+    let panels = results.rows_by_dial().map(|rows| {
         let series = rows.iter().enumerate().map(|(index, row)| {
             let each = row.result.seeds.iter().map(|it| it.curve.clone());
             let curve = combine_seeds(&each.collect::<Vec<_>>(), Band::Range);
@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn the_front_has_what_no_other_beats() {
-        let at = |speed: f64, value: f64| Placed {
+        let at = |speed: f64, value: f64| Marker {
             speed,
             value,
             ends: [value; 2],

@@ -13,14 +13,14 @@ use rand_chacha::ChaCha8Rng;
 
 const ENVS: usize = 16;
 /// The number of steps over which the rows of an environment are spread evenly.
-const SPAN: usize = 512;
+const SPAN_STEPS: usize = 512;
 /// The share of random actions if a network chooses the others.
 const EPSILON: f64 = 0.1;
 /// The seed of the world and the actions, so that all levels of a dial that does not change the world have the same rows.
 const SEED: u64 = 1_000_003;
 
 /// One step of all environments.
-struct Moment {
+struct EnvStep {
     /// The states [N, H, W, C] at the size of the network's input; empty if no row needs them.
     states: Vec<u8>,
     actions: Vec<u8>,
@@ -29,32 +29,32 @@ struct Moment {
 }
 
 /// Plays the world of `config` and returns `rows` rows. With `weights` nine actions in ten are greedy; without, all are random.
-pub(super) fn play(
+pub(super) fn sample(
     config: &RunConfig,
     weights: Option<&[u8]>,
     rows: usize,
 ) -> anyhow::Result<OwnedBatch> {
     let (n, k) = (config.run.n_step as usize, 1);
-    let of_env = rows.div_ceil(ENVS);
-    let apart = SPAN.div_ceil(of_env);
-    let steps = of_env * apart + n.max(k);
-    let wanted_at = |step: usize| {
-        let of_row = |offset: usize| step.checked_sub(offset).is_some_and(|t| t % apart == 0);
+    let rows_per_env = rows.div_ceil(ENVS);
+    let spacing = SPAN_STEPS.div_ceil(rows_per_env);
+    let steps = rows_per_env * spacing + n.max(k);
+    let is_needed = |step: usize| {
+        let of_row = |offset: usize| step.checked_sub(offset).is_some_and(|t| t % spacing == 0);
         [0, k, n].into_iter().any(of_row)
     };
-    let history = history(config, weights, steps + 1, wanted_at)?;
+    let history = play_history(config, weights, steps + 1, is_needed)?;
     let len = config.model.frame_len();
     let mut batch = OwnedBatch::default();
     let has_positive = config.run.horizon.positives() > 0;
     for row in 0..rows {
-        let (env, t) = (row % ENVS, row / ENVS * apart);
+        let (env, t) = (row % ENVS, row / ENVS * spacing);
         let state = |t: usize| &history[t].states[env * len..][..len];
         let mut n_step_return = 0.0;
         let mut discount = 1.0;
-        for moment in &history[t..t + n] {
-            n_step_return += discount * f64::from(moment.rewards[env]);
+        for env_step in &history[t..t + n] {
+            n_step_return += discount * f64::from(env_step.rewards[env]);
             discount *= config.run.gamma;
-            if ends(moment.ends[env]) {
+            if is_end(env_step.ends[env]) {
                 discount = 0.0;
                 break;
             }
@@ -62,7 +62,7 @@ pub(super) fn play(
         batch.states_t.extend_from_slice(state(t));
         batch.states_n.extend_from_slice(state(t + n));
         batch.action.push(history[t].actions[env]);
-        batch.next_action.push(match ends(history[t].ends[env]) {
+        batch.next_action.push(match is_end(history[t].ends[env]) {
             true => NO_ACTION,
             false => history[t + 1].actions[env],
         });
@@ -78,26 +78,26 @@ pub(super) fn play(
 }
 
 /// Whether the return ends at this step.
-fn ends(end: StepEnd) -> bool {
+fn is_end(end: StepEnd) -> bool {
     matches!(end, StepEnd::TimedOut | StepEnd::Terminal)
 }
 
-/// Plays `steps` steps of all environments. The states are kept for the steps at which they are `wanted_at`.
-fn history(
+/// Plays `steps` steps of all environments. The states are kept for the steps at which they are `is_needed`.
+fn play_history(
     config: &RunConfig,
     weights: Option<&[u8]>,
     steps: usize,
-    wanted_at: impl Fn(usize) -> bool,
-) -> anyhow::Result<Vec<Moment>> {
+    is_needed: impl Fn(usize) -> bool,
+) -> anyhow::Result<Vec<EnvStep>> {
     let (run, model) = (&config.run, &config.model);
-    let sent = (run.frame_height as usize, run.frame_width as usize);
+    let frame_size = (run.frame_height as usize, run.frame_width as usize);
     let world = config.world.build(ENVS, SEED, 0);
     let world = world.context("building the world")?;
     let actions = config.world.actions(config.actor.actions);
-    let world = RestrictedWorld::wrap(world, actions, sent)?;
+    let world = RestrictedWorld::wrap(world, actions, frame_size)?;
     let rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut acting = ActingLoop::new(world, run.frame_stack as usize, rng)?;
-    let enlarge = || config.input.resizer(sent, model);
+    let enlarge = || config.input.resizer(frame_size, model);
     let enlarged = enlarge()?;
     let precision = config.actor.precision;
     let mut policy: Box<dyn Policy> = match weights {
@@ -106,21 +106,21 @@ fn history(
     };
     let mut history = Vec::new();
     for step in 0..steps {
-        let seen = acting.step(&mut *policy, EPSILON)?;
+        let step_result = acting.step(&mut *policy, EPSILON)?;
         let mut states = Vec::new();
         match &enlarged {
-            _ if !wanted_at(step) => {}
-            None => states.extend_from_slice(seen.states),
+            _ if !is_needed(step) => {}
+            None => states.extend_from_slice(step_result.states),
             Some(enlarge) => {
                 states.resize(model.frame_len() * ENVS, 0);
-                enlarge.apply(seen.states, &mut states);
+                enlarge.apply(step_result.states, &mut states);
             }
         }
-        history.push(Moment {
+        history.push(EnvStep {
             states,
-            actions: seen.actions.to_vec(),
-            rewards: seen.rewards.to_vec(),
-            ends: seen.ends.to_vec(),
+            actions: step_result.actions.to_vec(),
+            rewards: step_result.rewards.to_vec(),
+            ends: step_result.ends.to_vec(),
         });
     }
     Ok(history)

@@ -14,15 +14,15 @@ use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::{fixed_batch, results::Measured};
+use super::{fixed_batch, results::Numbers};
 
 /// The most rows of the batch whose loss and gradient are compared.
 const ROWS_MAX: usize = 64;
 /// The number of states for each of these rows whose values and greedy actions are compared.
-const STATES_A_ROW: usize = 16;
+const STATES_PER_ROW: usize = 16;
 
 /// The work of a configuration that is timed.
-struct Side {
+struct TimedWork {
     /// An update with `rows` rows.
     update: Work<'static>,
     rows: usize,
@@ -33,8 +33,8 @@ struct Side {
     weights_bytes: usize,
 }
 
-fn side(config: &RunConfig) -> anyhow::Result<Side> {
-    let held = fixed_batch::play(config, None, config.learner.batch_size as usize)?;
+fn timed_work(config: &RunConfig) -> anyhow::Result<TimedWork> {
+    let fixed = fixed_batch::sample(config, None, config.learner.batch_size as usize)?;
     let (model, update) = (config.model.clone(), config.learner.update.clone());
     let compute = Compute::cpu(config.learner.precision);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
@@ -43,15 +43,15 @@ fn side(config: &RunConfig) -> anyhow::Result<Side> {
     let weights = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
     let envs = config.actor.envs as usize;
-    let frames = held.states_t.iter().copied().cycle();
+    let frames = fixed.states_t.iter().copied().cycle();
     let frames: Vec<u8> = frames.take(envs * config.model.frame_len()).collect();
     let mut actions = vec![0; envs];
-    Ok(Side {
-        rows: held.action.len(),
+    Ok(TimedWork {
+        rows: fixed.action.len(),
         envs,
         weights_bytes: weights.len(),
         update: Box::new(move || {
-            agent.update(&held.batch())?;
+            agent.update(&fixed.batch())?;
             Ok(())
         }),
         act: Box::new(move || Ok(policy.greedy_actions(&frames, &mut actions)?)),
@@ -59,9 +59,9 @@ fn side(config: &RunConfig) -> anyhow::Result<Side> {
 }
 
 /// Times `level` and `base` in turns, for some seconds each, less in the smoke length.
-pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow::Result<Measured> {
+pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow::Result<Numbers> {
     let meter = SpeedMeter::new(smoke);
-    let (from, to) = (side(base)?, side(level)?);
+    let (from, to) = (timed_work(base)?, timed_work(level)?);
     let updates = meter.rates_in_turn(&mut [from.update, to.update])?;
     let acts = meter.rates_in_turn(&mut [from.act, to.act])?;
     let gain =
@@ -86,11 +86,11 @@ pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow
 /// Returns the number of rows whose loss and gradient are compared, and of states whose values and greedy actions are compared.
 pub(super) fn sizes(config: &RunConfig) -> (usize, usize) {
     let rows = ROWS_MAX.min(config.learner.batch_size as usize);
-    (rows, rows * STATES_A_ROW)
+    (rows, rows * STATES_PER_ROW)
 }
 
 /// Returns the errors of loss, gradient and values on fixed rows, with the newest checkpoint of a run with `config`.
-pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Measured> {
+pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Numbers> {
     let (model, update) = (&config.model, &config.learner.update);
     let compute = Compute::cpu(config.learner.precision);
     let (checkpoints, hash) = (folder.checkpoints(), config.run.hash());
@@ -106,15 +106,15 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<M
         .with_deduplication(config.learner.deduplicate_states);
     let weights = agent.weights()?;
     let (rows, states) = sizes(config);
-    let held = fixed_batch::play(config, Some(&weights), rows)?;
-    let found = UpdateDeviation::new(&agent, &held.batch(), &reference)?;
+    let fixed = fixed_batch::sample(config, Some(&weights), rows)?;
+    let found = UpdateDeviation::new(&agent, &fixed.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
-    let held = fixed_batch::play(config, Some(&weights), states)?;
-    let mut acted = vec![0.0; held.action.len() * model.num_actions];
-    policy.q_values(&held.states_t, &mut acted)?;
-    let expected = reference.q_values_t(&held.batch())?;
-    let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]
+    let fixed = fixed_batch::sample(config, Some(&weights), states)?;
+    let mut actor_values = vec![0.0; fixed.action.len() * model.num_actions];
+    policy.q_values(&fixed.states_t, &mut actor_values)?;
+    let expected = reference.q_values_t(&fixed.batch())?;
+    let [learning, acting] = [agent.q_values_t(&fixed.batch())?, actor_values]
         .map(|values| QDeviation::new(&values, &expected, model.num_actions));
     let errors = [
         // The relative errors of the total loss and of the gradient, and 1 - cosine of the gradient's angle to the reference.

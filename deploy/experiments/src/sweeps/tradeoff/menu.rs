@@ -100,16 +100,16 @@ pub(super) struct Point {
 }
 
 #[derive(Clone, Debug)]
-pub(super) struct LevelOf {
+pub(super) struct DialLevel {
     pub(super) dial: Dial,
     pub(super) level: String,
     pub(super) base: Point,
     pub(super) point: Point,
     /// Whether the call requests this dial. The page also has the runs of dials that other calls requested.
-    pub(super) is_asked: bool,
+    pub(super) is_requested: bool,
 }
 
-impl LevelOf {
+impl DialLevel {
     pub(super) const fn points(&self) -> [&Point; 2] {
         [&self.base, &self.point]
     }
@@ -120,7 +120,7 @@ impl LevelOf {
 }
 
 impl Dial {
-    fn levels(&self, is_asked: bool) -> impl Iterator<Item = LevelOf> {
+    fn levels(&self, is_requested: bool) -> impl Iterator<Item = DialLevel> {
         let base = Point {
             key: self.agent.clone(),
             agent: self.agent.clone(),
@@ -137,7 +137,7 @@ impl Dial {
                 true => agent.clone(),
                 false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
             };
-            LevelOf {
+            DialLevel {
                 dial: self.clone(),
                 level: level.name,
                 base: base.clone(),
@@ -146,7 +146,7 @@ impl Dial {
                     agent,
                     sets: level.sets,
                 },
-                is_asked,
+                is_requested,
             }
         })
     }
@@ -178,18 +178,18 @@ pub(super) struct Common {
 pub(super) struct Settings {
     pub(super) common: Common,
     /// All levels that the world has.
-    pub(super) levels: Vec<LevelOf>,
+    pub(super) levels: Vec<DialLevel>,
     pub(super) seeds: u32,
     /// Whether the number of frames may still be reduced to fit the budget.
-    pub(super) frames_open: bool,
+    pub(super) may_shorten: bool,
 }
 
 impl Settings {
     /// Returns the settings of a call. A folder with earlier runs keeps their length.
-    pub(super) fn of(
+    pub(super) fn from_args(
         args: &TradeoffArgs,
         world: WorldName,
-        found: Option<Common>,
+        stored: Option<Common>,
     ) -> Result<Self, Usage> {
         let menu: Menu = toml::from_str(include_str!("../tradeoff.toml"))
             .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"));
@@ -199,8 +199,8 @@ impl Settings {
         };
         let base = world_base(menu.world, world)?;
         let asked = [base.sets, length.sets, args.queue.sets.clone()];
-        let (found_frames, found_jobs) = found.map(|it| (it.frames, it.jobs)).unzip();
-        let frames = args.frames.or(found_frames);
+        let (stored_frames, stored_jobs) = stored.map(|it| (it.frames, it.jobs)).unzip();
+        let frames = args.frames.or(stored_frames);
         Ok(Self {
             common: Common {
                 env: world.to_string(),
@@ -208,27 +208,27 @@ impl Settings {
                 sets: asked.concat(),
                 frames: frames.or(length.frames).unwrap_or(base.frames),
                 episodes: args.episodes.unwrap_or(length.episodes),
-                jobs: args.queue.jobs.or(found_jobs).unwrap_or(1),
+                jobs: args.queue.jobs.or(stored_jobs).unwrap_or(1),
             },
             levels: levels(menu.dial, world, &args.dials)?,
             seeds: args.flags.seeds.unwrap_or(length.seeds),
-            frames_open: frames.is_none() && !args.queue.report,
+            may_shorten: frames.is_none() && !args.queue.report,
         })
     }
 
     /// Whether the call requests this point, as a level or as the base of a level.
-    pub(super) fn asks_for(&self, point: &Point) -> bool {
-        let mut asked = self.levels.iter().filter(|it| it.is_asked);
+    pub(super) fn requests(&self, point: &Point) -> bool {
+        let mut asked = self.levels.iter().filter(|it| it.is_requested);
         asked.any(|it| it.points().contains(&point))
     }
 
     /// Returns the base beside which a point is timed, whichever dial requests it: the base of its level, or itself if it is only a base.
-    pub(super) fn base_of<'a>(&'a self, point: &'a Point) -> &'a Point {
+    pub(super) fn timing_base<'a>(&'a self, point: &'a Point) -> &'a Point {
         let level = self.levels.iter().find(|it| it.point == *point);
         level.map_or(point, |it| &it.base)
     }
 
-    pub(super) const fn seeds_of(&self, is_base: bool) -> u32 {
+    pub(super) const fn seed_count(&self, is_base: bool) -> u32 {
         match is_base {
             true => BASE_SEEDS * self.seeds,
             false => self.seeds,
@@ -238,10 +238,10 @@ impl Settings {
 
 impl Common {
     pub(super) fn config(&self, point: &Point) -> Result<RunConfig, Usage> {
-        self.run(point, 1).call.config()
+        self.plan_run(point, 1).call.config()
     }
 
-    pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
+    pub(super) fn plan_run(&self, point: &Point, seed: u32) -> PlannedRun {
         let call = TrainCall {
             env: Some(self.env.clone()),
             agent: Some(point.agent.clone()),
@@ -256,9 +256,9 @@ impl Common {
 }
 
 /// Returns the levels of all dials of a world, in the order of the menu. `names` are the requested dials; all if empty.
-fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Vec<LevelOf>, Usage> {
-    dials.retain(|it| it.worlds.is_empty() || it.worlds.iter().any(|kind| kind == world.kind()));
-    let known: Vec<_> = dials.iter().map(|dial| dial.name.as_str()).collect();
+fn levels(mut all: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Vec<DialLevel>, Usage> {
+    all.retain(|it| it.worlds.is_empty() || it.worlds.iter().any(|kind| kind == world.kind()));
+    let known: Vec<_> = all.iter().map(|dial| dial.name.as_str()).collect();
     if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
         return Err(usage!(
             "unknown dial {unknown:?} in this world{}; --dials takes {}",
@@ -266,8 +266,8 @@ fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Ve
             known.join(", ")
         ));
     }
-    let asks_for = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
-    let levels = dials.iter().flat_map(|dial| dial.levels(asks_for(dial)));
+    let requests = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
+    let levels = all.iter().flat_map(|dial| dial.levels(requests(dial)));
     Ok(levels.collect())
 }
 
@@ -297,7 +297,7 @@ mod tests {
 
     fn of(line: &str, found: Option<Common>) -> Result<Settings, Usage> {
         let args: TradeoffArgs = parse(line);
-        Settings::of(&args, presets::world(&args.env)?, found)
+        Settings::from_args(&args, presets::world(&args.env)?, found)
     }
 
     fn settings(world: &str, smoke: &str) -> Settings {
@@ -312,7 +312,7 @@ mod tests {
         for (name, smoke) in worlds.iter().flat_map(|it| [(it, ""), (it, " --smoke")]) {
             let Settings { common, levels, .. } = settings(name, smoke);
             let mut keys = BTreeSet::new();
-            for LevelOf { base, point, .. } in levels {
+            for DialLevel { base, point, .. } in levels {
                 let config = common.config(&point);
                 let config = config.unwrap_or_else(|e| panic!("{name} {}: {e}", point.key));
                 let key = point.key;
@@ -362,13 +362,13 @@ coinrun|observation|input.height=64 input.width=64";
     #[test]
     fn a_level_that_is_also_a_base_is_timed_beside_its_own() {
         let settings = of("--env mspacman --dials model.embedding_dim", None).unwrap();
-        let asked: Vec<_> = settings.levels.iter().filter(|it| it.is_asked).collect();
+        let asked = settings.levels.iter().find(|it| it.is_requested).unwrap();
         let timed = |point: &Point| {
-            let base = settings.base_of(point).key.clone();
-            (base, settings.asks_for(point))
+            let base = settings.timing_base(point).key.clone();
+            (base, settings.requests(point))
         };
-        assert_eq!(timed(&asked[0].base), ("c51".into(), true));
-        assert_eq!(timed(&asked[0].point), ("driml-fix".into(), true));
+        assert_eq!(timed(&asked.base), ("c51".into(), true));
+        assert_eq!(timed(&asked.point), ("driml-fix".into(), true));
         assert_eq!(timed(&settings.levels[0].base), ("c51".into(), false));
     }
 
@@ -392,7 +392,7 @@ coinrun|observation|input.height=64 input.width=64";
             config.notes.clear();
             config
         };
-        let is_preset = |it: &&LevelOf| it.dial.name.starts_with("preset");
+        let is_preset = |it: &&DialLevel| it.dial.name.starts_with("preset");
         for it in levels.iter().filter(is_preset) {
             assert_eq!(of("paper", &it.base), of(&it.dial.base, &it.base));
             let whole = of(&it.level, &it.base);
@@ -403,7 +403,7 @@ coinrun|observation|input.height=64 input.width=64";
     #[test]
     fn a_folder_keeps_its_length() {
         let first = of("--env mspacman", None).unwrap();
-        assert!(first.frames_open);
+        assert!(first.may_shorten);
         let found = Common {
             frames: 777,
             jobs: 2,
@@ -411,9 +411,9 @@ coinrun|observation|input.height=64 input.width=64";
         };
         let again = of("--env mspacman", Some(found)).unwrap();
         let kept = (again.common.frames, again.common.jobs);
-        assert_eq!((kept, again.frames_open), ((777, 2), false));
+        assert_eq!((kept, again.may_shorten), ((777, 2), false));
         // A report measures nothing, so it does not choose a length.
-        assert!(!of("--env mspacman --report", None).unwrap().frames_open);
+        assert!(!of("--env mspacman --report", None).unwrap().may_shorten);
     }
 
     #[test]

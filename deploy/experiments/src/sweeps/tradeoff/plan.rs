@@ -17,11 +17,11 @@ pub(super) struct Budget {
     /// The seconds of everything taken. Each point counts once.
     pub(super) seconds: f64,
     /// The keys of the points taken.
-    paid: BTreeSet<String>,
+    taken: BTreeSet<String>,
 }
 
 impl Budget {
-    pub(super) fn of(seconds_max: f64) -> Self {
+    pub(super) fn new(seconds_max: f64) -> Self {
         Self {
             seconds_max,
             ..Self::default()
@@ -30,14 +30,14 @@ impl Budget {
 
     /// Takes a level and its base with all their seeds if both fit, and returns whether it does. A level that costs nothing always fits. A
     /// level that does not fit leaves its room to later levels.
-    pub(super) fn takes(&mut self, base_and_level: &[Cost; 2]) -> bool {
+    pub(super) fn try_take(&mut self, base_and_level: &[Cost; 2]) -> bool {
         let both = base_and_level.iter();
-        let new = both.clone().filter(|it| !self.paid.contains(&it.key));
+        let new = both.clone().filter(|it| !self.taken.contains(&it.key));
         let more: f64 = new.map(|it| it.seconds).sum();
         let fits = more == 0.0 || self.seconds + more <= self.seconds_max;
         if fits {
             self.seconds += more;
-            self.paid.extend(both.map(|it| it.key.clone()));
+            self.taken.extend(both.map(|it| it.key.clone()));
         }
         fits
     }
@@ -45,7 +45,7 @@ impl Budget {
 
 /// Returns the frames of a run: the largest of `full`, its half and its quarter with which the first level and its base fit into the
 /// budget, or `full` if none fits. `seconds` is what both take with all seeds and `full` frames.
-pub(super) fn frames(full: u64, seconds: f64, budget_seconds: f64) -> u64 {
+pub(super) fn choose_frames(full: u64, seconds: f64, budget_seconds: f64) -> u64 {
     let lengths = [full, full / 2, full / 4];
     let fits = |frames: &u64| seconds * *frames as f64 / full as f64 <= budget_seconds;
     lengths.into_iter().find(fits).unwrap_or(full)
@@ -75,14 +75,14 @@ mod tests {
             (&finished, 0.0, &[true, false], 0.0),
             (&finished, 50.0, &[true, true], 50.0),
         ] {
-            let mut budget = Budget::of(seconds_max);
+            let mut budget = Budget::new(seconds_max);
             let costs = levels.iter().map(|both| {
                 both.map(|(key, seconds)| Cost {
                     key: key.to_owned(),
                     seconds,
                 })
             });
-            let found: Vec<_> = costs.map(|it| budget.takes(&it)).collect();
+            let found: Vec<_> = costs.map(|it| budget.try_take(&it)).collect();
             let found = (&found[..], budget.seconds);
             assert_eq!(found, (chosen, seconds), "{seconds_max} s");
         }
@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn a_small_budget_makes_shorter_runs() {
-        let found = [400.0, 200.0, 80.0, 1.0].map(|budget| frames(40_000, 300.0, budget));
+        let found = [400.0, 200.0, 80.0, 1.0].map(|budget| choose_frames(40_000, 300.0, budget));
         assert_eq!(found, [40_000, 20_000, 10_000, 40_000]);
     }
 }

@@ -25,9 +25,9 @@ const EQUAL_TIME: &str = "agent,base,equal_seconds,\
 /// The dial that turns DIM on.
 const DIM: &str = "DIM";
 
-pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
+pub(super) fn write_report(session: Session, results: &Results) -> anyhow::Result<()> {
     let of_dim = results.level_rows().filter(|row| row.dial.name == DIM);
-    let equal: Vec<_> = of_dim.filter_map(|row| EqualTime::of(&row)).collect();
+    let equal: Vec<_> = of_dim.filter_map(|row| EqualTime::from_row(&row)).collect();
     write_runs(&session, results)?;
     write_levels(&session, results)?;
     session.write_csv("equal_time", EQUAL_TIME, equal.iter().map(EqualTime::cells))?;
@@ -35,10 +35,11 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
         ("pareto", GREEDY, "greedy"),
         ("pareto_training", TRAINING, "training"),
     ] {
-        session.save_figure(stem, &figures::pareto(results, returns, name))?;
+        session.save_figure(stem, &figures::pareto_figure(results, returns, name))?;
     }
-    session.save_figure("wall", &figures::wall(results))?;
-    session.write_page(include_str!("../tradeoff.md.j2"), values(results, &equal)?)
+    session.save_figure("wall", &figures::wall_figure(results))?;
+    let values = page_values(results, &equal)?;
+    session.write_page(include_str!("../tradeoff.md.j2"), values)
 }
 
 fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -47,9 +48,9 @@ fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
     let all = results.points.iter();
     let all = all.flat_map(|(key, point)| point.seeds.iter().map(move |it| (key, it)));
     let rows = all.map(|(key, it)| {
-        let summary = &it.ran.summary;
+        let summary = &it.run.summary;
         let speed = (summary.updates, rounded(summary.updates_per_second));
-        let measured = MEASURES.map(|measure| (measure.of)(it).map(rounded));
+        let measured = MEASURES.map(|measure| (measure.get)(it).map(rounded));
         let of = (key, &summary.agent, it.seed);
         (of, speed, &summary.weights_sha256, measured)
     });
@@ -62,7 +63,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
         columns += &format!(",{name},{name}_low,{name}_high");
         columns += &format!(",{name}_minus_base,{name}_minus_base_low,{name}_minus_base_high");
     }
-    let rows = results.by_dial().flatten().map(|row| {
+    let rows = results.rows_by_dial().flatten().map(|row| {
         let measured = |name: &str| row.result.measured.get(name).copied().map(rounded);
         let of_runs = MEASURES.map(|measure| {
             let difference = row.difference(measure).filter(|_| !row.is_base);
@@ -80,9 +81,9 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
 }
 
 /// Returns the cells for mean, low end and high end; missing numbers are empty.
-fn interval_cells(of: Option<Interval>) -> [Option<f64>; 3] {
-    let (low, high) = of.and_then(|it| it.ends).unzip();
-    [of.map(|it| it.mean), low, high].map(|it| it.map(rounded))
+fn interval_cells(interval: Option<Interval>) -> [Option<f64>; 3] {
+    let (low, high) = interval.and_then(|it| it.ends).unzip();
+    [interval.map(|it| it.mean), low, high].map(|it| it.map(rounded))
 }
 
 /// The training returns of C51 (the base) and an agent with DIM (the level). Arrays are [base, level], with a value for each run.
@@ -101,7 +102,7 @@ struct EqualTime {
 impl EqualTime {
     /// Compares training returns of finished runs, because the agent at an earlier time was not kept. `None` if a side has no return at
     /// `seconds`.
-    fn of(row: &Row<'_>) -> Option<Self> {
+    fn from_row(row: &Row<'_>) -> Option<Self> {
         let sides = [row.base, row.result];
         let [base, level] = sides.map(|point| {
             let ends = point.seeds.iter().filter_map(|it| it.curve.last());
@@ -110,18 +111,18 @@ impl EqualTime {
         let seconds = base?.min(level?);
         let returns_at = |seconds: f64| {
             sides.map(|point| -> Vec<f64> {
-                let returns = point.seeds.iter().filter_map(|it| at(&it.curve, seconds));
-                returns.collect()
+                let curves = point.seeds.iter().map(|it| &it.curve);
+                curves.filter_map(|it| value_at(it, seconds)).collect()
             })
         };
-        let of = Self {
+        let comparison = Self {
             agent: row.agent.into(),
             base: row.dial.agent.clone(),
             seconds,
             end: returns_at(f64::INFINITY),
             then: returns_at(seconds),
         };
-        (!of.then.iter().any(Vec::is_empty)).then_some(of)
+        (!comparison.then.iter().any(Vec::is_empty)).then_some(comparison)
     }
 
     /// Returns the cells of the columns [`EQUAL_TIME`].
@@ -135,28 +136,28 @@ impl EqualTime {
 }
 
 /// Returns the last value of a curve up to this time.
-fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
+fn value_at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
     let before = curve.iter().take_while(|(x, _)| *x <= seconds).last();
     before.map(|(_, value)| *value)
 }
 
-fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
+fn page_values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     let common = &results.common;
     let (rows, states) = measured::sizes(&common.config(&results.levels[0].base)?);
-    let dials = results.by_dial().map(|rows| {
+    let dials = results.rows_by_dial().map(|rows| {
         let all: Vec<_> = rows.iter().map(page_row).collect();
         context! { dial => rows[0].dial, base => all[0], levels => all[1..] }
     });
-    let (judged, by_chance) = by_chance(results);
+    let (judged, false_positives) = false_positives(results);
     Ok(context! {
         settings => common,
         dials => dials.collect::<Vec<_>>(),
         equal,
         random => results.random,
-        seeds => seeds(results, false),
-        base_seeds => seeds(results, true),
+        seeds => seed_counts(results, false),
+        base_seeds => seed_counts(results, true),
         judged,
-        by_chance,
+        by_chance => false_positives,
         rows,
         states,
         left_out => results.left_out,
@@ -166,17 +167,14 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
 
 /// Converts a row for the template: the measured numbers, and for each measure the numbers of the runs.
 fn page_row(row: &Row<'_>) -> Value {
-    let measured = |name: &'static str| {
-        let found = row.result.measured.get(name).copied();
-        (name, Value::from(found))
-    };
+    let measured = |name: &'static str| (name, Value::from(row.result.measured.get(name).copied()));
     let of_runs = MEASURES.map(|it| (it.name, Value::from_serialize(row.result.values(it))));
     let named: Value = MEASURED.split(',').map(measured).chain(of_runs).collect();
     context! { level => row.name, agent => row.agent, frames_gain => row.frames_gain(), ..named }
 }
 
 /// Returns the numbers of seeds that bases have, or that other points have, in increasing order.
-fn seeds(results: &Results, of_bases: bool) -> BTreeSet<usize> {
+fn seed_counts(results: &Results, of_bases: bool) -> BTreeSet<usize> {
     let bases: BTreeSet<&str> = results.levels.iter().map(|of| &*of.base.key).collect();
     let all = results.points.iter();
     let some = all.filter(|(key, _)| bases.contains(key.as_str()) == of_bases);
@@ -185,7 +183,7 @@ fn seeds(results: &Results, of_bases: bool) -> BTreeSet<usize> {
 
 /// Returns how many differences of returns the page judges, and how many of them would be called better or worse by chance if no level
 /// changed anything and returns were normally distributed.
-fn by_chance(results: &Results) -> (usize, f64) {
+fn false_positives(results: &Results) -> (usize, f64) {
     let mut known = BTreeMap::new();
     let each = results.level_rows().flat_map(|row| {
         let points = [row.base, row.result];
@@ -206,7 +204,7 @@ mod tests {
     #[test]
     fn a_curve_is_read_at_a_time() {
         let curve = [(1.0, 0.5), (2.0, 0.6), (4.0, 0.9)];
-        let found = [3.0, 0.5, 9.0].map(|seconds| at(&curve, seconds));
+        let found = [3.0, 0.5, 9.0].map(|seconds| value_at(&curve, seconds));
         assert_eq!(found, [Some(0.6), None, Some(0.9)]);
     }
 }

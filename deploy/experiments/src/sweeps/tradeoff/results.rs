@@ -2,26 +2,26 @@
 
 use std::collections::BTreeMap;
 
-use super::menu::{Common, Dial, LevelOf, Point};
+use super::menu::{Common, Dial, DialLevel, Point};
 use crate::{
     stats::{Difference, Interval, difference, interval, mean},
     sweep::plan::FinishedRun,
 };
 
 /// Numbers of the benchmark, or errors against the reference, by their column names in the data.
-pub(super) type Measured = BTreeMap<String, f64>;
+pub(super) type Numbers = BTreeMap<String, f64>;
 
 #[derive(Default)]
 pub(super) struct PointResult {
     /// The benchmark, and the errors with the weights of the first finished seed.
-    pub(super) measured: Measured,
+    pub(super) measured: Numbers,
     pub(super) seeds: Vec<SeedResult>,
 }
 
 /// A finished run.
 pub(super) struct SeedResult {
     pub(super) seed: u32,
-    pub(super) ran: FinishedRun,
+    pub(super) run: FinishedRun,
     /// Training return over seconds.
     pub(super) curve: Vec<(f64, f64)>,
     /// The returns of the agent, played greedily.
@@ -31,7 +31,7 @@ pub(super) struct SeedResult {
 pub(super) struct Results {
     pub(super) common: Common,
     /// The levels that have finished runs, and whose bases have.
-    pub(super) levels: Vec<LevelOf>,
+    pub(super) levels: Vec<DialLevel>,
     /// The results by the key of the point.
     pub(super) points: BTreeMap<String, PointResult>,
     pub(super) random: Vec<f64>,
@@ -45,20 +45,20 @@ pub(super) struct Results {
 #[derive(Clone, Copy)]
 pub(super) struct Measure {
     pub(super) name: &'static str,
-    pub(super) of: fn(&SeedResult) -> Option<f64>,
+    pub(super) get: fn(&SeedResult) -> Option<f64>,
 }
 
-const fn measure(name: &'static str, of: fn(&SeedResult) -> Option<f64>) -> Measure {
-    Measure { name, of }
+const fn measure(name: &'static str, get: fn(&SeedResult) -> Option<f64>) -> Measure {
+    Measure { name, get }
 }
 
 /// The mean return of the greedily played episodes.
 pub(super) const GREEDY: Measure = measure("greedy_return", |it| mean(&it.greedy));
 /// The mean return of the last 100 training episodes.
-pub(super) const TRAINING: Measure = measure("training_return", |it| it.ran.summary.mean_return);
+pub(super) const TRAINING: Measure = measure("training_return", |it| it.run.summary.mean_return);
 /// `None` for a resumed run, whose time includes filling its replay and starting its processes again.
 pub(super) const FRAMES_PER_SECOND: Measure = measure("frames_per_second", |it| {
-    let summary = &it.ran.summary;
+    let summary = &it.run.summary;
     (summary.resumed_after_updates == 0).then_some(summary.frames_per_second)
 });
 /// All measures, in the order of the data.
@@ -66,24 +66,24 @@ pub(super) const MEASURES: [Measure; 7] = [
     GREEDY,
     TRAINING,
     FRAMES_PER_SECOND,
-    measure("wall_seconds", |it| Some(it.ran.summary.wall_seconds)),
+    measure("wall_seconds", |it| Some(it.run.summary.wall_seconds)),
     // The sum over all processes of their highest resident memory.
     measure("rss_mib", |it| {
-        Some(it.ran.summary.rss_mib_max.values().flatten().sum())
+        Some(it.run.summary.rss_mib_max.values().flatten().sum())
     }),
     // The median number of updates by which the acting weights were behind.
     measure("weights_behind_updates", |it| {
-        Some(it.ran.summary.replay.weights_behind_updates?.p50)
+        Some(it.run.summary.replay.weights_behind_updates?.p50)
     }),
     // The median number of seconds for which newer weights had existed.
     measure("weights_behind_seconds", |it| {
-        Some(it.ran.summary.replay.weights_behind_s?.p50)
+        Some(it.run.summary.replay.weights_behind_s?.p50)
     }),
 ];
 
 impl PointResult {
     pub(super) fn values(&self, measure: Measure) -> Vec<f64> {
-        self.seeds.iter().filter_map(measure.of).collect()
+        self.seeds.iter().filter_map(measure.get).collect()
     }
 
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
@@ -112,9 +112,9 @@ impl Row<'_> {
     /// time, beside other runs.
     pub(super) fn frames_gain(&self) -> Option<f64> {
         let mean_of = |point: &PointResult, other: &PointResult| {
-            let both = |it: &&SeedResult| other.seeds.iter().any(|of| of.seed == it.seed);
+            let both = |it: &&SeedResult| other.seeds.iter().any(|that| that.seed == it.seed);
             let values = point.seeds.iter().filter(both);
-            mean(&values.filter_map(FRAMES_PER_SECOND.of).collect::<Vec<_>>())
+            mean(&values.filter_map(FRAMES_PER_SECOND.get).collect::<Vec<_>>())
         };
         Some(mean_of(self.result, self.base)? / mean_of(self.base, self.result)?)
     }
@@ -122,10 +122,10 @@ impl Row<'_> {
 
 impl Results {
     /// Returns for each dial with runs the base, followed by the levels.
-    pub(super) fn by_dial<'a>(&'a self) -> impl Iterator<Item = Vec<Row<'a>>> {
+    pub(super) fn rows_by_dial<'a>(&'a self) -> impl Iterator<Item = Vec<Row<'a>>> {
         let dials = self.levels.chunk_by(|a, b| a.dial.name == b.dial.name);
         dials.map(move |levels| {
-            let LevelOf { dial, base, .. } = &levels[0];
+            let DialLevel { dial, base, .. } = &levels[0];
             let row = |name: &'a str, point: &'a Point, is_base| Row {
                 dial,
                 name,
@@ -135,12 +135,12 @@ impl Results {
                 base: &self.points[&base.key],
             };
             let base = row(&dial.base, base, true);
-            let levels = levels.iter().map(|of| row(&of.level, &of.point, false));
+            let levels = levels.iter().map(|it| row(&it.level, &it.point, false));
             std::iter::once(base).chain(levels).collect()
         })
     }
 
     pub(super) fn level_rows(&self) -> impl Iterator<Item = Row<'_>> {
-        self.by_dial().flatten().filter(|row| !row.is_base)
+        self.rows_by_dial().flatten().filter(|row| !row.is_base)
     }
 }
