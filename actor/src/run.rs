@@ -78,7 +78,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     };
     // Declared before joining, so that no other process can join as this actor from then on.
     let client = RunClient::new(session, keys, spec_hash);
-    let alive = client.declare_alive(participant.alive());
+    let alive = client.declare_alive(participant.peer());
     let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
         return Ok(false);

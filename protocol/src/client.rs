@@ -18,7 +18,7 @@ use crate::{
         buffers::{Buffer, BufferPool},
         codec,
         error::CodecError,
-        keys::{Alive, Keys},
+        keys::{Keys, Peer},
         message::{Keyed, Message, Request},
     },
 };
@@ -105,7 +105,7 @@ impl RunClient {
 
     /// Fetches a message by an empty query, such as a status.
     pub fn fetch<M: Keyed>(&self, timeout: Duration) -> Result<M, SessionError> {
-        self.query::<M, M>(self.keys.of::<M>(), ZBytes::new(), timeout)?
+        self.query::<M, M>(self.keys.key::<M>(), ZBytes::new(), timeout)?
             .wait()
     }
 
@@ -121,7 +121,7 @@ impl RunClient {
         payload: ZBytes,
     ) -> Result<Sealed<R>, SessionError> {
         let sealed = Sealed::with_payload(request, payload, self.spec_hash);
-        sealed.map_err(|why| SessionError::Failed(format!("{}: {why}", self.keys.of::<R>())))
+        sealed.map_err(|why| SessionError::Failed(format!("{}: {why}", self.keys.key::<R>())))
     }
 
     /// Sends a request. Requests of one priority arrive in the order in which they were sent.
@@ -134,8 +134,8 @@ impl RunClient {
         timeout: Duration,
     ) -> Result<PendingReply<R::Reply>, SessionError> {
         let key = match request.actor {
-            Some(actor) => self.keys.of_actor::<R>(actor),
-            None => self.keys.of_learner::<R>(),
+            Some(actor) => self.keys.actor_key::<R>(actor),
+            None => self.keys.learner_key::<R>(),
         };
         self.query::<R, R::Reply>(key, request.bytes, timeout)
     }
@@ -158,7 +158,7 @@ impl RunClient {
     pub fn announce<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
         let publisher = self
             .session
-            .declare_publisher(self.keys.of::<M>())
+            .declare_publisher(self.keys.key::<M>())
             .congestion_control(CongestionControl::Drop)
             .priority(M::PRIORITY)
             .wait()?;
@@ -177,7 +177,7 @@ impl RunClient {
     ) -> zenoh::Result<Subscriber<()>> {
         let spec_hash = self.spec_hash;
         self.session
-            .declare_subscriber(self.keys.of::<M>())
+            .declare_subscriber(self.keys.key::<M>())
             .callback(move |sample: Sample| {
                 let bytes = sample.payload().to_bytes();
                 on_message(codec::decode(&bytes, Some(spec_hash)).map(|(message, _)| message));
@@ -186,9 +186,9 @@ impl RunClient {
     }
 
     /// Shows other processes that `who` is connected, until the returned token is dropped.
-    pub fn declare_alive(&self, who: Alive) -> zenoh::Result<LivelinessToken> {
+    pub fn declare_alive(&self, who: Peer) -> zenoh::Result<LivelinessToken> {
         let token = self.session.liveliness();
-        token.declare_token(self.keys.alive_key(who)).wait()
+        token.declare_token(self.keys.liveliness_key(who)).wait()
     }
 }
 

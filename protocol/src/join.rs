@@ -69,7 +69,7 @@ pub fn run_info_within(
     keys: &Keys,
     wait_max: Duration,
 ) -> Result<RunInfo, SessionError> {
-    let (key, nothing) = (keys.of::<RunInfo>(), ZBytes::new());
+    let (key, nothing) = (keys.key::<RunInfo>(), ZBytes::new());
     session::send(session, &key, nothing, RunInfo::PRIORITY, wait_max)?
         .wait_for(|bytes| codec::decode(&bytes.to_bytes(), None).map(|(run_info, _)| run_info))
 }

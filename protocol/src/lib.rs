@@ -74,7 +74,7 @@ pub use wire::{
     buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},
     error::CodecError,
-    keys::{Alive, Keys, ProcessName},
+    keys::{Keys, Peer, ProcessName},
     message::{Keyed, Message, Request},
     shared_memory,
 };

@@ -63,7 +63,7 @@ impl<R: Request> Incoming<R> {
             codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
         // Where each process has its own key, access control guards only the key, so the request must come at the key of its sender.
         let (key, actor) = (self.query.key_expr().as_str(), request.actor());
-        if R::BY_ACTOR && Keys::actor(key) != actor {
+        if R::KEY_PER_ACTOR && Keys::parse_actor(key) != actor {
             let key = key.to_owned();
             return Err(CodecError::Actor { actor, key });
         }
@@ -196,7 +196,7 @@ impl<R: Request + 'static> QueryWorkers<R> {
                 tracing::debug!("more queries than can wait; the sender retries");
             }
         };
-        let queryable = client.session().declare_queryable(client.keys().of::<R>());
+        let queryable = client.session().declare_queryable(client.keys().key::<R>());
         queryable.complete(true).callback(take).wait()
     }
 

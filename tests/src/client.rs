@@ -193,7 +193,7 @@ impl Client {
 
     /// Sends a chunk as an actor would, and returns the reply.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
-        let key = self.keys.of_actor::<ChunkHeader>(chunk.header.actor);
+        let key = self.keys.actor_key::<ChunkHeader>(chunk.header.actor);
         let reply = self.request(&key, self.encode_chunk(chunk));
         let reply = reply.expect("chunks are always answered");
         codec::decode(&reply, Some(self.spec.hash())).unwrap().0

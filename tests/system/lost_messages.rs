@@ -71,7 +71,7 @@ impl Endpoint {
 
     /// Replies to messages of type `M`.
     fn on_message<M: Keyed>(&mut self, answer: impl Fn(Query) + Send + Sync + 'static) {
-        let key = Keys::new("driml").unwrap().of::<M>();
+        let key = Keys::new("driml").unwrap().key::<M>();
         let queryable = self.session.declare_queryable(key).callback(answer).wait();
         self.queryables.push(queryable.unwrap());
     }

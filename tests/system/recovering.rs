@@ -121,13 +121,13 @@ fn check_postponed(system: &TestSystem, spec: &RunSpec) {
     let chunk = client.encode_chunk(&Chunk::zeroed(tiny_replay::header(spec, 5, 1, 1)));
     let weights = upload(spec.hash(), 99, 1, b"weights");
     let rows = [
-        Row::new(client.keys.of_actor::<ChunkHeader>(5), chunk, postponed),
-        Row::new(client.keys.of::<WeightsUpload>(), weights, postponed),
+        Row::new(client.keys.actor_key::<ChunkHeader>(5), chunk, postponed),
+        Row::new(client.keys.key::<WeightsUpload>(), weights, postponed),
         Row::of(&client, &batch_request(99, 16), postponed),
         Row::of(&client, &actor_join(5, 1), postponed),
         Row::of(&client, &new_learner(99), postponed),
-        Row::new(client.keys.of::<RunInfo>(), [], postponed),
-        Row::new(client.keys.of::<ReplayStatus>(), [], postponed),
+        Row::new(client.keys.key::<RunInfo>(), [], postponed),
+        Row::new(client.keys.key::<ReplayStatus>(), [], postponed),
     ];
     check_replies(&client, rows);
 }

@@ -16,7 +16,7 @@ use driml_learner::{
 };
 use driml_machine::speed_meter::SpeedMeter;
 use driml_protocol::{
-    ActorJoin, Alive, JoinReply, Keys, LearnerJoin, Request, RunClient, Shutdown, join,
+    ActorJoin, JoinReply, Keys, LearnerJoin, Peer, Request, RunClient, Shutdown, join,
     session::{self, Endpoints, MESSAGE_BYTES_MAX},
     tls::{Credentials, Role},
 };
@@ -103,7 +103,7 @@ impl Server {
             actor,
             incarnation: INCARNATION,
         };
-        let who = Alive::actor(actor, INCARNATION);
+        let who = Peer::actor(actor, INCARNATION);
         let (client, alive) = self.join_run(Role::Actor(actor), who, &join)?;
         let limits = DeliveryLimits::from_config(&self.actor.actor);
         let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
@@ -130,7 +130,7 @@ impl Server {
             run: LEARNER,
             ..LearnerJoin::default()
         };
-        let (client, _alive) = self.join_run(Role::Learner, Alive::learner(LEARNER), &join)?;
+        let (client, _alive) = self.join_run(Role::Learner, Peer::learner(LEARNER), &join)?;
         let LearnerConfig {
             learner, transport, ..
         } = &self.learner;
@@ -168,7 +168,7 @@ impl Server {
     fn join_run(
         &mut self,
         role: Role,
-        who: Alive,
+        who: Peer,
         join: &impl Request<Reply = JoinReply>,
     ) -> anyhow::Result<(RunClient, LivelinessToken)> {
         let mut session = self.sessions[0].clone();

@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
-    Alive, Batch, Keys, LearnerJoin, RequestId, RunClient, RunInfo, ShardCounts, Shutdown, Silence,
+    Batch, Keys, LearnerJoin, Peer, RequestId, RunClient, RunInfo, ShardCounts, Shutdown, Silence,
     Waiting, join,
     session::{self, Endpoints},
     tls::Credentials,
@@ -91,7 +91,7 @@ impl Shards {
         };
         for (shard, client) in clients.iter().enumerate() {
             // Declared before the learner joins, so that no other learner can take its place from then on.
-            let alive = client.declare_alive(Alive::learner(learner));
+            let alive = client.declare_alive(Peer::learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
             membership._liveliness.push(alive);
             let join = LearnerJoin {

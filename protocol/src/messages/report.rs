@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::status::Waiting;
 use crate::wire::{
     error::CodecError,
-    keys::{Alive, ProcessName},
+    keys::{Peer, ProcessName},
     message::no_payload,
 };
 
@@ -34,10 +34,10 @@ pub enum Participant {
 
 impl Participant {
     /// The process as other processes see it by its liveliness token.
-    pub fn alive(self) -> Alive {
+    pub fn peer(self) -> Peer {
         match self {
-            Self::Actor { actor, incarnation } => Alive::actor(actor, incarnation),
-            Self::Learner(learner) => Alive::learner(learner),
+            Self::Actor { actor, incarnation } => Peer::actor(actor, incarnation),
+            Self::Learner(learner) => Peer::learner(learner),
         }
     }
 }

@@ -66,8 +66,8 @@ macro_rules! messages {
             $(impl Keyed for $message {
                 const KEY: &'static str = $key;
                 // Always true: a macro repetition must use the name that it repeats.
-                $(const BY_ACTOR: bool = !stringify!($actor).is_empty();)?
-                $(const BY_ACTOR: bool = !stringify!($who).is_empty();)?
+                $(const KEY_PER_ACTOR: bool = !stringify!($actor).is_empty();)?
+                $(const KEY_PER_ACTOR: bool = !stringify!($who).is_empty();)?
                 $(const PRIORITY: Priority = Priority::$priority;)?
             })?
 

@@ -30,68 +30,68 @@ impl Keys {
         }
     }
 
-    fn key(&self, name: &str) -> String {
+    fn prefixed(&self, name: &str) -> String {
         format!("{}/{name}", self.namespace)
     }
 
     /// The key at which messages of type `M` are answered, fetched or announced. If each actor has its own key, this one matches all.
-    pub fn of<M: Keyed>(&self) -> String {
-        self.said_by::<M>('*')
+    pub fn key<M: Keyed>(&self) -> String {
+        self.key_for::<M>('*')
     }
 
     /// The key at which `actor` sends messages of type `M`.
-    pub fn of_actor<M: Keyed>(&self, actor: u32) -> String {
-        self.said_by::<M>(actor)
+    pub fn actor_key<M: Keyed>(&self, actor: u32) -> String {
+        self.key_for::<M>(actor)
     }
 
     /// The key at which the learner sends messages of type `M`, whether or not each actor has its own.
-    pub fn of_learner<M: Keyed>(&self) -> String {
-        self.said_by::<M>("learner")
+    pub fn learner_key<M: Keyed>(&self) -> String {
+        self.key_for::<M>("learner")
     }
 
-    fn said_by<M: Keyed>(&self, who: impl fmt::Display) -> String {
-        match M::BY_ACTOR {
-            true => self.key(&format!("{}/{who}", M::KEY)),
-            false => self.key(M::KEY),
+    fn key_for<M: Keyed>(&self, who: impl fmt::Display) -> String {
+        match M::KEY_PER_ACTOR {
+            true => self.prefixed(&format!("{}/{who}", M::KEY)),
+            false => self.prefixed(M::KEY),
         }
     }
 
     /// The actor's number at the end of `key`; `None` if `key` does not end in a number.
-    pub(crate) fn actor(key: &str) -> Option<u32> {
+    pub(crate) fn parse_actor(key: &str) -> Option<u32> {
         key.rsplit('/').next()?.parse().ok()
     }
 
     /// The key of the liveliness token of one incarnation of an actor or a learner.
-    pub fn alive_key(&self, Alive { process, mark }: Alive) -> String {
-        self.lives(process, format_args!("{mark:016x}"))
+    pub fn liveliness_key(&self, Peer { process, hash }: Peer) -> String {
+        self.liveliness_key_for(process, format_args!("{hash:016x}"))
     }
 
-    pub(crate) fn all_lives(&self, process: ProcessName) -> String {
-        self.lives(process, '*')
+    pub(crate) fn liveliness_keys_of(&self, process: ProcessName) -> String {
+        self.liveliness_key_for(process, '*')
     }
 
-    fn lives(&self, process: ProcessName, mark: impl fmt::Display) -> String {
-        self.key(&match process {
-            ProcessName::Actor(actor) => format!("alive/actor/{actor}/{mark}"),
-            ProcessName::Learner => format!("alive/learner/{mark}"),
+    fn liveliness_key_for(&self, process: ProcessName, hash: impl fmt::Display) -> String {
+        self.prefixed(&match process {
+            ProcessName::Actor(actor) => format!("alive/actor/{actor}/{hash}"),
+            ProcessName::Learner => format!("alive/learner/{hash}"),
         })
     }
 
     /// The key that matches the liveliness tokens of all actors and learners.
-    pub fn all_alive(&self) -> String {
-        self.key("alive/**")
+    pub fn all_liveliness_keys(&self) -> String {
+        self.prefixed("alive/**")
     }
 
-    /// The process and mark whose liveliness token has this key; `None` if it is not a token of this run.
-    pub fn alive(&self, key: &str) -> Option<Alive> {
+    /// The process and incarnation whose liveliness token has this key; `None` if it is not a token of this run.
+    pub fn peer(&self, key: &str) -> Option<Peer> {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
-        let (process, mark) = match rest.split('/').collect::<Vec<_>>()[..] {
-            ["actor", actor, mark] => (ProcessName::Actor(actor.parse().ok()?), mark),
-            ["learner", mark] => (ProcessName::Learner, mark),
+        let (process, hash) = match rest.split('/').collect::<Vec<_>>()[..] {
+            ["actor", actor, hash] => (ProcessName::Actor(actor.parse().ok()?), hash),
+            ["learner", hash] => (ProcessName::Learner, hash),
             _ => return None,
         };
-        let mark = u64::from_str_radix(mark, 16).ok()?;
-        Some(Alive { process, mark })
+        let hash = u64::from_str_radix(hash, 16).ok()?;
+        Some(Peer { process, hash })
     }
 }
 
@@ -116,33 +116,33 @@ impl fmt::Display for ProcessName {
 /// An incarnation of a process, as its liveliness token shows it. Every client can see tokens, so a token hides the number by which the
 /// replay server knows the incarnation: with this number, a client could send in its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct Alive {
+pub struct Peer {
     /// The process, in any incarnation.
     pub process: ProcessName,
-    /// The mark of this incarnation, a hash of its number.
-    pub mark: u64,
+    /// The hash of this incarnation's number.
+    pub hash: u64,
 }
 
-impl Alive {
+impl Peer {
     /// The incarnation of `process` with this number.
-    pub fn of(process: ProcessName, number: u64) -> Self {
-        let mark = mark(number);
-        Self { process, mark }
+    pub fn new(process: ProcessName, number: u64) -> Self {
+        let hash = incarnation_hash(number);
+        Self { process, hash }
     }
 
     /// This incarnation of an actor.
     pub fn actor(actor: u32, incarnation: u64) -> Self {
-        Self::of(ProcessName::Actor(actor), incarnation)
+        Self::new(ProcessName::Actor(actor), incarnation)
     }
 
     /// The learner with this number.
     pub fn learner(learner: u64) -> Self {
-        Self::of(ProcessName::Learner, learner)
+        Self::new(ProcessName::Learner, learner)
     }
 }
 
 /// Proves knowledge of `number` without revealing it: the first 8 bytes of its SHA-256.
-fn mark(number: u64) -> u64 {
+fn incarnation_hash(number: u64) -> u64 {
     let digest = Sha256::digest(number.to_le_bytes());
     u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
 }
@@ -155,32 +155,32 @@ mod tests {
     #[test]
     fn what_an_actor_says_stands_under_its_number() {
         let keys = Keys::new("a/7").unwrap();
-        assert_eq!(keys.of::<Leave>(), "a/7/leave/*");
-        assert_eq!(keys.of_actor::<Leave>(7), "a/7/leave/7");
-        assert_eq!(keys.of_actor::<AffinityUpdate>(7), "a/7/affinity");
-        assert_eq!(keys.of_learner::<AffinityUpdate>(), "a/7/affinity");
-        assert_eq!(keys.of_learner::<Report>(), "a/7/report/learner");
-        assert_eq!(Keys::actor("a/7/report/learner"), None);
-        assert_eq!(Keys::actor("a/7/leave/7"), Some(7));
+        assert_eq!(keys.key::<Leave>(), "a/7/leave/*");
+        assert_eq!(keys.actor_key::<Leave>(7), "a/7/leave/7");
+        assert_eq!(keys.actor_key::<AffinityUpdate>(7), "a/7/affinity");
+        assert_eq!(keys.learner_key::<AffinityUpdate>(), "a/7/affinity");
+        assert_eq!(keys.learner_key::<Report>(), "a/7/report/learner");
+        assert_eq!(Keys::parse_actor("a/7/report/learner"), None);
+        assert_eq!(Keys::parse_actor("a/7/leave/7"), Some(7));
         for foreign in ["a/7/leave/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
-            assert_eq!(Keys::actor(foreign), None, "{foreign}");
+            assert_eq!(Keys::parse_actor(foreign), None, "{foreign}");
         }
     }
 
     #[test]
     fn liveliness_tokens_say_whose_they_are() {
         let keys = Keys::new("a/b").unwrap();
-        let actor = Alive::actor(7, u64::MAX);
-        assert_eq!(keys.alive(&keys.alive_key(actor)), Some(actor));
-        let learner = Alive::learner(9);
-        assert_eq!(keys.alive(&keys.alive_key(learner)), Some(learner));
-        let seen = keys.alive_key(learner);
+        let actor = Peer::actor(7, u64::MAX);
+        assert_eq!(keys.peer(&keys.liveliness_key(actor)), Some(actor));
+        let learner = Peer::learner(9);
+        assert_eq!(keys.peer(&keys.liveliness_key(learner)), Some(learner));
+        let seen = keys.liveliness_key(learner);
         assert!(seen.starts_with("a/b/alive/learner/"), "{seen}");
         assert!(
             !seen.ends_with("0000000000000009"),
             "the number is not shown"
         );
-        assert_ne!(Alive::actor(7, 1), Alive::actor(7, 2));
+        assert_ne!(Peer::actor(7, 1), Peer::actor(7, 2));
         for strange in [
             "a/b/alive/actor/7",
             "a/alive/learner/9",
@@ -188,7 +188,7 @@ mod tests {
             "a/b/alive/learner/x",
             "",
         ] {
-            assert_eq!(keys.alive(strange), None, "{strange}");
+            assert_eq!(keys.peer(strange), None, "{strange}");
         }
     }
 }

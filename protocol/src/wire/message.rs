@@ -31,7 +31,7 @@ pub trait Keyed: Message {
     const KEY: &'static str;
     /// Whether each actor has its own key for the message, `KEY/<number>`, and the learner `KEY/learner`. Access control can then check
     /// senders by key, without reading messages; the receiver checks that key and message agree.
-    const BY_ACTOR: bool = false;
+    const KEY_PER_ACTOR: bool = false;
     /// The message's priority over others on the same link.
     const PRIORITY: Priority = Priority::Data;
 }

@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    Alive, BatchReply, BatchRequest, BufferPool, Incoming, NotReady, Responder, fail_point,
+    BatchReply, BatchRequest, BufferPool, Incoming, NotReady, Peer, Responder, fail_point,
 };
 
 use super::{
@@ -31,7 +31,7 @@ impl Service {
             drop(state);
             return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         }
-        let learner = Alive::learner(request.learner);
+        let learner = Peer::learner(request.learner);
         state.participants.mark_seen(learner, None, Instant::now());
         let parked = ParkedRequest {
             request,

@@ -4,7 +4,7 @@
 use std::{borrow::Cow, time::Instant};
 
 use driml_protocol::{
-    Alive, Chunk, ChunkHeader, ChunkPoll, CodecError, Incoming, InsertReply, fail_point,
+    Chunk, ChunkHeader, ChunkPoll, CodecError, Incoming, InsertReply, Peer, fail_point,
 };
 
 use super::{
@@ -93,7 +93,7 @@ impl State {
     fn handle_chunk(&mut self, packed: PackedChunk<'static>, query: PendingQuery) -> Replies {
         let header = packed.chunk.header;
         let (version, arrived) = (header.weights_version, query.arrived);
-        let actor = Alive::actor(header.actor, header.incarnation);
+        let actor = Peer::actor(header.actor, header.incarnation);
         self.participants.mark_seen(actor, Some(version), arrived);
         let must_wait = !self.chunks.queue.is_empty() && !header.leaving;
         let reply = match self.replay.early_reply(&packed) {

@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, ProcessName, Request, RunInfo, Welcome,
+    ActorJoin, Incoming, JoinReply, LearnerJoin, Peer, ProcessName, Request, RunInfo, Welcome,
 };
 use zenoh::sample::SampleKind;
 
@@ -14,7 +14,7 @@ use super::{
 };
 
 impl Service {
-    pub(super) fn update_connection(&self, who: Alive, kind: SampleKind) {
+    pub(super) fn update_connection(&self, who: Peer, kind: SampleKind) {
         let (mut state, now) = (self.state(), Instant::now());
         let is_connected = kind == SampleKind::Put;
         state.participants.set_connected(who, is_connected, now);
@@ -23,7 +23,7 @@ impl Service {
             ProcessName::Learner => state.replay.learner_id(),
         };
         // A process that joined before the server restarted with its replay does not join again.
-        if joined.is_some_and(|number| Alive::of(who.process, number) == who) {
+        if joined.is_some_and(|number| Peer::new(who.process, number) == who) {
             state.participants.add_joined(who, now);
         }
         state.update_actor_count();
@@ -106,7 +106,7 @@ impl State {
         let known = self.replay.actor_incarnation(actor);
         let other = known.filter(|&other| other != incarnation);
         let participants = &mut self.participants;
-        let is_connected = |actor, it| participants.is_connected(Alive::actor(actor, it));
+        let is_connected = |actor, it| participants.is_connected(Peer::actor(actor, it));
         if other.is_some_and(|it| is_connected(actor, it)) {
             let why = format!(
                 "another process is actor {actor} of this run: give each actor another number (--id)"
@@ -117,7 +117,7 @@ impl State {
         let absent = self.replay.forget_absent(is_connected);
         participants.forget(&absent);
         let earlier_incarnations = self.replay.join_actor(join).map_err(refused_reply)?;
-        participants.add_joined(Alive::actor(actor, incarnation), Instant::now());
+        participants.add_joined(Peer::actor(actor, incarnation), Instant::now());
         self.update_actor_count();
         if other.is_some() {
             // Drops a parked chunk of the earlier incarnation.
@@ -136,7 +136,7 @@ impl State {
                 "the run is finished, with {done} updates; to train on, resume it with more --frames"
             )));
         }
-        if other.is_some_and(|other| self.participants.is_connected(Alive::learner(other))) {
+        if other.is_some_and(|other| self.participants.is_connected(Peer::learner(other))) {
             let why = "another learner takes part in this run, which has one alone".into();
             return Err(JoinReply::Taken { why });
         }
@@ -149,7 +149,7 @@ impl State {
         if served != Some(learner) {
             self.requests.retain(|it| it.request.learner == learner);
             self.participants
-                .add_joined(Alive::learner(learner), Instant::now());
+                .add_joined(Peer::learner(learner), Instant::now());
         }
         Ok(0)
     }

@@ -7,7 +7,7 @@ use std::{
     time::Instant,
 };
 
-use driml_protocol::{Alive, ProcessName, ProcessStatus, Report, WARNINGS_MAX, Waiting, Warning};
+use driml_protocol::{Peer, ProcessName, ProcessStatus, Report, WARNINGS_MAX, Waiting, Warning};
 
 use crate::ledger::actors::ACTORS_MAX;
 
@@ -19,13 +19,13 @@ pub(super) struct Participants {
     started: Instant,
     waiting: (Waiting, Instant),
     /// All connected incarnations, including those that have not joined.
-    connected: HashSet<Alive>,
+    connected: HashSet<Peer>,
     processes: BTreeMap<ProcessName, ProcessState>,
 }
 
 /// A participant, over all its incarnations.
 struct ProcessState {
-    alive: Alive,
+    alive: Peer,
     incarnations: u32,
     /// When the process last joined, connected or disconnected.
     changed_at: Instant,
@@ -44,7 +44,7 @@ impl Participants {
         }
     }
 
-    pub(super) fn add_joined(&mut self, who: Alive, now: Instant) {
+    pub(super) fn add_joined(&mut self, who: Peer, now: Instant) {
         let earlier = self.processes.get(&who.process);
         if earlier.is_some_and(|process| process.alive == who) {
             return;
@@ -68,7 +68,7 @@ impl Participants {
     }
 
     /// Returns the state of this incarnation, if it has joined and was not replaced.
-    fn current_mut(&mut self, who: Alive) -> Option<&mut ProcessState> {
+    fn current_mut(&mut self, who: Peer) -> Option<&mut ProcessState> {
         let process = self.processes.get_mut(&who.process)?;
         (process.alive == who).then_some(process)
     }
@@ -83,11 +83,11 @@ impl Participants {
     }
 
     /// Whether this incarnation of a process is connected, even if it has not joined.
-    pub(super) fn is_connected(&self, who: Alive) -> bool {
+    pub(super) fn is_connected(&self, who: Peer) -> bool {
         self.connected.contains(&who)
     }
 
-    pub(super) fn set_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
+    pub(super) fn set_connected(&mut self, who: Peer, is_connected: bool, now: Instant) {
         let has_changed = match is_connected {
             true => self.connected.len() < CONNECTED_MAX && self.connected.insert(who),
             false => self.connected.remove(&who),
@@ -108,7 +108,7 @@ impl Participants {
     }
 
     /// Notes that a chunk came from an actor, in which weights of this version acted, or a request from the learner.
-    pub(super) fn mark_seen(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
+    pub(super) fn mark_seen(&mut self, who: Peer, weights_version: Option<u64>, now: Instant) {
         if let Some(process) = self.current_mut(who) {
             process.last_seen = Some(now);
             process.weights_version = weights_version.or(process.weights_version);
@@ -117,7 +117,7 @@ impl Participants {
 
     /// Stores the report of a process; `false` if the process has not joined.
     pub(super) fn store_report(&mut self, mut report: Report, now: Instant) -> bool {
-        let Some(process) = self.current_mut(report.who.alive()) else {
+        let Some(process) = self.current_mut(report.who.peer()) else {
             return false;
         };
         // A late report from before the end of the run does not undo `finished`.
@@ -213,8 +213,8 @@ mod tests {
 
     use super::*;
 
-    fn actor(incarnation: u64) -> Alive {
-        Alive::actor(3, incarnation)
+    fn actor(incarnation: u64) -> Peer {
+        Peer::actor(3, incarnation)
     }
 
     #[test]
@@ -254,7 +254,7 @@ mod tests {
         assert_eq!(participants.actors_connected(), 0);
         participants.set_connected(actor(2), true, at(20));
         participants.add_joined(actor(2), at(20));
-        participants.add_joined(Alive::learner(1), at(20));
+        participants.add_joined(Peer::learner(1), at(20));
         assert_eq!(participants.actors_connected(), 1);
         assert_eq!(participants.actor_incarnations(), 2);
         let again = &participants.processes(at(21), |_| None)[1];
@@ -274,7 +274,7 @@ mod tests {
             }
             assert_eq!(participants.missing_process(all_stored), missing);
         };
-        let (learner, actor) = (Alive::learner(5), actor(1));
+        let (learner, actor) = (Peer::learner(5), actor(1));
         let no_learner = Some("no learner has joined yet");
         check(learner, false, true, false, no_learner);
         check(actor, false, true, false, no_learner);
@@ -306,7 +306,7 @@ mod tests {
         for actor in 0..200 {
             let incarnation = 1;
             let who = Participant::Actor { actor, incarnation };
-            participants.add_joined(who.alive(), now);
+            participants.add_joined(who.peer(), now);
             // Warnings of actors with higher numbers are newer, and many have the same age.
             let age = f64::from((200 - actor) / 50);
             let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));

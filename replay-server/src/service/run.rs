@@ -10,7 +10,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Alive, BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, QueryWorkers, Request, RunClient,
+    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, QueryWorkers, Request, RunClient,
     RunSpec, Sampling, Shutdown,
     config::{Settings, TransportConfig},
     fail_point, join_within,
@@ -329,7 +329,7 @@ fn watch_members(
     service: &Arc<Service>,
 ) -> zenoh::Result<(Subscriber<()>, JoinHandle<()>)> {
     let (service, keys) = (service.clone(), client.keys().clone());
-    let (sender, receiver) = mpsc::channel::<(Alive, SampleKind)>();
+    let (sender, receiver) = mpsc::channel::<(Peer, SampleKind)>();
     let next = move || {
         fail_point::reach("members");
         receiver.recv().ok()
@@ -342,10 +342,10 @@ fn watch_members(
     let subscriber = client
         .session()
         .liveliness()
-        .declare_subscriber(keys.all_alive())
+        .declare_subscriber(keys.all_liveliness_keys())
         .history(true)
         .callback(move |sample| {
-            if let Some(who) = keys.alive(sample.key_expr().as_str()) {
+            if let Some(who) = keys.peer(sample.key_expr().as_str()) {
                 // The receiving thread ends only after this callback is dropped.
                 let _ = sender.send((who, sample.kind()));
             }

@@ -7,7 +7,7 @@ use std::sync::{
 };
 
 use driml_protocol::{
-    ActorJoin, Alive, BatchRequest, Chunk, ChunkHeader, ChunkPoll, Leave, Origin, PriorityPart,
+    ActorJoin, BatchRequest, Chunk, ChunkHeader, ChunkPoll, Leave, Origin, Peer, PriorityPart,
     PriorityUpdate, ProcessName, ReplayStatus, RequestId, ShardCounts, WeightsRequest,
     WeightsUpload, WeightsVersion, session,
 };
@@ -81,7 +81,7 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
     let join = actor_join(0, INCARNATION);
     run.check_lies([Row::of(client, &join, "Taken {")], 0);
     // The number of the actor differs from that in the key.
-    let key = keys.of_actor::<ActorJoin>(UNUSED_ACTOR);
+    let key = keys.actor_key::<ActorJoin>(UNUSED_ACTOR);
     let bytes = encoded(client, &join);
     run.check_lies((0..4).map(|_| Row::new(&key, &*bytes, NO_REPLY)), 4);
 
@@ -102,7 +102,7 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
         let mut header = chunk_header(client, UNUSED_ACTOR, INCARNATION);
         header.leaving = true;
         change(&mut header);
-        let key = keys.of_actor::<ChunkHeader>(header.actor);
+        let key = keys.actor_key::<ChunkHeader>(header.actor);
         Row::new(key, client.encode_chunk(&Chunk::zeroed(header)), expected)
     };
     let (no_run, newest) = ("counts that no run reaches", "acted, and the newest are");
@@ -149,10 +149,10 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
 
     let uploads = [0, 1, 1 << 60, u64::MAX].map(|version| {
         let announced = encoded(client, &WeightsVersion { version });
-        let announced = client.session.put(keys.of::<WeightsVersion>(), announced);
+        let announced = client.session.put(keys.key::<WeightsVersion>(), announced);
         announced.wait().unwrap();
         let bytes = upload(client.spec.hash(), LEARNER, version, b"w");
-        Row::new(keys.of::<WeightsUpload>(), bytes, NO_REPLY)
+        Row::new(keys.key::<WeightsUpload>(), bytes, NO_REPLY)
     });
     run.check_lies(uploads, 4);
     let piece = |version, offset| WeightsRequest::Piece { version, offset };
@@ -205,7 +205,7 @@ fn forget_4096_strangers(run: &AttackedRun) {
     let client = &run.client;
     let stranger = client.run_client();
     let tokens: Vec<_> = (0..300)
-        .map(|number| stranger.declare_alive(Alive::learner(number)).unwrap())
+        .map(|number| stranger.declare_alive(Peer::learner(number)).unwrap())
         .collect();
     let joins = (0..5_000).map(|number| actor_join(UNUSED_ACTOR + number, INCARNATION));
     check_replies(
@@ -252,12 +252,12 @@ fn reject_half_a_gigabyte(run: &AttackedRun) {
     let (keys, peak_before) = (&client.keys, peak_mib());
     let zeros = |key: String, bytes| Row::new(key, vec![0; bytes], NO_REPLY);
     let long = [
-        keys.of::<WeightsUpload>(),
-        keys.of_actor::<Leave>(0),
-        keys.of::<ReplayStatus>(),
+        keys.key::<WeightsUpload>(),
+        keys.actor_key::<Leave>(0),
+        keys.key::<ReplayStatus>(),
     ];
     run.check_lies(long.map(|key| zeros(key, 600_000)), 3);
-    check_replies(client, [zeros(keys.of_actor::<ChunkHeader>(0), 1 << 29)]);
+    check_replies(client, [zeros(keys.actor_key::<ChunkHeader>(0), 1 << 29)]);
     let peak = peak_mib();
     assert!(
         peak < peak_before + 100,
@@ -271,19 +271,19 @@ fn reject_public_marks(run: &AttackedRun) {
     let tokens = client
         .session
         .liveliness()
-        .get(client.keys.all_alive())
+        .get(client.keys.all_liveliness_keys())
         .wait()
         .unwrap();
     let mut rows = Vec::new();
     while let Ok(reply) = tokens.recv() {
         let token = reply.into_result().unwrap();
-        let Alive { process, mark } = client.keys.alive(token.key_expr().as_str()).unwrap();
-        // The public mark does not work in place of the secret number.
+        let Peer { process, hash } = client.keys.peer(token.key_expr().as_str()).unwrap();
+        // The public hash does not work in place of the secret number.
         rows.push(match process {
-            ProcessName::Actor(actor) => Row::of(client, &leave(actor, mark, 0), "Ack"),
+            ProcessName::Actor(actor) => Row::of(client, &leave(actor, hash, 0), "Ack"),
             ProcessName::Learner => {
-                let bytes = upload(client.spec.hash(), mark, 1 << 19, b"w");
-                Row::new(client.keys.of::<WeightsUpload>(), bytes, NO_REPLY)
+                let bytes = upload(client.spec.hash(), hash, 1 << 19, b"w");
+                Row::new(client.keys.key::<WeightsUpload>(), bytes, NO_REPLY)
             }
         });
     }

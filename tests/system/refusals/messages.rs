@@ -108,12 +108,12 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
         assert_eq!(stored(), before, "{why}");
     };
     let check_chunk =
-        |(bytes, why): (Vec<u8>, _)| check(Row::new(keys.of_actor::<ChunkHeader>(0), bytes, why));
+        |(bytes, why): (Vec<u8>, _)| check(Row::new(keys.actor_key::<ChunkHeader>(0), bytes, why));
     invalid_chunks(client).into_iter().for_each(check_chunk);
 
     let garbage = b"DRML and then nothing that makes sense";
     let batch = |rows| batch_request(LEARNER, rows);
-    let (batches, leaves) = (keys.of::<BatchRequest>(), keys.of_actor::<Leave>(0));
+    let (batches, leaves) = (keys.key::<BatchRequest>(), keys.actor_key::<Leave>(0));
     let leave = leave(0, INCARNATION, 1000);
     let others = [
         // The replies to requests contain the reason.
@@ -124,7 +124,7 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
         // Messages that need no reply get none.
         Row::new(&leaves, garbage, NO_REPLY),
         Row::new(&leaves, foreign(client, &leave, &[]), NO_REPLY),
-        Row::new(keys.of::<AffinityUpdate>(), garbage, NO_REPLY),
+        Row::new(keys.key::<AffinityUpdate>(), garbage, NO_REPLY),
         Row::of(client, &affinity(LEARNER, 1, 2), NO_REPLY),
     ];
     others.into_iter().for_each(check);

@@ -51,7 +51,7 @@ impl Row {
     /// Returns a well-formed message of the client's run, at the key for its type.
     pub(crate) fn of<M: Keyed>(client: &Client, message: &M, expected: &'static str) -> Self {
         let actor = message.actor().unwrap_or_default();
-        let key = client.keys.of_actor::<M>(actor);
+        let key = client.keys.actor_key::<M>(actor);
         Self::new(key, encoded(client, message), expected)
     }
 }

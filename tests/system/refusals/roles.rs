@@ -7,7 +7,7 @@ use std::sync::{
 };
 
 use driml_protocol::{
-    ActorJoin, Alive, Chunk, ChunkHeader, ChunkPoll, LearnerStatus, Leave, ReplayStatus, RunInfo,
+    ActorJoin, Chunk, ChunkHeader, ChunkPoll, LearnerStatus, Leave, Peer, ReplayStatus, RunInfo,
     WeightsRequest, WeightsUpload, WeightsVersion, session, tls::Role,
 };
 use driml_tests::{Client, Process, TestSystem, in_parallel, new_learner, wait_until};
@@ -82,14 +82,14 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
             Row::of(one, &batch_request(1, 16), NO_REPLY),
             Row::of(one, &affinity(1, 1, 3), NO_REPLY),
             Row::of(one, &new_learner(1), NO_REPLY),
-            Row::new(keys.of::<WeightsUpload>(), weights, NO_REPLY),
+            Row::new(keys.key::<WeightsUpload>(), weights, NO_REPLY),
             Row::of(one, &join, NO_REPLY),
             Row::of(one, &leave, NO_REPLY),
             Row::of(one, &poll, NO_REPLY),
-            Row::new(keys.of_actor::<ChunkHeader>(other), [0; 100], NO_REPLY),
-            Row::new(keys.of::<Leave>(), encoded(one, &leave), NO_REPLY),
-            Row::new(keys.of::<ReplayStatus>(), [], NO_REPLY),
-            Row::new(keys.of::<LearnerStatus>(), [], NO_REPLY),
+            Row::new(keys.actor_key::<ChunkHeader>(other), [0; 100], NO_REPLY),
+            Row::new(keys.key::<Leave>(), encoded(one, &leave), NO_REPLY),
+            Row::new(keys.key::<ReplayStatus>(), [], NO_REPLY),
+            Row::new(keys.key::<LearnerStatus>(), [], NO_REPLY),
             Row::new("driml/**", [], NO_REPLY),
         ],
     );
@@ -97,15 +97,15 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
 
     // At the actor's own keys, send messages that speak for another actor.
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
-    let chunks = keys.of_actor::<ChunkHeader>(1);
+    let chunks = keys.actor_key::<ChunkHeader>(1);
     let reason = "speaks for actor 0 at the key";
     send_in_parallel(
         one,
         [
             Row::new(chunks, one.encode_chunk(&chunk), reason),
-            Row::new(keys.of_actor::<Leave>(1), encoded(one, &leave), NO_REPLY),
-            Row::new(keys.of_actor::<ActorJoin>(1), encoded(one, &join), NO_REPLY),
-            Row::new(keys.of_actor::<ChunkPoll>(1), encoded(one, &poll), NO_REPLY),
+            Row::new(keys.actor_key::<Leave>(1), encoded(one, &leave), NO_REPLY),
+            Row::new(keys.actor_key::<ActorJoin>(1), encoded(one, &join), NO_REPLY),
+            Row::new(keys.actor_key::<ChunkPoll>(1), encoded(one, &poll), NO_REPLY),
         ],
     );
     wait_until("four refusals", || run.refusals() >= before + 4);
@@ -118,11 +118,11 @@ fn an_actor_declares_nothing_but_its_own(run: &TlsRun) {
     let queries = Arc::<AtomicUsize>::default();
     let mut declared = Vec::new();
     for key in [
-        keys.of::<RunInfo>(),
-        keys.of::<WeightsRequest>(),
-        keys.of::<ReplayStatus>(),
-        keys.of::<LearnerStatus>(),
-        keys.of::<ChunkHeader>(),
+        keys.key::<RunInfo>(),
+        keys.key::<WeightsRequest>(),
+        keys.key::<ReplayStatus>(),
+        keys.key::<LearnerStatus>(),
+        keys.key::<ChunkHeader>(),
     ] {
         let queries = queries.clone();
         let answer = move |query: Query| {
@@ -145,13 +145,13 @@ fn an_actor_declares_nothing_but_its_own(run: &TlsRun) {
         .wait()
         .unwrap();
     let liveliness = one.session.liveliness();
-    let tokens = [Alive::actor(0, 5), Alive::learner(5)].map(|other| {
-        let token = liveliness.declare_token(keys.alive_key(other));
+    let tokens = [Peer::actor(0, 5), Peer::learner(5)].map(|other| {
+        let token = liveliness.declare_token(keys.liveliness_key(other));
         token.wait().unwrap()
     });
     let lie = WeightsVersion { version: 1 << 60 };
     one.session
-        .put(keys.of::<WeightsVersion>(), encoded(&one, &lie))
+        .put(keys.key::<WeightsVersion>(), encoded(&one, &lie))
         .wait()
         .unwrap();
 
@@ -181,7 +181,7 @@ fn an_observer_only_reads(run: &TlsRun) {
             Row::of(observer, &WeightsRequest::NewerThan(0), NO_REPLY),
             Row::of(observer, &new_learner(1), NO_REPLY),
             Row::of(observer, &actor_join(1, 1), NO_REPLY),
-            Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], NO_REPLY),
+            Row::new(keys.actor_key::<ChunkHeader>(1), [0; 100], NO_REPLY),
         ],
     );
 }

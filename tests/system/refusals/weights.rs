@@ -15,7 +15,7 @@ const LEARNER: u64 = 5;
 /// Sends weights that the replay server must reject and count as refused.
 fn check_rejected(client: &Client, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
     for (name, bytes) in rows {
-        let key = client.keys.of::<WeightsUpload>();
+        let key = client.keys.key::<WeightsUpload>();
         check_refused(client, name, [Row::new(key, bytes, NO_REPLY)], 1);
     }
 }
@@ -38,7 +38,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     let pack = |version, weights: &[u8], learner| upload(hash, learner, version, weights);
     // Uploads weights that the replay server accepts.
     let accept = |version, weights: &[u8]| {
-        let key = client.keys.of::<WeightsUpload>();
+        let key = client.keys.key::<WeightsUpload>();
         let bytes = pack(version, weights, LEARNER);
         client.request(&key, bytes).unwrap();
     };
@@ -47,7 +47,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         let bytes = codec::encode(spec_hash, &WeightsVersion { version }, &[]).unwrap();
         let put = client
             .session
-            .put(client.keys.of::<WeightsVersion>(), bytes);
+            .put(client.keys.key::<WeightsVersion>(), bytes);
         put.wait().unwrap();
     };
 
@@ -118,7 +118,7 @@ fn processes_of_another_protocol_version_do_not_join() {
         (b"hello?".to_vec(), "it was cut off or padded"),
         (whole, "the settings that the replay server sent"),
     ];
-    let key = Keys::new("driml").unwrap().of::<RunInfo>();
+    let key = Keys::new("driml").unwrap().key::<RunInfo>();
     for (bytes, reason) in run_infos {
         let answer = move |query| session::answer(&query, bytes.clone().into());
         let queryable = server
