@@ -248,7 +248,7 @@ fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
 }
 
 fn send(client: &RunClient, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
-    let sent = client.send(client.seal(&request)?, PIECE_TIMEOUT);
+    let sent = client.send(client.encode(&request)?, PIECE_TIMEOUT);
     sent.map_err(|e| anyhow!("asking for weights: {e}"))
 }
 

@@ -34,14 +34,14 @@ pub struct RunClient {
 
 /// An encoded message of type `M`, which may be sent several times.
 #[derive(Clone, Debug)]
-pub struct Sealed<M> {
+pub struct EncodedMessage<M> {
     bytes: ZBytes,
     /// The actor that the message names as its sender, if any.
     actor: Option<u32>,
     message: PhantomData<fn() -> M>,
 }
 
-impl<M: Message> Sealed<M> {
+impl<M: Message> EncodedMessage<M> {
     /// Encodes a message without a payload for the run with this hash.
     pub fn new(message: &M, spec_hash: u64) -> Result<Self, CodecError> {
         Self::with_payload(message, ZBytes::new(), spec_hash)
@@ -49,7 +49,7 @@ impl<M: Message> Sealed<M> {
 
     /// Encodes a message with a payload, which is not copied.
     pub fn with_payload(message: &M, payload: ZBytes, spec_hash: u64) -> Result<Self, CodecError> {
-        let head = codec::seal(spec_hash, message, &payload.to_bytes())?;
+        let head = codec::encode_head(spec_hash, message, &payload.to_bytes())?;
         let mut writer = ZBytes::writer();
         writer.append(ZBytes::from(head));
         writer.append(payload);
@@ -100,7 +100,7 @@ impl RunClient {
         request: &R,
         timeout: Duration,
     ) -> Result<R::Reply, SessionError> {
-        self.send(self.seal(request)?, timeout)?.wait()
+        self.send(self.encode(request)?, timeout)?.wait()
     }
 
     /// Fetches a message by an empty query, such as a status.
@@ -110,18 +110,18 @@ impl RunClient {
     }
 
     /// Encodes a request, which may then be sent several times.
-    pub fn seal<R: Request>(&self, request: &R) -> Result<Sealed<R>, SessionError> {
-        self.seal_with(request, ZBytes::new())
+    pub fn encode<R: Request>(&self, request: &R) -> Result<EncodedMessage<R>, SessionError> {
+        self.encode_with(request, ZBytes::new())
     }
 
     /// Encodes a request with a payload, which is not copied.
-    pub fn seal_with<R: Request>(
+    pub fn encode_with<R: Request>(
         &self,
         request: &R,
         payload: ZBytes,
-    ) -> Result<Sealed<R>, SessionError> {
-        let sealed = Sealed::with_payload(request, payload, self.spec_hash);
-        sealed.map_err(|why| SessionError::Failed(format!("{}: {why}", self.keys.key::<R>())))
+    ) -> Result<EncodedMessage<R>, SessionError> {
+        let encoded = EncodedMessage::with_payload(request, payload, self.spec_hash);
+        encoded.map_err(|why| SessionError::Failed(format!("{}: {why}", self.keys.key::<R>())))
     }
 
     /// Sends a request. Requests of one priority arrive in the order in which they were sent.
@@ -130,7 +130,7 @@ impl RunClient {
     /// zenoh rejects the request. The caller may retry.
     pub fn send<R: Request>(
         &self,
-        request: Sealed<R>,
+        request: EncodedMessage<R>,
         timeout: Duration,
     ) -> Result<PendingReply<R::Reply>, SessionError> {
         let key = match request.actor {
@@ -203,8 +203,8 @@ pub struct Announcer<M> {
 impl<M: Message> Announcer<M> {
     /// Publishes a message to all current subscribers.
     pub fn put(&self, message: &M) -> zenoh::Result<()> {
-        let sealed = Sealed::new(message, self.spec_hash)?;
-        self.publisher.put(sealed.bytes).wait()
+        let encoded = EncodedMessage::new(message, self.spec_hash)?;
+        self.publisher.put(encoded.bytes).wait()
     }
 }
 
@@ -231,7 +231,7 @@ impl<M: Message> PendingReply<M> {
     /// Waits for the reply and copies its payload into private memory from `pool`.
     pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
         self.bytes.wait_for(|bytes| {
-            codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))
+            codec::decode_from(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))
         })
     }
 }

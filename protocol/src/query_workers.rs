@@ -21,7 +21,7 @@ use zenoh::{
 };
 
 use crate::{
-    client::{RunClient, Sealed},
+    client::{EncodedMessage, RunClient},
     messages::recovering::Recovering,
     process::fail_point,
     session,
@@ -60,7 +60,7 @@ impl<R: Request> Incoming<R> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
         let (request, payload): (R, _) =
-            codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
+            codec::decode_from(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
         // Where each process has its own key, access control guards only the key, so the request must come at the key of its sender.
         let (key, actor) = (self.query.key_expr().as_str(), request.actor());
         if R::KEY_PER_ACTOR && Keys::parse_actor(key) != actor {
@@ -91,25 +91,25 @@ pub struct Responder<M> {
 impl<M: Message> Responder<M> {
     /// Sends the reply. A failure is logged, and the requester retries.
     pub fn reply(self, reply: &M) {
-        self.send(Sealed::new(reply, self.spec_hash));
+        self.send(EncodedMessage::new(reply, self.spec_hash));
     }
 
     /// Sends the reply with a payload, like [`Responder::reply`].
     pub fn reply_with(self, reply: &M, payload: ZBytes) {
-        self.send(Sealed::with_payload(reply, payload, self.spec_hash));
+        self.send(EncodedMessage::with_payload(reply, payload, self.spec_hash));
     }
 
     /// Answers, in place of a reply, that the replay is still being read back from disk.
     pub fn put_off(self, recovering: &Recovering) {
-        match Sealed::new(recovering, self.spec_hash) {
-            Ok(sealed) => session::put_off(&self.query, sealed.into_bytes()),
+        match EncodedMessage::new(recovering, self.spec_hash) {
+            Ok(encoded) => session::put_off(&self.query, encoded.into_bytes()),
             Err(e) => tracing::error!("that the replay is being read back was not said: {e}"),
         }
     }
 
-    fn send(&self, sealed: Result<Sealed<M>, CodecError>) {
-        match sealed {
-            Ok(sealed) => session::answer(&self.query, sealed.into_bytes()),
+    fn send(&self, encoded: Result<EncodedMessage<M>, CodecError>) {
+        match encoded {
+            Ok(encoded) => session::answer(&self.query, encoded.into_bytes()),
             Err(e) => tracing::error!("a reply of kind {} was not sent: {e}", M::NAME),
         }
     }

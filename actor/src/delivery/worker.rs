@@ -146,7 +146,7 @@ impl DeliveryWorker {
             let payload = chunk.into_payload();
             self.outgoing.push_back(OutgoingChunk {
                 header,
-                in_shared_memory: payload.are_shared(),
+                in_shared_memory: payload.is_shared(),
                 payload: payload.freeze(),
                 pending: None,
                 is_kept: false,
@@ -195,7 +195,7 @@ impl DeliveryWorker {
                     false => (self.window + 1).min(self.limits.chunks_in_flight_max),
                 };
                 if self.outgoing[0].in_shared_memory {
-                    self.pool.shared_memory_works();
+                    self.pool.report_shared_arrival();
                 }
                 Ok(Outcome::Stored)
             }
@@ -241,7 +241,7 @@ impl DeliveryWorker {
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
                 // The replay server may be unable to read shared memory: these chunks and the next ones go through the socket.
                 if self.outgoing[0].in_shared_memory {
-                    self.pool.avoid_shared_memory();
+                    self.pool.report_shared_loss();
                 }
                 self.copy_out_of_shared_memory();
                 std::thread::sleep(RETRY_PAUSE);
@@ -323,9 +323,9 @@ impl DeliveryWorker {
                     sequence: header.sequence,
                     leaving: header.leaving,
                 };
-                self.client.send(self.client.seal(&poll)?, timeout)?
+                self.client.send(self.client.encode(&poll)?, timeout)?
             } else {
-                let chunk = self.client.seal_with(header, it.payload.clone())?;
+                let chunk = self.client.encode_with(header, it.payload.clone())?;
                 tracing::debug!(
                     "chunk {} goes out: {} transitions by weights {}",
                     header.sequence,

@@ -298,7 +298,7 @@ impl Fetcher {
         if partial.is_complete() {
             let header = Batch::merged_header(&partial.parts);
             let header = header.ok_or(BatchError::DifferentShards)?;
-            let memory = self.shared.pool.take_own(header.payload_bytes());
+            let memory = self.shared.pool.take_private(header.payload_bytes());
             let batch = Batch::merge(&partial.parts, memory);
             partial.parts.clear();
             let parts = std::mem::take(&mut partial.sources);
@@ -363,12 +363,12 @@ impl Fetcher {
             learner: self.shared.requests.learner_id,
             id,
             rows,
-            shared_memory: self.shared.requests.shared_memory && self.trust.ask(),
+            shared_memory: self.shared.requests.shared_memory && self.trust.may_use(),
             learned: self.shared.counters.learned(shard),
             other_shards,
         };
         let client = &self.shared.clients[shard];
-        let pending = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;
+        let pending = client.send(client.encode(&request)?, REQUEST_TIMEOUT)?;
         Ok((pending, request.shared_memory))
     }
 
@@ -384,13 +384,13 @@ impl Fetcher {
                 SessionError::NoReply { .. } | SessionError::NoAnswerer { .. }
             );
             if shared_memory && is_lost {
-                self.trust.lost();
+                self.trust.record_loss();
             }
         })?;
         Ok(match reply {
             BatchReply::Batch(header) => {
                 if shared_memory {
-                    self.trust.worked();
+                    self.trust.record_arrival();
                 }
                 Ok(Batch::from_payload(header, payload)?)
             }

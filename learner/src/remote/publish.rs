@@ -11,8 +11,8 @@ use std::{
 };
 
 use driml_protocol::{
-    Ack, AffinityUpdate, CodecError, Incoming, LearnerStatus, LogLimiter, PriorityUpdate,
-    QueryWorkers, Request, RunClient, Sampling, Sealed, Shutdown, Weights, WeightsUpload,
+    Ack, AffinityUpdate, CodecError, EncodedMessage, Incoming, LearnerStatus, LogLimiter,
+    PriorityUpdate, QueryWorkers, Request, RunClient, Sampling, Shutdown, Weights, WeightsUpload,
     codec::PAYLOAD_BYTES_MAX, fail_point, lock, session::SessionError,
 };
 use zenoh::query::Queryable;
@@ -140,16 +140,16 @@ impl Publisher {
                 learner: learner_id,
                 weights: weights.header,
             };
-            Sealed::with_payload(&upload, weights.safetensors.clone().into(), spec_hash)
+            EncodedMessage::with_payload(&upload, weights.safetensors.clone().into(), spec_hash)
         })?;
         let affinity = outbox_sender("affinity", SEND_TIMEOUT);
         affinity.start(this.affinity.clone(), move |update| {
-            Sealed::new(update, spec_hash)
+            EncodedMessage::new(update, spec_hash)
         })?;
         if sampling.is_prioritised() {
             let priorities = outbox_sender("priorities", SEND_TIMEOUT);
             priorities.start(this.priorities.clone(), move |update| {
-                Sealed::new(update, spec_hash)
+                EncodedMessage::new(update, spec_hash)
             })?;
         }
         Ok(this)
@@ -199,7 +199,7 @@ impl OutboxSender {
     fn start<T: Send + 'static, R: Request<Reply = Ack>>(
         mut self,
         outbox: Arc<Outbox<T>>,
-        message: impl Fn(&T) -> Result<Sealed<R>, CodecError> + Send + 'static,
+        message: impl Fn(&T) -> Result<EncodedMessage<R>, CodecError> + Send + 'static,
     ) -> std::io::Result<()> {
         let name = format!("{}-sender", self.what);
         let thread = std::thread::Builder::new().name(name.clone());
@@ -223,7 +223,7 @@ impl OutboxSender {
     /// Sends `message` to all replay servers, with retries while `is_superseded` is false. Returns whether all have acknowledged it.
     fn send_to_all<R: Request<Reply = Ack>>(
         &mut self,
-        message: &Sealed<R>,
+        message: &EncodedMessage<R>,
         is_superseded: impl Fn() -> bool,
     ) -> bool {
         let mut arrived = true;

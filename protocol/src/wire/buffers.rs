@@ -27,17 +27,17 @@ pub struct Buffer(Memory);
 
 enum Memory {
     /// Private memory, which returns to the pool when dropped, if there is a pool.
-    Own(Vec<u8>, Option<Arc<Pool>>),
+    Private(Vec<u8>, Option<Arc<Pool>>),
     Shared(ZShmMut),
 }
 
 struct Pool {
     spare: Mutex<Vec<Vec<u8>>>,
     spare_max: usize,
-    shared: Option<Shared>,
+    shared: Option<SharedMemory>,
 }
 
-struct Shared {
+struct SharedMemory {
     provider: ShmProvider<PosixShmProviderBackend>,
     trust: Mutex<Trust>,
 }
@@ -49,22 +49,22 @@ pub struct BufferPool(Arc<Pool>);
 impl BufferPool {
     /// Creates a pool of private memory, which keeps at most `spare_max` returned buffers for reuse.
     pub fn new(spare_max: usize) -> Self {
-        Self::with(spare_max, None)
+        Self::with_shared(spare_max, None)
     }
 
     /// Like [`BufferPool::new`], with shared memory for `count` buffers of `bytes` each. If the machine does not grant shared memory, a
     /// warning is logged and all buffers are private.
     pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
         let mut shared = None;
-        let asked = provider(shared_memory::pool_bytes(count, bytes));
-        shared_memory::is_granted(asked.map(|provider| {
+        let created = create_provider(shared_memory::pool_bytes(count, bytes));
+        shared_memory::is_granted(created.map(|provider| {
             let trust = Mutex::default();
-            shared = Some(Shared { provider, trust });
+            shared = Some(SharedMemory { provider, trust });
         }));
-        Self::with(spare_max, shared)
+        Self::with_shared(spare_max, shared)
     }
 
-    fn with(spare_max: usize, shared: Option<Shared>) -> Self {
+    fn with_shared(spare_max: usize, shared: Option<SharedMemory>) -> Self {
         Self(Arc::new(Pool {
             spare: Mutex::default(),
             spare_max,
@@ -73,44 +73,44 @@ impl BufferPool {
     }
 
     /// Returns `bytes` bytes of private memory with arbitrary content.
-    pub fn take_own(&self, bytes: usize) -> Buffer {
+    pub fn take_private(&self, bytes: usize) -> Buffer {
         let mut vec = lock(&self.0.spare).pop().unwrap_or_default();
         vec.resize(bytes, 0);
-        Buffer(Memory::Own(vec, Some(self.0.clone())))
+        Buffer(Memory::Private(vec, Some(self.0.clone())))
     }
 
-    /// Returns `bytes` bytes with arbitrary content: shared memory if the pool has some and it may be used, else [`BufferPool::take_own`].
+    /// Returns `bytes` bytes with arbitrary content: shared memory if the pool has some and may use it, else private memory.
     pub fn take(&self, bytes: usize) -> Buffer {
         match self.0.shared.as_ref().and_then(|shared| shared.take(bytes)) {
             Some(shared) => Buffer(Memory::Shared(shared)),
-            None => self.take_own(bytes),
+            None => self.take_private(bytes),
         }
     }
 
     /// Reports that a message in shared memory did not arrive: the next ones use private memory.
-    pub fn avoid_shared_memory(&self) {
+    pub fn report_shared_loss(&self) {
         if let Some(shared) = &self.0.shared {
-            lock(&shared.trust).lost();
+            lock(&shared.trust).record_loss();
         }
     }
 
     /// Reports that a message in shared memory has arrived.
-    pub fn shared_memory_works(&self) {
+    pub fn report_shared_arrival(&self) {
         if let Some(shared) = &self.0.shared {
-            lock(&shared.trust).worked();
+            lock(&shared.trust).record_arrival();
         }
     }
 }
 
-impl Shared {
+impl SharedMemory {
     /// Never waits. A killed receiver's buffers stay in use while this process runs: zenoh frees a buffer once all have released it.
     fn take(&self, bytes: usize) -> Option<ZShmMut> {
-        if !lock(&self.trust).ask() {
+        if !lock(&self.trust).may_use() {
             return None;
         }
         let piece = self.provider.alloc(bytes);
         let taken = piece.with_policy::<Defragment<GarbageCollect>>().wait();
-        lock(&self.trust).found(taken.is_ok());
+        lock(&self.trust).record_allocation(taken.is_ok());
         taken.ok()
     }
 }
@@ -119,11 +119,11 @@ impl Shared {
 ///
 /// zenoh creates its metadata at the first allocation and panics if it cannot, so that allocation happens here, while there is room. zenoh
 /// locks all of this memory, so a folder that fills up later takes nothing from this process.
-fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
+fn create_provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
     let needed = shared_memory::process_bytes(bytes);
     shared_memory::check_lockable(needed)?;
     shared_memory::check_file_size(bytes.max(METADATA_BYTES))?;
-    shared_memory::take_room(needed, || {
+    shared_memory::allocate_in_turn(needed, || {
         let provider = ShmProviderBuilder::default_backend(bytes).wait();
         let provider = provider.map_err(|e| e.to_string())?;
         let first = provider.alloc(1).wait().map_err(|e| format!("{e:?}"))?;
@@ -139,28 +139,28 @@ impl Buffer {
     }
 
     /// Whether the bytes lie in shared memory, which other processes on this host can read.
-    pub const fn are_shared(&self) -> bool {
+    pub const fn is_shared(&self) -> bool {
         matches!(self.0, Memory::Shared(_))
     }
 
     /// Returns the bytes for sending, without a copy. Private memory returns to its pool when the last clone is dropped.
     pub fn freeze(mut self) -> ZBytes {
-        match std::mem::replace(&mut self.0, Memory::Own(Vec::new(), None)) {
+        match std::mem::replace(&mut self.0, Memory::Private(Vec::new(), None)) {
             Memory::Shared(shared) => ZBytes::from(shared),
-            own => ZBytes::from(bytes::Bytes::from_owner(Self(own))),
+            private => ZBytes::from(bytes::Bytes::from_owner(Self(private))),
         }
     }
 }
 
 impl From<Vec<u8>> for Buffer {
     fn from(bytes: Vec<u8>) -> Self {
-        Self(Memory::Own(bytes, None))
+        Self(Memory::Private(bytes, None))
     }
 }
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        if let Memory::Own(bytes, Some(pool)) = &mut self.0 {
+        if let Memory::Private(bytes, Some(pool)) = &mut self.0 {
             let mut spare = lock(&pool.spare);
             if spare.len() < pool.spare_max {
                 spare.push(std::mem::take(bytes));
@@ -174,7 +174,7 @@ impl Deref for Buffer {
 
     fn deref(&self) -> &[u8] {
         match &self.0 {
-            Memory::Own(bytes, _) => bytes,
+            Memory::Private(bytes, _) => bytes,
             Memory::Shared(bytes) => bytes,
         }
     }
@@ -183,7 +183,7 @@ impl Deref for Buffer {
 impl DerefMut for Buffer {
     fn deref_mut(&mut self) -> &mut [u8] {
         match &mut self.0 {
-            Memory::Own(bytes, _) => bytes,
+            Memory::Private(bytes, _) => bytes,
             Memory::Shared(bytes) => bytes,
         }
     }
@@ -226,16 +226,16 @@ mod tests {
     #[test]
     fn own_memory_comes_back_also_from_the_wire() {
         let pool = BufferPool::new(1);
-        let mut payload = pool.take_own(5);
+        let mut payload = pool.take_private(5);
         payload.copy_from_slice(b"abcde");
         let address = payload.as_ptr();
-        let (sent, again) = (payload.freeze(), pool.take_own(5));
+        let (sent, again) = (payload.freeze(), pool.take_private(5));
         assert_ne!(again.as_ptr(), address);
         assert_eq!(sent.to_bytes(), &b"abcde"[..]);
         drop((sent.clone(), again, sent));
         // The pool keeps one buffer, the first that came back.
         assert_eq!(pool.0.spare.lock().unwrap().len(), 1);
-        assert_eq!(pool.take_own(3).len(), 3);
+        assert_eq!(pool.take_private(3).len(), 3);
     }
 
     #[test]
@@ -261,16 +261,16 @@ mod tests {
         let pool = BufferPool::shared(4, 2, 1_000_000);
         if pool.0.shared.is_none() {
             // Without shared memory, all buffers are private.
-            assert!(!pool.take(1_000_000).are_shared());
+            assert!(!pool.take(1_000_000).is_shared());
             return;
         }
         let pieces: Vec<_> = (0..8).map(|_| pool.take(1_000_000)).collect();
-        assert!(pieces[0].are_shared() && pieces[1].are_shared() && !pieces[7].are_shared());
+        assert!(pieces[0].is_shared() && pieces[1].is_shared() && !pieces[7].is_shared());
         drop(pieces);
-        pool.avoid_shared_memory();
-        assert!(!pool.take(1_000_000).are_shared());
-        while !pool.take(1_000_000).are_shared() {}
-        pool.avoid_shared_memory();
-        assert!((0..1_000).all(|_| !pool.take(1_000_000).are_shared()));
+        pool.report_shared_loss();
+        assert!(!pool.take(1_000_000).is_shared());
+        while !pool.take(1_000_000).is_shared() {}
+        pool.report_shared_loss();
+        assert!((0..1_000).all(|_| !pool.take(1_000_000).is_shared()));
     }
 }

@@ -22,14 +22,14 @@ pub const HEADER_BYTES_MAX: usize = 1 << 20;
 /// Longest payload, bytes; sender and receiver reject a longer one.
 pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 
-/// Bytes that `copy` handles at a time: it copies a block, then adds it to the checksum while it is in the nearest cache.
+/// Bytes that `copy_and_sum` handles at a time: it copies a block, then adds it to the checksum while it is in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
 
 /// Longest value of [`encode_value`], bytes; a longer one is an error.
 pub const VALUE_BYTES_MAX: usize = 1 << 28;
 
 /// The encoding of the prefix: integers of fixed width, without gaps.
-const FIXED: Configuration<LittleEndian, Fixint> =
+const PREFIX_ENCODING: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
 fn encode_within<T: Serialize>(value: &T, max: usize) -> Result<Vec<u8>, CodecError> {
@@ -42,11 +42,11 @@ fn encode_within<T: Serialize>(value: &T, max: usize) -> Result<Vec<u8>, CodecEr
 /// Decodes a value from all of `bytes`; the value may claim at most `MAX` bytes of memory.
 fn decode_within<T: DeserializeOwned, const MAX: usize>(bytes: &[u8]) -> Result<T, CodecError> {
     let config = bincode::config::standard().with_limit::<MAX>();
-    let (value, used) = bincode::serde::decode_from_slice(bytes, config)
+    let (value, read) = bincode::serde::decode_from_slice(bytes, config)
         .map_err(|e| CodecError::Header(e.to_string()))?;
-    match bytes.len() - used {
+    match bytes.len() - read {
         0 => Ok(value),
-        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
+        rest => Err(CodecError::Header(format!("{rest} bytes after its end"))),
     }
 }
 
@@ -61,7 +61,7 @@ pub fn decode_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> 
 }
 
 /// Returns prefix and header of a message. On the wire, `payload` follows these bytes; it is not copied.
-pub fn seal<M: Message>(
+pub fn encode_head<M: Message>(
     spec_hash: u64,
     message: &M,
     payload: &[u8],
@@ -77,7 +77,7 @@ pub fn seal<M: Message>(
         payload_bytes: payload.len() as u64,
         checksum: 0,
     };
-    let mut sum = prefix.checksum_begun();
+    let mut sum = prefix.start_checksum();
     sum.update(&header);
     sum.update(payload);
     prefix.checksum = sum.finalize();
@@ -90,41 +90,41 @@ pub fn encode<M: Message>(
     message: &M,
     payload: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    Ok([&seal(spec_hash, message, payload)?, payload].concat())
+    Ok([&encode_head(spec_hash, message, payload)?, payload].concat())
 }
 
 /// Checks a message in one buffer and returns the message and its payload.
 ///
 /// `spec_hash` is the hash of this process's run, or `None` to accept any run, for a process that joins to learn the hash.
 pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
-    let (message, payload) = receive(bytes, bytes.len(), &BufferPool::new(0), spec_hash)?;
+    let (message, payload) = decode_from(bytes, bytes.len(), &BufferPool::new(0), spec_hash)?;
     Ok((message, &bytes[bytes.len() - payload.len()..]))
 }
 
 /// Checks a message of `len` bytes and copies its payload into private memory from `pool`.
 ///
 /// The checksum covers the copy, so the checked bytes cannot change afterwards, even if they came through shared memory.
-pub fn receive<M: Message>(
+pub fn decode_from<M: Message>(
     mut bytes: impl Read,
     len: usize,
     pool: &BufferPool,
     spec_hash: Option<u64>,
 ) -> Result<(M, Buffer), CodecError> {
     let mut prefix = [0; PREFIX_BYTES];
-    let is_there = bytes.read_exact(&mut prefix).is_ok();
-    let prefix = Prefix::read(is_there.then_some(&prefix), len)?;
-    let mut sum = prefix.checksum_begun();
+    let has_prefix = bytes.read_exact(&mut prefix).is_ok();
+    let prefix = Prefix::decode(has_prefix.then_some(&prefix), len)?;
+    let mut sum = prefix.start_checksum();
     let mut header = vec![0; prefix.header_len()];
-    copy(&mut bytes, &mut header, &mut sum);
-    let mut payload = pool.take_own(prefix.payload_len());
-    copy(&mut bytes, &mut payload, &mut sum);
-    let message = prefix.message(sum, &header, &payload, spec_hash)?;
+    copy_and_sum(&mut bytes, &mut header, &mut sum);
+    let mut payload = pool.take_private(prefix.payload_len());
+    copy_and_sum(&mut bytes, &mut payload, &mut sum);
+    let message = prefix.decode_message(sum, &header, &payload, spec_hash)?;
     Ok((message, payload))
 }
 
 /// Copies the next bytes into `out` a block at a time, and adds each block to the checksum while it is in the cache.
 /// If `bytes` ends early, the checksum will not match.
-fn copy(bytes: &mut impl Read, out: &mut [u8], sum: &mut crc32fast::Hasher) {
+fn copy_and_sum(bytes: &mut impl Read, out: &mut [u8], sum: &mut crc32fast::Hasher) {
     for block in out.chunks_mut(BLOCK_BYTES) {
         if bytes.read_exact(block).is_err() {
             return;
@@ -155,26 +155,26 @@ impl Prefix {
 
     fn to_bytes(self) -> [u8; PREFIX_BYTES] {
         let mut bytes = [0; PREFIX_BYTES];
-        let written = bincode::serde::encode_into_slice(self, &mut bytes, FIXED);
+        let written = bincode::serde::encode_into_slice(self, &mut bytes, PREFIX_ENCODING);
         debug_assert_eq!(written.ok(), Some(PREFIX_BYTES));
         bytes
     }
 
     /// Decodes the fields of received bytes, without checking them.
     fn from_bytes(bytes: &[u8; PREFIX_BYTES]) -> Self {
-        let read = bincode::serde::decode_from_slice(bytes, FIXED);
+        let read = bincode::serde::decode_from_slice(bytes, PREFIX_ENCODING);
         read.expect("any 32 bytes are seven integers").0
     }
 
     /// Starts a checksum with the fields before `checksum`; the caller adds header and payload.
-    fn checksum_begun(self) -> crc32fast::Hasher {
+    fn start_checksum(self) -> crc32fast::Hasher {
         let mut sum = crc32fast::Hasher::new();
         sum.update(&self.to_bytes()[..PREFIX_BYTES - size_of::<u32>()]);
         sum
     }
 
     /// Decodes the prefix of a message of `len` bytes in all, and checks its magic, version and lengths.
-    fn read(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
+    fn decode(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
         let this = Self::from_bytes(bytes.ok_or(CodecError::Length {
             have: len,
             need: PREFIX_BYTES,
@@ -206,7 +206,7 @@ impl Prefix {
     }
 
     /// Decodes the message, after checking checksum, kind and run, and validates header and payload by its type.
-    fn message<M: Message>(
+    fn decode_message<M: Message>(
         &self,
         sum: crc32fast::Hasher,
         header: &[u8],

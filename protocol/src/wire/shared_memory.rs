@@ -20,7 +20,7 @@ pub const METADATA_BYTES: usize = 40 << 15;
 /// Bytes that zenoh keeps in [`FOLDER`] for each session.
 pub const SESSION_BYTES: usize = 12 << 10;
 /// How long a process waits for others that allocate shared memory at the same time; each takes milliseconds.
-const OTHERS_MAX: Duration = Duration::from_secs(10);
+const LOCK_WAIT_MAX: Duration = Duration::from_secs(10);
 /// How often a waiting process checks whether the others are done.
 const TICK: Duration = Duration::from_millis(2);
 /// Messages that go through the socket after a loss in shared memory, before shared memory is tried again.
@@ -36,24 +36,24 @@ const CAP_IPC_LOCK: u32 = 14;
 #[derive(Debug, Default)]
 pub struct Trust {
     /// Messages still to be sent through the socket.
-    avoid: u32,
+    avoid_left: u32,
     losses_in_a_row: u32,
     misses_in_a_row: u32,
 }
 
 impl Trust {
     /// Whether the next message may go through shared memory.
-    pub fn ask(&mut self) -> bool {
-        let may = self.avoid == 0;
+    pub fn may_use(&mut self) -> bool {
+        let may_use = self.avoid_left == 0;
         if self.losses_in_a_row < LOSSES_MAX {
-            self.avoid = self.avoid.saturating_sub(1);
+            self.avoid_left = self.avoid_left.saturating_sub(1);
         }
-        may
+        may_use
     }
 
     /// Records that a message in shared memory was not answered. The next ones go through the socket; after two losses in a row, all do.
-    pub fn lost(&mut self) {
-        self.avoid = AVOID_COUNT;
+    pub fn record_loss(&mut self) {
+        self.avoid_left = AVOID_COUNT;
         self.losses_in_a_row += 1;
         if self.losses_in_a_row == LOSSES_MAX {
             tracing::warn!(
@@ -64,7 +64,7 @@ impl Trust {
     }
 
     /// Records whether shared memory was free for a message; if not, the message goes through the socket.
-    pub fn found(&mut self, is_free: bool) {
+    pub fn record_allocation(&mut self, is_free: bool) {
         let misses = self.misses_in_a_row.saturating_add(1);
         self.misses_in_a_row = if is_free { 0 } else { misses };
         if self.misses_in_a_row == MISSES_MAX {
@@ -76,7 +76,7 @@ impl Trust {
     }
 
     /// Records that a message in shared memory has arrived.
-    pub const fn worked(&mut self) {
+    pub const fn record_arrival(&mut self) {
         self.losses_in_a_row = 0;
     }
 }
@@ -114,15 +114,15 @@ pub fn check_room(bytes: usize) -> Result<(), String> {
 
 /// Checks that this process may create a file of `bytes` bytes, because shared memory is a file.
 pub(super) fn check_file_size(bytes: usize) -> Result<(), String> {
-    let most = getrlimit(Resource::RLIMIT_FSIZE).ok().map(|it| it.0);
-    check_limit(most, bytes, "write files of", "-f")
+    let limit = getrlimit(Resource::RLIMIT_FSIZE).ok().map(|it| it.0);
+    check_limit(limit, bytes, "write files of", "-f")
 }
 
-fn check_limit(most: Option<u64>, bytes: usize, to: &str, option: &str) -> Result<(), String> {
-    match most {
-        Some(most) if most < bytes as u64 => Err(format!(
-            "this process may {to} {} KiB, {} KiB are needed: raise `ulimit {option}`",
-            most >> 10,
+fn check_limit(limit: Option<u64>, bytes: usize, action: &str, option: &str) -> Result<(), String> {
+    match limit {
+        Some(limit) if limit < bytes as u64 => Err(format!(
+            "this process may {action} {} KiB, {} KiB are needed: raise `ulimit {option}`",
+            limit >> 10,
             bytes >> 10
         )),
         _ => Ok(()),
@@ -141,22 +141,22 @@ pub fn is_granted(asked: Result<(), String>) -> bool {
         .is_ok()
 }
 
-/// Calls `take` to allocate in [`FOLDER`] if `bytes` bytes are free there. Processes that allocate at the same time take turns by a lock,
-/// so that all together take no more than there is.
-pub(super) fn take_room<T>(
+/// Calls `allocate` if `bytes` bytes are free in [`FOLDER`]. Processes that allocate at the same time take turns by a lock, so that all
+/// together take no more than there is.
+pub(super) fn allocate_in_turn<T>(
     bytes: usize,
-    take: impl FnOnce() -> Result<T, String>,
+    allocate: impl FnOnce() -> Result<T, String>,
 ) -> Result<T, String> {
     let folder = File::open(FOLDER).map_err(|e| format!("{FOLDER}: {e}"))?;
     let started = Instant::now();
     while matches!(lock_file::try_lock(&folder), Ok(false)) {
-        if started.elapsed() > OTHERS_MAX {
+        if started.elapsed() > LOCK_WAIT_MAX {
             return Err(format!("{FOLDER} is locked by another process"));
         }
         std::thread::sleep(TICK);
     }
     check_room(bytes)?;
-    take()
+    allocate()
 }
 
 /// Checks that this process may lock `bytes` bytes, as zenoh locks the shared memory that it creates and that it reads.
@@ -172,11 +172,11 @@ pub fn lockable_bytes() -> Option<u64> {
     // A system without this limit reports an error when memory is locked.
     let (soft, hard) = getrlimit(Resource::RLIMIT_MEMLOCK).ok()?;
     // The soft limit still applies if it cannot be raised.
-    let most = match setrlimit(Resource::RLIMIT_MEMLOCK, hard, hard) {
+    let limit = match setrlimit(Resource::RLIMIT_MEMLOCK, hard, hard) {
         Ok(()) => hard,
         Err(_) => soft,
     };
-    (most != nix::sys::resource::RLIM_INFINITY).then_some(most)
+    (limit != nix::sys::resource::RLIM_INFINITY).then_some(limit)
 }
 
 #[cfg(test)]
@@ -186,15 +186,15 @@ mod tests {
     #[test]
     fn after_a_loss_sockets_serve_for_a_while_and_after_two_in_a_row_for_ever() {
         let mut trust = Trust::default();
-        assert!(trust.ask() && trust.ask());
-        trust.lost();
-        assert_eq!((0..AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
-        assert!(trust.ask());
-        trust.worked();
-        trust.lost();
-        assert_eq!((0..AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
-        assert!(trust.ask(), "one loss, as something arrived in between");
-        trust.lost();
-        assert_eq!((0..10 * AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
+        assert!(trust.may_use() && trust.may_use());
+        trust.record_loss();
+        assert_eq!((0..AVOID_COUNT).filter(|_| trust.may_use()).count(), 0);
+        assert!(trust.may_use());
+        trust.record_arrival();
+        trust.record_loss();
+        assert_eq!((0..AVOID_COUNT).filter(|_| trust.may_use()).count(), 0);
+        assert!(trust.may_use(), "one loss, as something arrived in between");
+        trust.record_loss();
+        assert_eq!((0..10 * AVOID_COUNT).filter(|_| trust.may_use()).count(), 0);
     }
 }

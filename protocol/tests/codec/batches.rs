@@ -6,7 +6,7 @@ use driml_protocol::{
 };
 
 use crate::samples::{
-    ORIGIN, SPEC, STACKED, batch, batch_from, prioritised_batch, refusal, rows, sealed,
+    ORIGIN, SPEC, STACKED, batch, batch_from, encoded, prioritised_batch, refusal, rows,
     stacked_batch,
 };
 
@@ -28,13 +28,13 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     let mut columns = [1u64 << 40, 7, u64::MAX].map(u64::to_le_bytes).concat();
     columns.extend([0.5f32, 1.0, 1e-30].map(f32::to_le_bytes).concat());
     assert!(payload.ends_with(&columns), "transitions, then chances");
-    let sent = [sealed(plain.clone()), sealed(prioritised.clone())].map(|bytes| bytes.len());
+    let sent = [encoded(plain.clone()), encoded(prioritised.clone())].map(|bytes| bytes.len());
     // The origin takes one byte for the shard and nine for the incarnation.
     assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
     assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
-    assert_eq!(received(&sealed(plain.clone())), plain);
+    assert_eq!(received(&encoded(plain.clone())), plain);
 
-    let bytes = sealed(prioritised.clone());
+    let bytes = encoded(prioritised.clone());
     let mut back = received(&bytes);
     assert_eq!(back, prioritised);
     assert_eq!(back.probabilities().unwrap(), [0.5, 1.0, 1e-30]);
@@ -83,7 +83,7 @@ fn stacks_come_back_as_whole_states() {
         let more = sent.header.payload_bytes() - batch_from(origin).header.payload_bytes();
         // Five frames of two bytes. Each of six states has two frame numbers of four bytes in place of four bytes of pixels.
         assert_eq!(more, 5 * 2 + 6 * 8 - 6 * 4);
-        let bytes = sealed(sent.clone());
+        let bytes = encoded(sent.clone());
         let back = received(&bytes);
         assert_eq!(back, sent);
         assert_eq!(back.probabilities().is_some(), origin.is_some());

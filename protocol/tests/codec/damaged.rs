@@ -160,7 +160,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         ..RunInfo::default()
     };
-    let refused = codec::seal(SPEC, &run_info, &[]).unwrap_err();
+    let refused = codec::encode_head(SPEC, &run_info, &[]).unwrap_err();
     let max = HEADER_BYTES_MAX;
     let is_too_large = matches!(refused, CodecError::TooLarge { max: m, .. } if m == max);
     assert!(is_too_large, "{refused}");

@@ -11,7 +11,7 @@ use std::{fs, io::Read, path::Path};
 
 use driml_protocol::{BufferPool, Chunk, End, Kind, NO_ACTION, WeightsUpload, codec};
 
-use crate::samples::{SPEC, batch, chunk, samples, sealed_chunk, weights};
+use crate::samples::{SPEC, batch, chunk, encoded_chunk, samples, weights};
 
 #[test]
 fn chunk_batch_and_weights_hold_what_was_written() {
@@ -42,13 +42,13 @@ fn pieces_are_received_as_the_whole_is() {
     let pool = BufferPool::new(1);
     let receive = |first: &[u8], second: &[u8], len| {
         let pieces = first.chain(&b""[..]).chain(second);
-        let (header, payload) = codec::receive(pieces, len, &pool, Some(SPEC))?;
+        let (header, payload) = codec::decode_from(pieces, len, &pool, Some(SPEC))?;
         Chunk::from_payload(header, payload)
     };
-    let bytes = sealed_chunk();
+    let bytes = encoded_chunk();
     for at in 0..=bytes.len() {
         let (first, second) = bytes.split_at(at);
-        pool.take_own(64).fill(0xAB);
+        pool.take_private(64).fill(0xAB);
         let back = receive(first, second, bytes.len()).unwrap();
         assert_eq!(back, chunk(), "cut at {at}");
         // The last piece is missing, or the length is not the sum of the pieces.

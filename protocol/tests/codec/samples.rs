@@ -180,12 +180,12 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
 }
 
 /// An encoded chunk.
-pub(crate) fn sealed_chunk() -> Vec<u8> {
+pub(crate) fn encoded_chunk() -> Vec<u8> {
     codec::encode(SPEC, &chunk().header, chunk().payload()).unwrap()
 }
 
 /// An encoded batch.
-pub(crate) fn sealed(batch: Batch) -> Vec<u8> {
+pub(crate) fn encoded(batch: Batch) -> Vec<u8> {
     let (header, payload) = batch.into_payload();
     codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
 }

@@ -297,7 +297,7 @@ impl LogReader<'_> {
             RecordKind::Segment => Err("a segment begins within another".into()),
             RecordKind::Chunk => {
                 let (hash, len) = (self.id.spec_hash, record.body.len());
-                let chunk = codec::receive(record.body, len, &self.pool, Some(hash))
+                let chunk = codec::decode_from(record.body, len, &self.pool, Some(hash))
                     .and_then(|(header, payload)| Chunk::from_payload(header, payload))
                     .map_err(|e| e.to_string())?;
                 self.replay.check_chunk(&chunk)?;

@@ -105,7 +105,7 @@ impl State {
             let request = parked.request;
             let alloc = |bytes| match request.shared_memory {
                 true => pool.take(bytes),
-                false => pool.take_own(bytes),
+                false => pool.take_private(bytes),
             };
             let drawn = self.replay.draw_for(request.id, request.rows, alloc);
             if !matches!(drawn, Err(NotReady::Wait(_))) || parked.time_left(now).is_zero() {

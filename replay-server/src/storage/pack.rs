@@ -65,7 +65,7 @@ impl Packer {
                 .map(|frames| pack_blocks(frames, chunk.header.frame_bytes as usize))
                 .collect(),
         };
-        let seal = |hash| codec::seal(hash, &chunk.header, chunk.payload()).ok();
+        let seal = |hash| codec::encode_head(hash, &chunk.header, chunk.payload()).ok();
         let message_head = self.spec_hash.and_then(seal);
         PackedChunk {
             chunk,

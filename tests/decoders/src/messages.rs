@@ -23,7 +23,7 @@ fn read<M: Message + Debug>(bytes: &[u8]) {
     let whole = codec::decode::<M>(bytes, Some(SPEC_HASH));
     let (first, second) = bytes.split_at(bytes.len() / 3);
     let pool = BufferPool::new(0);
-    let pieces = codec::receive::<M>(first.chain(second), bytes.len(), &pool, None);
+    let pieces = codec::decode_from::<M>(first.chain(second), bytes.len(), &pool, None);
     match (whole, pieces) {
         (Ok((message, payload)), Ok((same, copy))) => {
             assert_eq!(payload, &copy[..]);
