@@ -46,13 +46,13 @@ pub struct RunArgs {
 /// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let endpoints = Endpoints::to(args.connect);
+    let endpoints = Endpoints::connect_to(args.connect);
     let (credentials, bytes_max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
     let opened = session::open_unless(shutdown, endpoints, &keys, credentials, bytes_max)?;
     let Some(session) = opened else {
         return Ok(false);
     };
-    let Some(run_info) = join::run_info(&session, &keys, shutdown)? else {
+    let Some(run_info) = join::fetch_run_info(&session, &keys, shutdown)? else {
         return Ok(false);
     };
     let mut settings = ActorSettings::from_toml(&run_info.config_toml)
@@ -80,7 +80,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client.declare_alive(participant.peer());
     let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
-    let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
+    let Some(welcome) = join::join(&client, &join, shutdown)? else {
         return Ok(false);
     };
     if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {
@@ -97,7 +97,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         return Ok(false);
     };
     // The learner has joined by now, so the replay server knows after how many updates a resumed run continues.
-    let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
+    let Some(run_info) = join::fetch_run_info(client.session(), client.keys(), shutdown)? else {
         return Ok(false);
     };
     let pool = settings.chunk_buffers();

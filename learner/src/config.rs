@@ -100,10 +100,10 @@ impl AffinityConfig {
     ) -> Result<Option<AffinityEstimator>, ConfigError> {
         let missing = |key: &str| {
             let why = "the chosen estimator needs it: start from a preset";
-            ConfigError::of(&format!("learner.affinity.{key}"), "(missing)", why)
+            ConfigError::new(&format!("learner.affinity.{key}"), "(missing)", why)
         };
         let name = format!("{:?}", self.estimator);
-        let bad = |e: AffinityError| ConfigError::of("learner.affinity", &name, e);
+        let bad = |e: AffinityError| ConfigError::new("learner.affinity", &name, e);
         // Tables that the chosen estimator does not use are checked too.
         let learned = self.learned.map_or(Ok(()), |it| it.check_valid());
         let exact = self.exact.map_or(Ok(()), |it| it.check_valid());
@@ -163,7 +163,7 @@ impl Config {
         }
         let name = self.update.auxiliary_loss.name();
         match (self.update.auxiliary_loss.positives(), self.augment) {
-            (Positives::OtherView, None) => Err(ConfigError::of(
+            (Positives::OtherView, None) => Err(ConfigError::new(
                 "learner.augment",
                 "(missing)",
                 format!(
@@ -171,7 +171,7 @@ impl Config {
                     name.to_uppercase()
                 ),
             )),
-            (Positives::None, Some(_)) => Err(ConfigError::of(
+            (Positives::None, Some(_)) => Err(ConfigError::new(
                 "learner.augment",
                 "(there)",
                 "nothing but an auxiliary loss sees augmented states, and this agent has none",

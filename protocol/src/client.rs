@@ -155,7 +155,7 @@ impl RunClient {
     }
 
     /// Declares a publisher of messages of type `M`.
-    pub fn announce<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
+    pub fn declare_announcer<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
         let publisher = self
             .session
             .declare_publisher(self.keys.key::<M>())
@@ -202,7 +202,7 @@ pub struct Announcer<M> {
 
 impl<M: Message> Announcer<M> {
     /// Publishes a message to all current subscribers.
-    pub fn put(&self, message: &M) -> zenoh::Result<()> {
+    pub fn publish(&self, message: &M) -> zenoh::Result<()> {
         let encoded = EncodedMessage::new(message, self.spec_hash)?;
         self.publisher.put(encoded.bytes).wait()
     }

@@ -12,21 +12,21 @@ pub struct ConfigError(String);
 
 impl ConfigError {
     /// An error that `value` cannot work for `key`, a path with its table. `why` says what is wrong and what to do.
-    pub fn of(key: &str, value: impl Display, why: impl Display) -> Self {
+    pub fn new(key: &str, value: impl Display, why: impl Display) -> Self {
         Self(format!("{key} = {value} cannot work: {why}"))
     }
 }
 
-/// Returns the error [`ConfigError::of`] unless `is_so`.
+/// Returns the error [`ConfigError::new`] unless `is_valid`.
 pub fn check<W: Display>(
-    is_so: bool,
+    is_valid: bool,
     key: &str,
     value: impl Display,
     why: impl FnOnce() -> W,
 ) -> Result<(), ConfigError> {
-    match is_so {
+    match is_valid {
         true => Ok(()),
-        false => Err(ConfigError::of(key, value, why())),
+        false => Err(ConfigError::new(key, value, why())),
     }
 }
 

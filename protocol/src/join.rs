@@ -19,20 +19,20 @@ use crate::{
 };
 
 /// How long a joining process waits for a replay server.
-const SERVER_MAX: Duration = Duration::from_secs(60);
+const SERVER_WAIT_MAX: Duration = Duration::from_secs(60);
 /// How long it waits until its predecessor is disconnected: a session that was cut off counts as connected for its lease of 30 s.
-const TAKEN_MAX: Duration = Duration::from_secs(45);
+const PREDECESSOR_WAIT_MAX: Duration = Duration::from_secs(45);
 /// How long it waits before it logs that it is waiting.
-const SILENT_MAX: Duration = Duration::from_secs(5);
+const QUIET_WAIT_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its reply.
-const TRY_MAX: Duration = Duration::from_secs(2);
+const TRY_TIMEOUT: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a process could not join a run.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum JoinError {
-    #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_MAX.as_secs())]
+    #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_WAIT_MAX.as_secs())]
     NoReplayServer { last: SessionError },
     #[error("the replay server's run info: {0}")]
     Codec(#[from] CodecError),
@@ -46,16 +46,16 @@ pub enum JoinError {
 ///
 /// # Errors
 /// No replay server answered within 60 s, or its reply cannot be read, for example because its protocol version differs.
-pub fn run_info(
+pub fn fetch_run_info(
     session: &Session,
     keys: &Keys,
     shutdown: &Shutdown,
 ) -> Result<Option<RunInfo>, JoinError> {
-    let mut patience = Patience::default();
+    let mut server_wait = ServerWait::default();
     loop {
-        match run_info_within(session, keys, TRY_MAX) {
+        match fetch_run_info_once(session, keys, TRY_TIMEOUT) {
             Ok(run_info) => return Ok(Some(run_info)),
-            Err(e) => patience.wait_after(e)?,
+            Err(e) => server_wait.record_failure(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);
@@ -64,7 +64,7 @@ pub fn run_info(
 }
 
 /// Asks the replay server once for the run's settings, and waits for at most `wait_max`.
-pub fn run_info_within(
+pub fn fetch_run_info_once(
     session: &Session,
     keys: &Keys,
     wait_max: Duration,
@@ -76,20 +76,20 @@ pub fn run_info_within(
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.
 #[derive(Default)]
-struct Patience {
+struct ServerWait {
     silence: Silence,
-    silence_said: LogLimiter,
-    recovery_said: LogLimiter,
+    silence_log: LogLimiter,
+    recovery_log: LogLimiter,
 }
 
-impl Patience {
+impl ServerWait {
     /// Records a failed attempt, and logs now and then what this process waits for. Returns an error if a retry is useless.
-    fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
+    fn record_failure(&mut self, e: SessionError) -> Result<(), JoinError> {
         let e = match e {
             SessionError::Unreadable { why, .. } => return Err(why.into()),
             SessionError::Recovering(recovering) => {
                 self.silence.answered();
-                if recovering.progress.is_slow() && self.recovery_said.due().is_some() {
+                if recovering.progress.is_slow() && self.recovery_log.due().is_some() {
                     tracing::info!("waiting for as long as it takes: {recovering}");
                 }
                 return Ok(());
@@ -97,14 +97,14 @@ impl Patience {
             e => e,
         };
         let since = self.silence.unanswered();
-        if since > SERVER_MAX {
+        if since > SERVER_WAIT_MAX {
             return Err(JoinError::NoReplayServer { last: e });
         }
-        if since > SILENT_MAX && self.silence_said.due().is_some() {
-            let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
+        if since > QUIET_WAIT_MAX && self.silence_log.due().is_some() {
+            let (since, max) = (since.as_secs(), SERVER_WAIT_MAX.as_secs());
             // The listener may be a router to which the replay server has not connected yet.
             let why = match e {
-                SessionError::NoAnswerer { key } => format!(
+                SessionError::NoResponder { key } => format!(
                     "a process listens there, but does not answer at {key}: is it the replay server of this run, with the same --namespace?"
                 ),
                 other => other.to_string(),
@@ -121,35 +121,35 @@ impl Patience {
 ///
 /// # Errors
 /// Another process keeps this role, or the replay server rejects this one or does not answer for a minute.
-pub fn take_part(
+pub fn join(
     client: &RunClient,
-    join: &impl Request<Reply = JoinReply>,
+    request: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let mut patience = Patience::default();
-    let mut taken: Option<Silence> = None;
+    let mut server_wait = ServerWait::default();
+    let mut predecessor: Option<Silence> = None;
     loop {
-        match client.ask(join, TRY_MAX) {
+        match client.ask(request, TRY_TIMEOUT) {
             Ok(JoinReply::Welcome(welcome)) => return Ok(Some(welcome)),
             Ok(JoinReply::Refused { why }) => {
                 let why = format!("the replay server refuses: {why}");
                 return Err(JoinError::Refused(why));
             }
-            Ok(JoinReply::Taken { why }) => match &mut taken {
+            Ok(JoinReply::Taken { why }) => match &mut predecessor {
                 Some(silence) => {
-                    if silence.unanswered() > TAKEN_MAX {
-                        let seconds = TAKEN_MAX.as_secs();
+                    if silence.unanswered() > PREDECESSOR_WAIT_MAX {
+                        let seconds = PREDECESSOR_WAIT_MAX.as_secs();
                         let why = format!("{why}, and has not ended within {seconds} s");
                         return Err(JoinError::Refused(why));
                     }
                 }
                 None => {
-                    let max = TAKEN_MAX.as_secs();
+                    let max = PREDECESSOR_WAIT_MAX.as_secs();
                     tracing::warn!("{why}; waiting up to {max} s for its end");
-                    taken = Some(Silence::default());
+                    predecessor = Some(Silence::default());
                 }
             },
-            Err(e) => patience.wait_after(e)?,
+            Err(e) => server_wait.record_failure(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
             return Ok(None);

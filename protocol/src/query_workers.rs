@@ -35,10 +35,10 @@ use crate::{
 };
 
 /// Most queries in the queue. A query beyond this is dropped; its sender is notified at once and retries.
-const WAITING_MAX: usize = 4096;
+const QUEUE_MAX: usize = 4096;
 /// Payload bytes in the queue after which queries are dropped, a few hundred chunks of Procgen. Only the bytes before a query count, so
 /// that a query of any size is answered in the end. The sender of a dropped query retries.
-const WAITING_BYTES_MAX: usize = 1 << 29;
+const QUEUE_BYTES_MAX: usize = 1 << 29;
 
 /// A request that has arrived and has yet to be answered.
 #[derive(Debug)]
@@ -100,9 +100,9 @@ impl<M: Message> Responder<M> {
     }
 
     /// Answers, in place of a reply, that the replay is still being read back from disk.
-    pub fn put_off(self, recovering: &Recovering) {
+    pub fn retry_later(self, recovering: &Recovering) {
         match EncodedMessage::new(recovering, self.spec_hash) {
-            Ok(encoded) => session::put_off(&self.query, encoded.into_bytes()),
+            Ok(encoded) => session::reply_error(&self.query, encoded.into_bytes()),
             Err(e) => tracing::error!("that the replay is being read back was not said: {e}"),
         }
     }
@@ -119,14 +119,14 @@ impl<M: Message> Responder<M> {
 enum Work {
     Query(Query),
     /// A rejected query: the bytes of its payload, and the callback that reports them.
-    TooLong(usize, Arc<dyn Fn(usize) + Send + Sync>),
+    Rejected(usize, Arc<dyn Fn(usize) + Send + Sync>),
 }
 
 /// Threads that answer requests `R`, and their queue. The threads exit once this value and all queryables that it declared are dropped.
 #[derive(Debug)]
 pub struct QueryWorkers<R> {
     work: Sender<Work>,
-    waiting_bytes: Arc<AtomicUsize>,
+    queued_bytes: Arc<AtomicUsize>,
     threads: Vec<JoinHandle<()>>,
     request: PhantomData<fn() -> R>,
 }
@@ -139,14 +139,14 @@ impl<R: Request + 'static> QueryWorkers<R> {
         spec_hash: u64,
         answer: impl Fn(Incoming<R>) + Clone + Send + 'static,
     ) -> std::io::Result<Self> {
-        let (work, waiting) = crossbeam_channel::bounded::<Work>(WAITING_MAX);
-        let waiting_bytes = Arc::<AtomicUsize>::default();
+        let (work, queue) = crossbeam_channel::bounded::<Work>(QUEUE_MAX);
+        let queued_bytes = Arc::<AtomicUsize>::default();
         let thread = |i: usize| {
-            let (waiting, answer, bytes) = (waiting.clone(), answer.clone(), waiting_bytes.clone());
+            let (queue, answer, bytes) = (queue.clone(), answer.clone(), queued_bytes.clone());
             let point = name.to_owned();
             let next = move || {
                 fail_point::reach(&point);
-                waiting.recv().ok()
+                queue.recv().ok()
             };
             let handle = move |work| match work {
                 Work::Query(query) => {
@@ -157,7 +157,7 @@ impl<R: Request + 'static> QueryWorkers<R> {
                         request: PhantomData,
                     });
                 }
-                Work::TooLong(bytes, refused) => refused(bytes),
+                Work::Rejected(bytes, on_rejected) => on_rejected(bytes),
             };
             std::thread::Builder::new()
                 .name(format!("{name}-{i}"))
@@ -166,38 +166,38 @@ impl<R: Request + 'static> QueryWorkers<R> {
         let threads = (0..threads).map(thread).collect::<Result<_, _>>()?;
         Ok(Self {
             work,
-            waiting_bytes,
+            queued_bytes,
             threads,
             request: PhantomData,
         })
     }
 
     /// Accepts requests of the client's run until the returned queryable is dropped. A request of more than `bytes_max` bytes is dropped
-    /// before anything is copied, and `refused` is called with its bytes. The reply is complete: zenoh need query no other process.
+    /// before anything is copied, and `on_rejected` is called with its bytes. The reply is complete: zenoh need query no other process.
     pub fn declare(
         &self,
         client: &RunClient,
         bytes_max: usize,
-        refused: impl Fn(usize) + Send + Sync + 'static,
+        on_rejected: impl Fn(usize) + Send + Sync + 'static,
     ) -> zenoh::Result<Queryable<()>> {
-        let (work, waiting_bytes) = (self.work.clone(), self.waiting_bytes.clone());
-        let refused: Arc<dyn Fn(usize) + Send + Sync> = Arc::new(refused);
-        let take = move |query: Query| {
+        let (work, queued_bytes) = (self.work.clone(), self.queued_bytes.clone());
+        let on_rejected: Arc<dyn Fn(usize) + Send + Sync> = Arc::new(on_rejected);
+        let enqueue = move |query: Query| {
             let bytes = payload_bytes(&query);
             if bytes > bytes_max {
                 // If the queue is full, this report is lost; it is one of very many.
-                let _ = work.try_send(Work::TooLong(bytes, refused.clone()));
+                let _ = work.try_send(Work::Rejected(bytes, on_rejected.clone()));
                 return;
             }
-            let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
+            let before = queued_bytes.fetch_add(bytes, Ordering::Relaxed);
             // Dropping a query notifies its sender at once.
-            if before > WAITING_BYTES_MAX || work.try_send(Work::Query(query)).is_err() {
-                waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
+            if before > QUEUE_BYTES_MAX || work.try_send(Work::Query(query)).is_err() {
+                queued_bytes.fetch_sub(bytes, Ordering::Relaxed);
                 tracing::debug!("more queries than can wait; the sender retries");
             }
         };
         let queryable = client.session().declare_queryable(client.keys().key::<R>());
-        queryable.complete(true).callback(take).wait()
+        queryable.complete(true).callback(enqueue).wait()
     }
 
     /// Returns the threads so that the caller can join them.

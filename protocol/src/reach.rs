@@ -10,63 +10,63 @@ use std::{
 };
 
 /// How long one address may take to answer.
-const TRY_MAX: Duration = Duration::from_secs(2);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pauses between attempts: the first pause, which doubles each time, and the longest.
 const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(1)];
 /// How long a foreign server may take to send its first bytes.
-const SAYS_MAX: Duration = Duration::from_secs(1);
+const GREETING_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Why an endpoint cannot be reached, and what to do.
 #[derive(Debug, thiserror::Error)]
-#[error("{said}")]
+#[error("{text}")]
 pub struct Unreachable {
-    said: String,
+    text: String,
     /// Whether a retry may succeed, as the replay server may still be starting.
-    may_pass: bool,
+    is_retryable: bool,
 }
 
 impl Unreachable {
-    const fn for_now(said: String) -> Self {
-        let may_pass = true;
-        Self { said, may_pass }
+    const fn retryable(text: String) -> Self {
+        let is_retryable = true;
+        Self { text, is_retryable }
     }
 }
 
 /// Checks once whether something accepts connections at `endpoint`. For `quic/` only the host is resolved, because UDP does not
 /// report a closed port.
-pub fn look(endpoint: &str) -> Result<(), Unreachable> {
+pub fn check_listening(endpoint: &str) -> Result<(), Unreachable> {
     match endpoint.split_once('/') {
-        Some(("unixsock-stream", path)) => look_at_socket(endpoint, path.into()),
+        Some(("unixsock-stream", path)) => check_unix_socket(endpoint, path.into()),
         Some((protocol, address)) => {
             let addresses = address.to_socket_addrs().map_err(|e| {
                 let why = e.to_string();
                 let why = why.rsplit(": ").next().unwrap_or(&why);
-                let said = format!(
+                let text = format!(
                     "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
                 );
-                let may_pass = why.contains("emporary");
-                Unreachable { said, may_pass }
+                let is_retryable = why.contains("emporary");
+                Unreachable { text, is_retryable }
             })?;
             if protocol != "tcp" {
                 return Ok(());
             }
             let mut failed = None;
             for address in addresses {
-                match TcpStream::connect_timeout(&address, TRY_MAX) {
+                match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
                     Ok(_) => return Ok(()),
                     Err(e) => failed = Some(e),
                 }
             }
             let failed = failed.unwrap_or_else(|| ErrorKind::AddrNotAvailable.into());
-            Err(of_error(endpoint, failed))
+            Err(connect_error(endpoint, failed))
         }
         // zenoh reports what is wrong with such an endpoint.
         None => Ok(()),
     }
 }
 
-fn of_error(endpoint: &str, e: std::io::Error) -> Unreachable {
-    Unreachable::for_now(match e.kind() {
+fn connect_error(endpoint: &str, e: std::io::Error) -> Unreachable {
+    Unreachable::retryable(match e.kind() {
         ErrorKind::ConnectionRefused => format!(
             "nothing listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
              reached with quic/HOST:PORT, which is UDP, and --tls-dir"
@@ -77,16 +77,16 @@ fn of_error(endpoint: &str, e: std::io::Error) -> Unreachable {
     })
 }
 
-fn look_at_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
+fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
     let what = match UnixStream::connect(path) {
         Ok(_) => return Ok(()),
         Err(e) if e.kind() == ErrorKind::NotFound => "there is no such socket",
         Err(e) if e.kind() == ErrorKind::ConnectionRefused => {
             "its socket was left by a process that has ended"
         }
-        Err(e) => return Err(of_error(endpoint, e)),
+        Err(e) => return Err(connect_error(endpoint, e)),
     };
-    Err(Unreachable::for_now(format!(
+    Err(Unreachable::retryable(format!(
         "nothing listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
     )))
 }
@@ -94,11 +94,11 @@ fn look_at_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
 /// Waits until something accepts connections at one of `endpoints`.
 pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(), Unreachable> {
     let (started, [mut pause, pause_max]) = (Instant::now(), PAUSES);
-    let mut said = false;
+    let mut is_logged = false;
     loop {
         let mut failed = None;
         for endpoint in endpoints {
-            match look(endpoint) {
+            match check_listening(endpoint) {
                 Ok(()) => return Ok(()),
                 Err(e) => failed = Some(e),
             }
@@ -106,10 +106,10 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
         let Some(e) = failed else {
             return Ok(());
         };
-        if !e.may_pass || started.elapsed() + pause > wait_max {
+        if !e.is_retryable || started.elapsed() + pause > wait_max {
             return Err(e);
         }
-        if started.elapsed() > TRY_MAX && !std::mem::replace(&mut said, true) {
+        if started.elapsed() > CONNECT_TIMEOUT && !std::mem::replace(&mut is_logged, true) {
             tracing::info!("waiting for {} s: {e}", wait_max.as_secs());
         }
         std::thread::sleep(pause);
@@ -118,17 +118,17 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
 }
 
 /// Returns the first line that a foreign server at `endpoint` sends in answer to an HTTP request, if it is printable text.
-pub(crate) fn what_listens(endpoint: &str) -> Option<String> {
+pub(crate) fn read_greeting(endpoint: &str) -> Option<String> {
     let ("tcp", address) = endpoint.split_once('/')? else {
         return None;
     };
     let address = address.to_socket_addrs().ok()?.next()?;
-    let mut stream = TcpStream::connect_timeout(&address, TRY_MAX).ok()?;
-    stream.set_read_timeout(Some(SAYS_MAX)).ok()?;
+    let mut stream = TcpStream::connect_timeout(&address, CONNECT_TIMEOUT).ok()?;
+    stream.set_read_timeout(Some(GREETING_TIMEOUT)).ok()?;
     stream.write_all(b"GET / HTTP/1.0\r\n\r\n").ok()?;
-    let mut said = [0; 40];
-    let count = stream.read(&mut said).ok()?;
-    let line = said[..count].split(|&byte| byte == b'\r' || byte == b'\n');
+    let mut greeting = [0; 40];
+    let count = stream.read(&mut greeting).ok()?;
+    let line = greeting[..count].split(|&byte| byte == b'\r' || byte == b'\n');
     let line = std::str::from_utf8(line.into_iter().next()?).ok()?;
     let is_text = line.len() >= 4 && line.chars().all(|it| !it.is_control());
     is_text.then(|| line.to_owned())
@@ -140,31 +140,31 @@ mod tests {
 
     use super::*;
 
-    fn said(endpoint: &str) -> String {
-        look(endpoint).unwrap_err().to_string()
+    fn error_at(endpoint: &str) -> String {
+        check_listening(endpoint).unwrap_err().to_string()
     }
 
     #[test]
     fn each_cause_has_its_sentence() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
-        assert!(look(&endpoint).is_ok());
+        assert!(check_listening(&endpoint).is_ok());
         drop(listener);
-        assert!(said(&endpoint).contains("nothing listens on tcp/127.0.0.1:"));
-        let unknown = said("tcp/no-such-host.invalid:7447");
+        assert!(error_at(&endpoint).contains("nothing listens on tcp/127.0.0.1:"));
+        let unknown = error_at("tcp/no-such-host.invalid:7447");
         assert!(
             unknown.contains("the host of tcp/no-such-host.invalid:7447 is unknown: "),
             "{unknown}"
         );
-        assert!(said("quic/no-such-host.invalid:7447").contains("is unknown"));
+        assert!(error_at("quic/no-such-host.invalid:7447").contains("is unknown"));
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("s");
         let endpoint = format!("unixsock-stream/{}", path.display());
-        assert!(said(&endpoint).contains("there is no such socket"));
+        assert!(error_at(&endpoint).contains("there is no such socket"));
         let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
-        assert!(look(&endpoint).is_ok());
+        assert!(check_listening(&endpoint).is_ok());
         drop(listener);
-        assert!(said(&endpoint).contains("left by a process that has ended"));
+        assert!(error_at(&endpoint).contains("left by a process that has ended"));
     }
 
     #[test]
@@ -177,8 +177,8 @@ mod tests {
             let _ = stream.read(&mut request).unwrap();
             stream.write_all(b"HTTP/1.0 404 Not Found\r\n\r\n").unwrap();
         });
-        let said = what_listens(&endpoint);
-        assert_eq!(said.as_deref(), Some("HTTP/1.0 404 Not Found"));
+        let greeting = read_greeting(&endpoint);
+        assert_eq!(greeting.as_deref(), Some("HTTP/1.0 404 Not Found"));
         server.join().unwrap();
     }
 }

@@ -20,29 +20,29 @@ use crate::{
 const PERIOD: Duration = Duration::from_secs(2);
 /// How often a process checks whether its activity has changed.
 const TICK: Duration = Duration::from_millis(250);
-const TIMEOUT: Duration = Duration::from_secs(2);
+const REPORT_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long the learner retries its last report at a replay server that does not answer: the server may be restarting.
-const FINISHED_MAX: Duration = Duration::from_secs(30);
+const FINISHED_RETRY_MAX: Duration = Duration::from_secs(30);
 
 /// Reports to each replay server of `clients` that the learner `who` has finished the run after `updates` updates. Retries until the server
 /// answers or `shutdown` is set, at least once: for 30 s, plus all the time in which the server reads its replay back.
-pub fn say_finished(clients: &[RunClient], who: Participant, updates: u64, shutdown: &Shutdown) {
+pub fn report_finished(clients: &[RunClient], who: Participant, updates: u64, shutdown: &Shutdown) {
     let finished = Report {
         finished: Some(updates),
-        ..report(who, "has finished", Duration::ZERO)
+        ..new_report(who, "has finished", Duration::ZERO)
     };
     for client in clients {
-        send_until_heard(|| client.ask(&finished, TIMEOUT), shutdown);
+        send_until_acked(|| client.ask(&finished, REPORT_TIMEOUT), shutdown);
     }
 }
 
-fn send_until_heard(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdown: &Shutdown) {
+fn send_until_acked(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdown: &Shutdown) {
     let mut silence = Silence::default();
     while let Err(e) = send() {
         if matches!(e, SessionError::Recovering(_)) {
             silence.answered();
         }
-        if silence.unanswered() > FINISHED_MAX {
+        if silence.unanswered() > FINISHED_RETRY_MAX {
             tracing::warn!("a replay server does not know that the run is finished: {e}; stop it");
             return;
         }
@@ -53,7 +53,7 @@ fn send_until_heard(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdow
 }
 
 /// Returns a report that `who` does `doing`, with the last warning in the log of this process.
-fn report(who: Participant, doing: &str, since: Duration) -> Report {
+fn new_report(who: Participant, doing: &str, since: Duration) -> Report {
     let warning = last_warning::get();
     let warning = warning.map(|(text, age)| Warning::new(&text, age.as_secs_f64()));
     Report::new(who, doing, since.as_secs_f64(), warning)
@@ -67,19 +67,19 @@ pub fn start(
     shutdown: Shutdown,
 ) -> std::io::Result<JoinHandle<()>> {
     let work = move || {
-        let mut said: Option<(String, Instant)> = None;
+        let mut last: Option<(String, Instant)> = None;
         loop {
             fail_point::reach("reporter");
             let (doing, since) = activity.get();
-            let is_old = |(said, at): &(String, Instant)| *said != doing || at.elapsed() > PERIOD;
-            if said.as_ref().is_none_or(is_old) {
-                let report = report(who, &doing, since);
+            let is_old = |(sent, at): &(String, Instant)| *sent != doing || at.elapsed() > PERIOD;
+            if last.as_ref().is_none_or(is_old) {
+                let report = new_report(who, &doing, since);
                 for client in &clients {
-                    if let Err(e) = client.ask(&report, TIMEOUT) {
+                    if let Err(e) = client.ask(&report, REPORT_TIMEOUT) {
                         tracing::debug!("a report did not arrive: {e}");
                     }
                 }
-                said = Some((doing, Instant::now()));
+                last = Some((doing, Instant::now()));
             }
             if shutdown.wait_timeout(TICK) || clients.iter().all(|it| it.session().is_closed()) {
                 return;
@@ -100,12 +100,12 @@ mod tests {
     fn that_the_run_is_finished_is_sent_until_a_server_that_comes_back_hears_it() {
         let key = String::new();
         let mut answers = [
-            Err(SessionError::NoAnswerer { key }),
+            Err(SessionError::NoResponder { key }),
             Err(SessionError::Recovering(Recovering::default())),
             Ok(Ack),
         ]
         .into_iter();
-        send_until_heard(|| answers.next().unwrap(), &Shutdown::default());
+        send_until_acked(|| answers.next().unwrap(), &Shutdown::default());
         assert_eq!(answers.count(), 0);
     }
 }

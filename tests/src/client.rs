@@ -34,7 +34,7 @@ pub struct Client {
 
 /// Opens a session with the process that listens at an endpoint, without retries.
 pub fn connect(endpoint: &str) -> Session {
-    session::open(&Endpoints::to(vec![endpoint.to_owned()])).unwrap()
+    session::open(&Endpoints::connect_to(vec![endpoint.to_owned()])).unwrap()
 }
 
 /// Opens a session that listens at an endpoint, in place of a replay server.
@@ -71,14 +71,14 @@ pub fn check_nothing_lost(replay: &ReplayStatus) {
 impl Client {
     /// Connects to the run at an endpoint once its replay server answers.
     pub(crate) fn join(endpoint: &str, credentials: Option<&Credentials>) -> Self {
-        let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
+        let endpoints = Endpoints::connect_to(vec![endpoint.to_owned()]);
         let keys = Keys::new(NAMESPACE).unwrap();
         let bytes_max = session::MESSAGE_BYTES_MAX;
         // One attempt waits for some seconds; on a busy machine a process may need longer to start listening.
         let session = wait_for(&format!("a process that listens on {endpoint}"), || {
             session::open_as(&endpoints, &keys, credentials, bytes_max).ok()
         });
-        let run_info = join::run_info(&session, &keys, &Shutdown::default())
+        let run_info = join::fetch_run_info(&session, &keys, &Shutdown::default())
             .unwrap()
             .expect("this client is not told to stop");
         let spec = Settings::parse(&run_info.config_toml)
@@ -177,13 +177,13 @@ impl Client {
     pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
         let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
-        join::take_part(&self.run_client(), &join, &never).unwrap();
+        join::join(&self.run_client(), &join, &never).unwrap();
     }
 
     /// Joins the run as a learner that has made no update yet.
     pub fn join_as_learner(&self, learner: u64) {
         let never = Shutdown::default();
-        join::take_part(&self.run_client(), &new_learner(learner), &never).unwrap();
+        join::join(&self.run_client(), &new_learner(learner), &never).unwrap();
     }
 
     /// Encodes a chunk as a process of the run would send it.

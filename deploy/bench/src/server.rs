@@ -76,7 +76,7 @@ impl Server {
         let process = subprocess::start("replay-server", &args, &wire.endpoint, &sets, folder)?;
         let keys = Keys::new(DEFAULT_NAMESPACE).map_err(anyhow::Error::msg)?;
         let session = wire.open(&keys, Role::Observer)?;
-        let run_info = join::run_info(&session, &keys, &Shutdown::default())?
+        let run_info = join::fetch_run_info(&session, &keys, &Shutdown::default())?
             .context("this client was not told to stop")?;
         Ok(Self {
             process,
@@ -179,7 +179,7 @@ impl Server {
         let client = RunClient::new(session, self.keys.clone(), self.actor.spec.hash());
         let alive = client.declare_alive(who);
         let alive = alive.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))?;
-        join::take_part(&client, join, &Shutdown::default())?
+        join::join(&client, join, &Shutdown::default())?
             .context("this client was not told to stop")?;
         Ok((client, alive))
     }
@@ -205,7 +205,7 @@ impl Wire {
             Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?),
             _ => None,
         };
-        let to = Endpoints::to(vec![self.endpoint.clone()]);
+        let to = Endpoints::connect_to(vec![self.endpoint.clone()]);
         let opened = session::open_as(&to, keys, credentials.as_ref(), MESSAGE_BYTES_MAX);
         Ok(opened?)
     }

@@ -80,7 +80,7 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
         let is_used = match endpoint.split_once('/') {
             Some(("tcp", address)) => is_taken(TcpListener::bind(address)),
             Some(("quic", address)) => is_taken(UdpSocket::bind(address)),
-            _ => reach::look(endpoint).is_ok(),
+            _ => reach::check_listening(endpoint).is_ok(),
         };
         if is_used {
             return Err(usage!(
@@ -99,7 +99,7 @@ pub fn wait_until_listening(
     mut check_alive: impl FnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<bool> {
     let deadline = Instant::now() + LISTEN_MAX;
-    while let Err(e) = reach::look(endpoint) {
+    while let Err(e) = reach::check_listening(endpoint) {
         check_alive()?;
         if Instant::now() > deadline {
             return Err(e).context("waiting for the replay server");

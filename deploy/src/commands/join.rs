@@ -67,7 +67,7 @@ pub(super) fn prepare_join<T>(
 ) -> anyhow::Result<T> {
     Keys::new(&flags.namespace).map_err(Usage)?;
     if flags.exit_with_parent.is_none() {
-        session::sweep_shared_memory();
+        session::remove_orphaned_shared_memory();
     }
     listen(flags.exit_with_parent).context("listening for signals")
 }

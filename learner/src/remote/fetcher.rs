@@ -381,7 +381,7 @@ impl Fetcher {
         let (reply, payload) = pending.receive(&self.shared.pool).inspect_err(|e| {
             let is_lost = matches!(
                 e,
-                SessionError::NoReply { .. } | SessionError::NoAnswerer { .. }
+                SessionError::TimedOut { .. } | SessionError::NoResponder { .. }
             );
             if shared_memory && is_lost {
                 self.trust.record_loss();

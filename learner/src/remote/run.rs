@@ -178,7 +178,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     }
     if is_run_over {
         let (updates, who) = (learner.updates(), Participant::Learner(learner_id));
-        reporter::say_finished(&clients, who, updates, shutdown);
+        reporter::report_finished(&clients, who, updates, shutdown);
     }
     drop(membership);
     let closed = shards.close();

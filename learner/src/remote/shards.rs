@@ -46,13 +46,13 @@ impl Shards {
         let mut sessions = Vec::new();
         let mut run_infos = Vec::new();
         for endpoint in connect {
-            let endpoints = Endpoints::to(vec![endpoint.clone()]);
+            let endpoints = Endpoints::connect_to(vec![endpoint.clone()]);
             let max = session::MESSAGE_BYTES_MAX;
             let opened = session::open_unless(shutdown, endpoints, keys, credentials, max)?;
             let Some(session) = opened else {
                 return Ok(None);
             };
-            let Some(run_info) = join::run_info(&session, keys, shutdown)? else {
+            let Some(run_info) = join::fetch_run_info(&session, keys, shutdown)? else {
                 return Ok(None);
             };
             sessions.push(session);
@@ -102,7 +102,7 @@ impl Shards {
                 other_shards: counts.other_shards(shard),
                 restart,
             };
-            let joined = join::take_part(client, &join, shutdown)?;
+            let joined = join::join(client, &join, shutdown)?;
             let Some(welcome) = joined else {
                 return Ok(None);
             };

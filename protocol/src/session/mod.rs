@@ -1,14 +1,14 @@
 //! Opens a zenoh session for large, acknowledged messages, over which processes ask and answer.
 //! Sessions do not scout, gossip or mesh: one process listens, and the others connect and reconnect.
 
-mod questions;
+mod requests;
 
 use std::{sync::Arc, time::Duration};
 
 use zenoh::{Session, Wait};
 
-pub(crate) use questions::{PendingBytes, put_off, send};
-pub use questions::{SessionError, answer, ask};
+pub(crate) use requests::{PendingBytes, reply_error, send};
+pub use requests::{SessionError, answer, ask};
 
 use crate::{
     process::shutdown::Shutdown,
@@ -27,17 +27,17 @@ pub struct Endpoints {
 }
 
 /// The part of zenoh's error message that says that it could connect to no endpoint.
-const NOTHING_LISTENS: &str = "Unable to connect to any of";
+const NO_LISTENER_TEXT: &str = "Unable to connect to any of";
 
 /// How long sending one message may take before its link is closed. This is less than the 10 s time-outs of chunks, batches and weights, so
 /// a frozen or vanished peer loses its link before others time out. Once the peer recovers, it reconnects and retries. A message must be
 /// small enough: 3 MB need 3 Mbit/s.
-const STALLED_MAX: Duration = Duration::from_secs(8);
+const SEND_TIMEOUT: Duration = Duration::from_secs(8);
 /// How long a client waits for a listener. A replay server first waits for shared memory while other processes allocate theirs.
-const START_MAX: Duration = Duration::from_secs(30);
+const LISTENER_WAIT_MAX: Duration = Duration::from_secs(30);
 const CONNECT_MAX: Duration = Duration::from_secs(10);
 /// How long the first attempt to connect may take. After it, the client checks whether a foreign server listens.
-const UNDERSTOOD_MAX: Duration = Duration::from_millis(2500);
+const FIRST_CONNECT_MAX: Duration = Duration::from_millis(2500);
 /// Longest message accepted from a peer, bytes, before a process knows the sizes of its run.
 pub const MESSAGE_BYTES_MAX: usize = 1 << 29;
 /// Longest message accepted by a process that only receives settings, status and pieces of weights, bytes.
@@ -48,7 +48,7 @@ pub const SMALL_MESSAGE_BYTES_MAX: usize = 1 << 22;
 /// # Errors
 /// An endpoint cannot be listened on, or nothing listens at a client's endpoints within half a minute.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
-    open_with(endpoints, MESSAGE_BYTES_MAX, &[])
+    open_with_settings(endpoints, MESSAGE_BYTES_MAX, &[])
 }
 
 /// Like [`open`], with `credentials` if there are any: endpoints are then `quic/HOST:PORT` or unix sockets, and a replay server grants each
@@ -61,7 +61,7 @@ pub fn open_as(
     message_bytes_max: usize,
 ) -> Result<Session, SessionError> {
     let Some(credentials) = credentials else {
-        return open_with(endpoints, message_bytes_max, &[]);
+        return open_with_settings(endpoints, message_bytes_max, &[]);
     };
     credentials.warn_if_it_expires_soon();
     let mut settings = vec![
@@ -72,9 +72,9 @@ pub fn open_as(
         ),
     ];
     if credentials.role == Role::ReplayServer {
-        settings.push(("access_control", tls::rules(keys)));
+        settings.push(("access_control", tls::access_rules(keys)));
     }
-    open_with(endpoints, message_bytes_max, &settings)
+    open_with_settings(endpoints, message_bytes_max, &settings)
 }
 
 /// Like [`open_as`], for a process that waits for its replay server; returns `None` if `shutdown` is set first.
@@ -90,18 +90,18 @@ pub fn open_unless(
     let open = move || open_as(&endpoints, &keys, credentials.as_deref(), message_bytes_max);
     match shutdown.unless_set("connecting", open) {
         Ok(opened) => opened.transpose(),
-        Err(e) => Err(failed.not_opened(&format!("starting a thread: {e}"))),
+        Err(e) => Err(failed.open_error(&format!("starting a thread: {e}"))),
     }
 }
 
 impl Endpoints {
     /// Creates endpoints to connect to, and none to listen on.
-    pub fn to(connect: Vec<String>) -> Self {
+    pub fn connect_to(connect: Vec<String>) -> Self {
         let listen = Vec::new();
         Self { listen, connect }
     }
 
-    fn not_opened(&self, why: &str) -> SessionError {
+    fn open_error(&self, why: &str) -> SessionError {
         let Self { listen, connect } = self;
         SessionError::Failed(format!(
             "opening a zenoh session (listen {listen:?}, connect {connect:?}): {why}"
@@ -114,16 +114,16 @@ pub fn is_quic(endpoint: &str) -> bool {
     endpoint.starts_with("quic/")
 }
 
-fn open_with(
+fn open_with_settings(
     endpoints: &Endpoints,
     message_bytes_max: usize,
     more: &[(&str, String)],
 ) -> Result<Session, SessionError> {
     // zenoh appends the place in its sources where it failed; this cuts it off.
-    let fail = |why: String| endpoints.not_opened(why.split(" at /").next().unwrap_or_default());
+    let fail = |why: String| endpoints.open_error(why.split(" at /").next().unwrap_or_default());
     let router = !endpoints.listen.is_empty();
     let max = message_bytes_max.to_string();
-    let stalled_us = STALLED_MAX.as_micros().to_string();
+    let send_timeout_us = SEND_TIMEOUT.as_micros().to_string();
     let settings: &[(&str, &str)] = &[
         ("mode", if router { "\"router\"" } else { "\"client\"" }),
         ("listen/endpoints", &format!("{:?}", endpoints.listen)),
@@ -147,7 +147,7 @@ fn open_with(
         ("transport/link/tx/queue/size/data", "16"),
         (
             "transport/link/tx/queue/congestion_control/block/wait_before_close",
-            &stalled_us,
+            &send_timeout_us,
         ),
         ("transport/link/rx/max_message_size", &max),
         ("transport/link/rx/buffer_size", "4194304"),
@@ -157,7 +157,7 @@ fn open_with(
             "false",
         ),
     ];
-    let open_within = |shared_memory: &str, connect_ms: &str| {
+    let open_once = |shared_memory: &str, connect_ms: &str| {
         let mut config = zenoh::Config::default();
         let more = more.iter().map(|(key, value)| (*key, value.as_str()));
         let last = [
@@ -172,20 +172,20 @@ fn open_with(
         zenoh::open(config).wait().map_err(|e| e.to_string())
     };
     let open = |connect_ms: &str| {
-        open_within("true", connect_ms).or_else(|why| {
+        open_once("true", connect_ms).or_else(|why| {
             // Without shared memory, there would still be no listener.
-            if why.contains(NOTHING_LISTENS) {
+            if why.contains(NO_LISTENER_TEXT) {
                 return Err(why);
             }
             tracing::debug!("trying again without shared memory: {why}");
-            open_within("false", connect_ms)
+            open_once("false", connect_ms)
         })
     };
     if router {
         return open("-1").map_err(fail);
     }
-    reach::wait_for_any(&endpoints.connect, START_MAX)?;
-    let not_driml = |what: &str| {
+    reach::wait_for_any(&endpoints.connect, LISTENER_WAIT_MAX)?;
+    let foreign_server_error = |what: &str| {
         let connect = endpoints.connect.join(", ");
         SessionError::Failed(match endpoints.connect.iter().any(|it| is_quic(it)) {
             // zenoh does not tell a missing listener from a rejected certificate; its log on the rejecting side does.
@@ -200,19 +200,19 @@ fn open_with(
         })
     };
     let milliseconds = |it: Duration| it.as_millis().to_string();
-    let why = match open(&milliseconds(UNDERSTOOD_MAX)) {
-        Err(why) if why.contains(NOTHING_LISTENS) => why,
+    let why = match open(&milliseconds(FIRST_CONNECT_MAX)) {
+        Err(why) if why.contains(NO_LISTENER_TEXT) => why,
         opened => return opened.map_err(fail),
     };
     // A process of the run that is slow on a busy machine sends nothing; a foreign server may introduce itself.
     let mut listening = endpoints.connect.iter();
-    if let Some(words) = listening.find_map(|it| reach::what_listens(it)) {
-        return Err(not_driml(&format!("it says {words:?}")));
+    if let Some(words) = listening.find_map(|it| reach::read_greeting(it)) {
+        return Err(foreign_server_error(&format!("it says {words:?}")));
     }
     tracing::debug!("trying again: {why}");
-    open(&milliseconds(CONNECT_MAX.saturating_sub(UNDERSTOOD_MAX))).map_err(|why| {
-        match why.contains(NOTHING_LISTENS) {
-            true => not_driml("it says nothing that could be understood"),
+    open(&milliseconds(CONNECT_MAX.saturating_sub(FIRST_CONNECT_MAX))).map_err(|why| {
+        match why.contains(NO_LISTENER_TEXT) {
+            true => foreign_server_error("it says nothing that could be understood"),
             false => fail(why),
         }
     })
@@ -220,6 +220,6 @@ fn open_with(
 
 /// Removes the shared memory of processes that ended without doing so, such as killed ones, and keeps that of running processes. The
 /// launcher and processes started by hand call this, so that not each of many processes scans for it at once.
-pub fn sweep_shared_memory() {
+pub fn remove_orphaned_shared_memory() {
     zenoh::shm::cleanup_orphaned_shm_segments();
 }

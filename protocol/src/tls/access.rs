@@ -178,7 +178,7 @@ impl Lists {
 }
 
 /// Returns zenoh's whole `access_control`, JSON5, for the replay server of the run with these keys.
-pub(crate) fn rules(keys: &Keys) -> String {
+pub(crate) fn access_rules(keys: &Keys) -> String {
     let mut lists = Lists::default();
     let actors = (0..ACTORS_MAX).map(Role::Actor);
     for role in actors.chain([Role::Learner, Role::Observer]) {
@@ -225,7 +225,7 @@ mod tests {
     #[test]
     fn zenoh_takes_the_rules() {
         let mut config = zenoh::Config::default();
-        let rules = rules(&Keys::new("a/b").unwrap());
+        let rules = access_rules(&Keys::new("a/b").unwrap());
         config.insert_json5("access_control", &rules).unwrap();
     }
 }

@@ -11,6 +11,6 @@
 mod access;
 mod credentials;
 
-pub(crate) use access::rules;
+pub(crate) use access::access_rules;
 pub use access::{ACTORS_MAX, Role};
 pub use credentials::{Credentials, TlsError, authority_path};

@@ -73,7 +73,7 @@ impl Replay {
                 "the system does not grant the {bytes} bytes that this takes; hold fewer"
             );
             let key = "replay.capacity_transitions";
-            ConfigError::of(key, config.capacity_transitions, why)
+            ConfigError::new(key, config.capacity_transitions, why)
         };
         let frames = FrameStore::new(config.compression, capacity, spec.frame_bytes(), bytes_max)
             .map_err(not_granted)?;

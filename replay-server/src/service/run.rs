@@ -172,7 +172,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
-        announcements: client.announce().map_err(declare_error)?,
+        announcements: client.declare_announcer().map_err(declare_error)?,
         shutdown: shutdown.clone(),
     });
     let (subscriber, members) = watch_members(&client, &service)
@@ -307,7 +307,7 @@ impl<'a> Queries<'a> {
         let (gate, spec_hash) = (self.gate.clone(), self.client.spec_hash());
         let answer = move |incoming: Incoming<R>| match gate.service.get() {
             Some(service) => answer(service, incoming),
-            None => incoming.into_responder().put_off(&gate.recovering_reply()),
+            None => incoming.into_responder().retry_later(&gate.recovering_reply()),
         };
         let workers = QueryWorkers::start(name, threads, spec_hash, answer)?;
         let gate = self.gate.clone();

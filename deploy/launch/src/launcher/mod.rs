@@ -80,7 +80,7 @@ pub fn run(
     write_atomically(&run_dir.rendezvous(), rendezvous_path)?;
     let display = Display::new(config.frames(), Instant::now(), resume_point.updates);
     // Frees the shared memory that killed processes left behind.
-    session::sweep_shared_memory();
+    session::remove_orphaned_shared_memory();
     let shared_memory = config.transport.shared_memory && {
         let settings = Settings::parse(&config.to_toml())?;
         let needed = shared_memory_bytes(&settings, config.replay.shards)?;
@@ -107,7 +107,7 @@ pub fn run(
 
     let watched = launch.start_and_watch();
     let result = launch.stop_all(watched);
-    session::sweep_shared_memory();
+    session::remove_orphaned_shared_memory();
     crate::shared_memory::remove_own_segments();
     launch.display.screen.clear();
     let outcome = result.as_ref().map_or(Outcome::Failed, |outcome| *outcome);

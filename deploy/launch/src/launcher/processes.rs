@@ -204,7 +204,7 @@ impl Launch<'_> {
             self.display.screen.print_line(&format!(
                 "{report}\n{name} is started again{with_replay} ({restarts} of {max} times in a run)"
             ));
-            session::sweep_shared_memory();
+            session::remove_orphaned_shared_memory();
             self.processes[number] = self.start(number)?;
         }
         Ok(())

@@ -63,9 +63,9 @@ impl Poller {
         let mut servers = Vec::new();
         let mut config: Option<RunConfig> = None;
         for endpoint in endpoints {
-            let server = Endpoints::to(vec![endpoint.clone()]);
+            let server = Endpoints::connect_to(vec![endpoint.clone()]);
             // An observer does not wait for a server that does not listen yet.
-            reach::look(endpoint)?;
+            reach::check_listening(endpoint)?;
             let session = session::open_as(&server, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
             let served = fetch_settings(&session, &keys, endpoint, namespace)?;
             let hash = served.run.hash();
@@ -154,7 +154,7 @@ impl Poller {
 impl ServerConnection {
     /// Connects to a server that `driml train` has started at `endpoint`, of the run with this hash.
     pub fn open(name: &str, endpoint: &str, spec_hash: u64) -> anyhow::Result<Self> {
-        let session = session::open(&Endpoints::to(vec![endpoint.to_owned()]))?;
+        let session = session::open(&Endpoints::connect_to(vec![endpoint.to_owned()]))?;
         let keys = Keys::new(DEFAULT_NAMESPACE).map_err(Usage)?;
         Ok(Self {
             name: name.to_owned(),
@@ -182,7 +182,7 @@ impl ServerConnection {
                     &e,
                     SessionError::Unreadable { why, .. } if matches!(why, CodecError::RunSpec { .. })
                 );
-                answer.is_gone = reach::look(&self.endpoint).is_err();
+                answer.is_gone = reach::check_listening(&self.endpoint).is_err();
                 answer.error = Some(e.to_string());
             }
         }
@@ -197,13 +197,13 @@ fn fetch_settings(
     endpoint: &str,
     namespace: &str,
 ) -> anyhow::Result<RunConfig> {
-    let config_toml = match join::run_info_within(session, keys, ANSWER_MAX) {
+    let config_toml = match join::fetch_run_info_once(session, keys, ANSWER_MAX) {
         Ok(run_info) => run_info.config_toml,
         Err(SessionError::Recovering(recovering)) => recovering.config_toml,
         Err(SessionError::Unreadable { why, .. }) => {
             return Err(why).context(format!("the run info of the replay server on {endpoint}"));
         }
-        Err(SessionError::NoAnswerer { .. }) => {
+        Err(SessionError::NoResponder { .. }) => {
             bail!(usage!(
                 "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}"
             ));

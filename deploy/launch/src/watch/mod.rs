@@ -239,7 +239,7 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<St
     let config = read_config(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints()).unwrap_or_default();
     let mut lines = endpoints.lines();
-    if lines.any(|it| reach::look(it).is_ok()) {
+    if lines.any(|it| reach::check_listening(it).is_ok()) {
         return Ok(Ok(endpoints.lines().map(str::to_owned).collect()));
     }
     let run = folder.display();

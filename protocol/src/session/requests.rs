@@ -26,9 +26,9 @@ pub enum SessionError {
     #[error(transparent)]
     Tls(#[from] TlsError),
     #[error("{key}: no process answers there")]
-    NoAnswerer { key: String },
+    NoResponder { key: String },
     #[error("{key}: no answer within {within_ms} ms")]
-    NoReply { key: String, within_ms: u128 },
+    TimedOut { key: String, within_ms: u128 },
     /// The replay server runs, but still reads its replay back from disk. It answers afterwards, so a caller may wait without a limit.
     #[error("{0}")]
     Recovering(Recovering),
@@ -40,7 +40,7 @@ pub enum SessionError {
 }
 
 /// zenoh's error reply if no process replies in time.
-const TIMED_OUT: &str = "Timeout";
+const TIMEOUT_TEXT: &str = "Timeout";
 
 #[derive(Debug)]
 pub(crate) struct PendingBytes {
@@ -118,7 +118,7 @@ impl PendingBytes {
     ) -> Result<Option<T>, SessionError> {
         let key = || self.key.clone();
         let Some(reply) = reply else {
-            let none = || SessionError::NoAnswerer { key: key() };
+            let none = || SessionError::NoResponder { key: key() };
             return Err(self.failed.take().unwrap_or_else(none));
         };
         let failed = match reply.into_result() {
@@ -132,7 +132,7 @@ impl PendingBytes {
                 }
                 let why = e.payload().try_to_string().unwrap_or_default().into_owned();
                 match why.as_str() {
-                    TIMED_OUT => SessionError::NoReply {
+                    TIMEOUT_TEXT => SessionError::TimedOut {
                         key: key(),
                         within_ms: self.timeout.as_millis(),
                     },
@@ -164,7 +164,7 @@ pub fn answer(query: &Query, payload: ZBytes) {
 }
 
 /// Answers `query` with the error `payload`, because it cannot be handled now. The requester retries.
-pub(crate) fn put_off(query: &Query, payload: ZBytes) {
+pub(crate) fn reply_error(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply_err(payload).wait() {
         tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
     }
