@@ -114,7 +114,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         let (settings, pool) = (settings.clone(), pool.clone());
         let build =
             move || Collector::new(&settings, pool, incarnation, version, &first.safetensors);
-        shutdown.unless_set("environments", build)?
+        shutdown.run_unless_set("environments", build)?
     };
     let Some(collector) = built else {
         return Ok(false);

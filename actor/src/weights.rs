@@ -122,20 +122,20 @@ pub(crate) fn wait_for_first(
     wait_max: Duration,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Option<Weights>> {
-    let mut silence = Silence::with_tries_of(PIECE_TIMEOUT);
+    let mut silence = Silence::with_try_timeout(PIECE_TIMEOUT);
     let mut log_limiter = LogLimiter::default();
     loop {
         let pulled = pull(client, 0);
         let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
         if let Some(SessionError::Recovering(recovering)) = error {
-            silence.answered();
-            if recovering.progress.is_slow() && log_limiter.due().is_some() {
+            silence.record_answer();
+            if recovering.progress.is_slow() && log_limiter.admit().is_some() {
                 tracing::info!("waiting for weights for as long as it takes: {recovering}");
             }
         }
         match pulled {
             Ok(Some(weights)) => return Ok(Some(weights)),
-            pulled if silence.unanswered() > wait_max => {
+            pulled if silence.record_failure() > wait_max => {
                 let message = format!(
                     "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
                 );
@@ -147,7 +147,7 @@ pub(crate) fn wait_for_first(
             Err(e) => tracing::debug!("no weights yet: {e}"),
             Ok(None) => {}
         }
-        if silence.length() > UNLOGGED_WAIT_MAX && log_limiter.due().is_some() {
+        if silence.length() > UNLOGGED_WAIT_MAX && log_limiter.admit().is_some() {
             tracing::info!("waiting for the learner's first weights");
         }
         if shutdown.wait_timeout(RETRY_PAUSE) {

@@ -88,19 +88,19 @@ impl ServerWait {
         let e = match e {
             SessionError::Unreadable { why, .. } => return Err(why.into()),
             SessionError::Recovering(recovering) => {
-                self.silence.answered();
-                if recovering.progress.is_slow() && self.recovery_log.due().is_some() {
+                self.silence.record_answer();
+                if recovering.progress.is_slow() && self.recovery_log.admit().is_some() {
                     tracing::info!("waiting for as long as it takes: {recovering}");
                 }
                 return Ok(());
             }
             e => e,
         };
-        let since = self.silence.unanswered();
+        let since = self.silence.record_failure();
         if since > SERVER_WAIT_MAX {
             return Err(JoinError::NoReplayServer { last: e });
         }
-        if since > QUIET_WAIT_MAX && self.silence_log.due().is_some() {
+        if since > QUIET_WAIT_MAX && self.silence_log.admit().is_some() {
             let (since, max) = (since.as_secs(), SERVER_WAIT_MAX.as_secs());
             // The listener may be a router to which the replay server has not connected yet.
             let why = match e {
@@ -137,7 +137,7 @@ pub fn join(
             }
             Ok(JoinReply::Taken { why }) => match &mut predecessor {
                 Some(silence) => {
-                    if silence.unanswered() > PREDECESSOR_WAIT_MAX {
+                    if silence.record_failure() > PREDECESSOR_WAIT_MAX {
                         let seconds = PREDECESSOR_WAIT_MAX.as_secs();
                         let why = format!("{why}, and has not ended within {seconds} s");
                         return Err(JoinError::Refused(why));

@@ -40,9 +40,9 @@ fn send_until_acked(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdow
     let mut silence = Silence::default();
     while let Err(e) = send() {
         if matches!(e, SessionError::Recovering(_)) {
-            silence.answered();
+            silence.record_answer();
         }
-        if silence.unanswered() > FINISHED_RETRY_MAX {
+        if silence.record_failure() > FINISHED_RETRY_MAX {
             tracing::warn!("a replay server does not know that the run is finished: {e}; stop it");
             return;
         }

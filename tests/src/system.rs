@@ -192,7 +192,7 @@ impl TestSystem {
         let updates = self.pause_at_updates.load(Ordering::Relaxed);
         if updates != NEVER {
             let go = self.path(GO_FILE);
-            command.env(fail_point::HOLD, format!("{updates} {}", go.display()));
+            command.env(fail_point::HOLD_VAR, format!("{updates} {}", go.display()));
         }
         command
     }

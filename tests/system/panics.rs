@@ -36,7 +36,7 @@ fn check_panic_ends_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
     let ended = system.run(&format!(
         "env '{}={point}' DRIML local --agent driml-ada {LONG} {flags} --run-dir run",
-        fail_point::VARIABLE
+        fail_point::PANIC_VAR
     ));
     let contains = |line: &str, words: &str| {
         assert!(line.contains(words), "{point}: {words:?} in {ended:#?}");
@@ -57,7 +57,7 @@ fn check_panic_ends_run((process, point, flags): (&str, &str, &str)) {
     contains(line, " panicked at ");
     contains(
         line,
-        &format!(": {}={point}; this is a fault", fail_point::VARIABLE),
+        &format!(": {}={point}; this is a fault", fail_point::PANIC_VAR),
     );
     let killed = "was killed by signal 6 SIGABRT";
     if process.is_empty() {

@@ -83,7 +83,7 @@ impl DeliveryWorker {
             state,
             outgoing: VecDeque::new(),
             window: 1,
-            silence: Silence::with_tries_of(limits.ack_timeout),
+            silence: Silence::with_try_timeout(limits.ack_timeout),
             held_since: None,
             draining_since: None,
             retry_log: LogLimiter::default(),
@@ -140,7 +140,7 @@ impl DeliveryWorker {
             let Some(chunk) = next else { break };
             if self.outgoing.is_empty() {
                 // The time without chunks does not count as silence of the replay server.
-                self.silence.answered();
+                self.silence.record_answer();
             }
             let header = chunk.header;
             let payload = chunk.into_payload();
@@ -176,7 +176,7 @@ impl DeliveryWorker {
             return Ok(self.prepare_resend());
         };
         if reply.is_ok() {
-            self.silence.answered();
+            self.silence.record_answer();
         }
         match reply {
             Ok(InsertReply::Stored {
@@ -219,8 +219,8 @@ impl DeliveryWorker {
                 "the replay server refused a chunk: {why}"
             ))),
             Err(SessionError::Recovering(recovering)) => {
-                self.silence.answered();
-                if let Some(suppressed) = self.retry_log.due() {
+                self.silence.record_answer();
+                if let Some(suppressed) = self.retry_log.admit() {
                     tracing::warn!("chunk {sequence} waits: {recovering}{suppressed}");
                 }
                 // A poll of a few bytes instead of the same chunks again and again: its reply says when chunks are wanted.
@@ -231,10 +231,10 @@ impl DeliveryWorker {
             }
             Err(e) => {
                 let within = self.limits.unreachable_max;
-                if self.silence.unanswered() > within {
+                if self.silence.record_failure() > within {
                     return Err(DeliveryError::Unreachable { within, source: e });
                 }
-                if let Some(suppressed) = self.retry_log.due() {
+                if let Some(suppressed) = self.retry_log.admit() {
                     tracing::warn!("chunk {sequence} will be sent again: {e}{suppressed}");
                 }
                 // A chunk without a reply may not have arrived, whatever an earlier reply said.
@@ -275,7 +275,7 @@ impl DeliveryWorker {
         }
         let seconds = since.elapsed().as_secs();
         if seconds >= 10
-            && let Some(suppressed) = self.wait_log.due()
+            && let Some(suppressed) = self.wait_log.admit()
         {
             tracing::info!(
                 "waiting for the learner, which is behind by the replay ratio: a chunk has waited {seconds} s{suppressed}"

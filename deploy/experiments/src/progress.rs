@@ -65,7 +65,7 @@ impl Progress {
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.count(units);
         self.show();
-        if self.shutdown.ending.is_set() {
+        if self.shutdown.drain.is_set() {
             self.clear();
             return Err(Interrupted);
         }
@@ -76,7 +76,7 @@ impl Progress {
         self.screen.print_line(line);
     }
 
-    /// The shutdown flags: `ending` is set by the first Ctrl-C or signal, `now` by the second.
+    /// The shutdown flags: `drain` is set by the first Ctrl-C or signal, `immediate` by the second.
     pub(crate) const fn shutdown(&self) -> &GracefulShutdown {
         &self.shutdown
     }

@@ -208,7 +208,7 @@ impl<S: Subscriber> Layer<S> for LastWarning {
                     text = format!("{value:?}");
                 }
             });
-            last_warning::note(text);
+            last_warning::set(text);
         }
     }
 }

@@ -208,13 +208,13 @@ impl RunView {
         self.is_learner_answering = learner.is_some();
         if let Some(learner) = learner {
             self.learner = learner;
-            self.learner_silence.answered();
+            self.learner_silence.record_answer();
             if !std::mem::replace(&mut self.is_learner_known, true) {
                 // The learner had done its updates before this first answer, so they say nothing about its speed.
                 self.rates = Rates::default();
             }
         } else {
-            self.learner_silence.unanswered();
+            self.learner_silence.record_failure();
         }
         // A resumed run has the updates of its checkpoint even before its learner has answered.
         self.learner.updates = self.learner.updates.max(self.after_updates.unwrap_or(0));
@@ -224,7 +224,7 @@ impl RunView {
     pub(crate) fn set_replay(&mut self, shards: Vec<ReplayStatus>) {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
-        self.replay_silence.answered();
+        self.replay_silence.record_answer();
         self.episodes = Episodes::new(self.replay.episodes, self.replay.returns.newest.iter());
         self.k = Spread::of_k(&self.replay);
         (self.recorded_s, self.rss_mib) = (None, Vec::new());

@@ -55,7 +55,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         let checked = config.replay.check_in_memory("--replay-dir DIR");
         checked.map_err(|e| usage!("{e}"))?;
     }
-    let GracefulShutdown { ending, now } = prepare_join(&args.join, GracefulShutdown::on_signals)?;
+    let shutdown = prepare_join(&args.join, GracefulShutdown::on_signals)?;
     config.notes.iter().for_each(|it| tracing::warn!("{it}"));
     open_files::warn_if_limit_low(&config);
     let run = driml_replay_server::RunArgs {
@@ -67,8 +67,8 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
         keep_alive: args.lifetime.keep_alive,
-        drain: ending,
+        drain: ending: shutdown.drain,
         config_toml: config.to_toml(),
     };
-    clean_up_after(driml_replay_server::run(run, &now))
+    clean_up_after(driml_replay_server::run(run, &shutdown.immediate))
 }

@@ -26,7 +26,7 @@ const OLD_SUFFIX: &str = ".replaced.tmp";
 pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
     let path = folder.join(LOCK_FILE);
-    let lock = lock_file::create(&path, "let no other learner save there");
+    let lock = lock_file::acquire(&path, "let no other learner save there");
     let lock = lock.map_err(io_error("create", &path))?;
     lock.ok_or_else(|| CheckpointError::InUse(folder.to_owned()))
 }

@@ -165,19 +165,19 @@ impl Fetcher {
             fail_point::reach("batches");
             let fetched = match self.fetch() {
                 Ok(None) => {
-                    silence.answered();
+                    silence.record_answer();
                     continue;
                 }
                 Ok(Some(fetched)) => fetched,
                 Err(e) => {
                     if e.is_recovering() {
-                        silence.answered();
+                        silence.record_answer();
                     }
                     let unreachable_max = self.shared.requests.unreachable_max;
-                    if silence.unanswered() <= unreachable_max {
+                    if silence.record_failure() <= unreachable_max {
                         // At a shutdown the server may be gone already.
                         if !self.shared.shutdown.is_set()
-                            && let Some(more) = self.log_limiter.due()
+                            && let Some(more) = self.log_limiter.admit()
                         {
                             tracing::warn!("asking for a batch again: {e}{more}");
                         }
@@ -202,7 +202,7 @@ impl Fetcher {
             if sender.send(fetched).is_err() || is_last {
                 return;
             }
-            silence.answered();
+            silence.record_answer();
         }
     }
 
@@ -302,13 +302,13 @@ impl Fetcher {
             let batch = Batch::merge(&partial.parts, memory);
             partial.parts.clear();
             let parts = std::mem::take(&mut partial.sources);
-            partial.since_last_batch.answered();
+            partial.since_last_batch.record_answer();
             return Ok(Some(Message::Batch(Box::new(ServedBatch { batch, parts }))));
         }
         self.fetch_counts(&mut partial, |_, _| true)?;
         // Once a part has come, a shard that reports the end may have been told outdated counts of the other shards.
         let is_over = finished && partial.parts.is_empty();
-        let waited = partial.since_last_batch.unanswered();
+        let waited = partial.since_last_batch.record_failure();
         if !is_over && partial.all_stored && waited > LAST_BATCH_MAX {
             let left = partial.shards.iter().enumerate();
             let left = left.filter(|(_, state)| state.pending_rows > 0);

@@ -238,7 +238,7 @@ impl OutboxSender {
                     arrived = false;
                     break;
                 }
-                if let Some(more) = self.log_limiter.due() {
+                if let Some(more) = self.log_limiter.admit() {
                     tracing::warn!("the {} did not arrive, trying again: {e}{more}", self.what);
                 }
             }

@@ -216,14 +216,14 @@ impl PartialBatch {
     pub(super) fn set_stored(&mut self, all_stored: bool) {
         if all_stored && !self.all_stored {
             self.all_stored = true;
-            self.since_last_batch.answered();
+            self.since_last_batch.record_answer();
         }
     }
 
     /// Records why a shard does not send its part yet. It knows the others' counts: if it warms up, it lost its replay and refills it.
     pub(super) fn record_waiting(&mut self, waiting: Waiting) {
         if matches!(waiting, Waiting::WarmUp { .. }) {
-            self.since_last_batch.answered();
+            self.since_last_batch.record_answer();
         }
     }
 
@@ -351,7 +351,7 @@ mod tests {
     fn the_last_batch_is_waited_for_from_when_it_can_come() {
         let mut batch = batch_of(&[]);
         let mut restarts = |record: fn(&mut PartialBatch)| {
-            while batch.since_last_batch.unanswered().is_zero() {}
+            while batch.since_last_batch.record_failure().is_zero() {}
             record(&mut batch);
             batch.since_last_batch.length().is_zero()
         };

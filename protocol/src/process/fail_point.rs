@@ -5,7 +5,7 @@
 use std::{env, path::Path, sync::OnceLock, thread::sleep, time::Duration};
 
 /// The variable that names the point at which to panic.
-pub const VARIABLE: &str = "DRIML_TEST_PANIC";
+pub const PANIC_VAR: &str = "DRIML_TEST_PANIC";
 
 /// In a debug build, panics if `DRIML_TEST_PANIC` names this point; else does nothing.
 ///
@@ -16,13 +16,13 @@ pub const VARIABLE: &str = "DRIML_TEST_PANIC";
 pub fn reach(name: &str) {
     static WANTED: OnceLock<Option<String>> = OnceLock::new();
     if cfg!(debug_assertions) {
-        let wanted = WANTED.get_or_init(|| env::var(VARIABLE).ok());
-        assert!(wanted.as_deref() != Some(name), "{VARIABLE}={name}");
+        let wanted = WANTED.get_or_init(|| env::var(PANIC_VAR).ok());
+        assert!(wanted.as_deref() != Some(name), "{PANIC_VAR}={name}");
     }
 }
 
 /// The variable that gives the number of updates after which to wait, and the file to wait for.
-pub const HOLD: &str = "DRIML_TEST_HOLD";
+pub const HOLD_VAR: &str = "DRIML_TEST_HOLD";
 
 /// In a debug build, waits for the file in `DRIML_TEST_HOLD` once `updates` has reached the number there; else does nothing.
 ///
@@ -31,7 +31,7 @@ pub const HOLD: &str = "DRIML_TEST_HOLD";
 pub fn hold(updates: u64) {
     static WANTED: OnceLock<Option<(u64, String)>> = OnceLock::new();
     let read = || {
-        let text = env::var(HOLD).ok()?;
+        let text = env::var(HOLD_VAR).ok()?;
         let (count, file) = text.split_once(' ')?;
         Some((count.parse().ok()?, file.to_owned()))
     };

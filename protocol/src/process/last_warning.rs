@@ -11,7 +11,7 @@ use super::lock;
 static LAST: Mutex<Option<(String, Instant)>> = Mutex::new(None);
 
 /// Stores a warning in place of the previous one.
-pub fn note(text: String) {
+pub fn set(text: String) {
     *lock(&LAST) = Some((text, Instant::now()));
 }
 

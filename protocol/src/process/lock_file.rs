@@ -13,7 +13,7 @@ use std::{
 ///
 /// # Errors
 /// The file cannot be created; the error names no path.
-pub fn create(path: &Path, advice: &str) -> io::Result<Option<File>> {
+pub fn acquire(path: &Path, advice: &str) -> io::Result<Option<File>> {
     let file = File::create(path)?;
     match try_lock(&file) {
         Ok(true) => Ok(Some(file)),
@@ -42,14 +42,14 @@ mod tests {
     fn a_file_is_locked_once_until_its_last_holder_lets_go() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(".lock");
-        let lock = create(&path, "").unwrap().unwrap();
-        assert!(create(&path, "").unwrap().is_none());
+        let lock = acquire(&path, "").unwrap().unwrap();
+        assert!(acquire(&path, "").unwrap().is_none());
         assert!(!try_lock(&File::open(&path).unwrap()).unwrap());
         let copy = lock.try_clone().unwrap();
         drop(lock);
-        assert!(create(&path, "").unwrap().is_none());
+        assert!(acquire(&path, "").unwrap().is_none());
         drop(copy);
-        assert!(create(&path, "").unwrap().is_some());
-        assert!(create(&folder.path().join("nowhere/.lock"), "").is_err());
+        assert!(acquire(&path, "").unwrap().is_some());
+        assert!(acquire(&folder.path().join("nowhere/.lock"), "").is_err());
     }
 }

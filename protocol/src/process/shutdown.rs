@@ -10,13 +10,13 @@ use std::{
 
 use super::{
     fail_point, lock,
-    termination::{self, EndSign},
+    termination::{self, ExitReason},
 };
 
 /// How often a thread that also waits for something else checks the flag.
 const TICK: Duration = Duration::from_millis(50);
 /// Signals closer together count as one request to exit: tools such as `timeout` signal the process and its group.
-const ONE_WISH: Duration = Duration::from_millis(300);
+const SAME_REQUEST_MAX: Duration = Duration::from_millis(300);
 
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]
@@ -50,21 +50,21 @@ impl Shutdown {
     }
 
     /// Runs `work` on a thread of this `name` and returns its result; `None` if the flag is raised first. The thread then runs unattended.
-    pub fn unless_set<T: Send + 'static>(
+    pub fn run_unless_set<T: Send + 'static>(
         &self,
         name: &'static str,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> std::io::Result<Option<T>> {
-        let (tell, told) = mpsc::channel();
+        let (sender, receiver) = mpsc::channel();
         let thread = std::thread::Builder::new().name(name.into());
         thread.spawn(move || {
             fail_point::reach(name);
             // The receiver is gone if the flag was raised meanwhile.
-            let _ = tell.send(work());
+            let _ = sender.send(work());
         })?;
         loop {
-            match told.recv_timeout(TICK) {
-                Ok(given) => return Ok(Some(given)),
+            match receiver.recv_timeout(TICK) {
+                Ok(result) => return Ok(Some(result)),
                 // A thread that panics sends nothing; the panic ends the process.
                 Err(_) if self.is_set() => return Ok(None),
                 Err(_) => {}
@@ -74,7 +74,7 @@ impl Shutdown {
 
     /// A flag that is raised at the first reason to exit: a signal, a closed terminal or stderr, or the death of the process `parent`.
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
-        GracefulShutdown::on_signals(parent).map(|steps| steps.ending)
+        GracefulShutdown::on_signals(parent).map(|flags| flags.drain)
     }
 }
 
@@ -82,49 +82,46 @@ impl Shutdown {
 #[derive(Clone, Debug, Default)]
 pub struct GracefulShutdown {
     /// Raised when the process should exit as soon as the others have left.
-    pub ending: Shutdown,
+    pub drain: Shutdown,
     /// Raised when the process should exit without waiting for the others.
-    pub now: Shutdown,
+    pub immediate: Shutdown,
 }
 
 impl GracefulShutdown {
-    /// Raises `ending` at any reason to exit, and `now` at SIGINT and SIGTERM, or without a `parent` at any reason. With a parent, its
-    /// death, SIGHUP and a closed stderr raise only `ending`, because the other processes then exit too.
+    /// Raises `drain` at any reason to exit, and `immediate` at SIGINT and SIGTERM, or without a `parent` at any reason. With a parent, its
+    /// death, SIGHUP and a closed stderr raise only `drain`, because the other processes then exit too.
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
-        let steps = Self::default();
-        let raised = steps.clone();
-        termination::listen("signals", parent, move |sign| {
-            raised.ending.set();
-            if sign == EndSign::Abandoned && parent.is_some() {
+        let flags = Self::default();
+        let raised = flags.clone();
+        termination::watch("signals", parent, move |reason| {
+            raised.drain.set();
+            if reason == ExitReason::Abandoned && parent.is_some() {
                 return ControlFlow::Continue(());
             }
-            raised.now.set();
+            raised.immediate.set();
             ControlFlow::Break(())
         })?;
-        Ok(steps)
+        Ok(flags)
     }
 
-    /// Raises `ending` at any reason to exit, and `now` when SIGINT or SIGTERM arrives later.
+    /// Raises `drain` at any reason to exit, and `immediate` when SIGINT or SIGTERM arrives later.
     pub fn on_repeated_signals(parent: Option<u32>) -> std::io::Result<Self> {
-        let steps = Self::default();
-        let (raised, mut first) = (steps.clone(), None);
-        termination::listen("interrupts", parent, move |sign| {
-            raised.note(sign, &mut first, Instant::now());
+        let flags = Self::default();
+        let (raised, mut first) = (flags.clone(), None);
+        termination::watch("interrupts", parent, move |reason| {
+            raised.handle_reason(reason, &mut first, Instant::now());
             ControlFlow::Continue(())
         })?;
-        Ok(steps)
+        Ok(flags)
     }
 
-    /// Handles a sign received at `now`. `first` is the time of the first sign.
-    fn note(&self, sign: EndSign, first: &mut Option<Instant>, now: Instant) {
-        match *first {
-            None => {
-                *first = Some(now);
-                self.ending.set();
-            }
-            // A closed terminal causes SIGHUP and then other signs, but no user there asks for a faster exit.
-            Some(first) if sign == EndSign::Asked && now - first > ONE_WISH => self.now.set(),
-            Some(_) => {}
+    /// Handles a reason that came up at `now`. `first` is the time of the first one.
+    fn handle_reason(&self, reason: ExitReason, first: &mut Option<Instant>, now: Instant) {
+        let first = *first.get_or_insert(now);
+        self.drain.set();
+        // A closed terminal causes SIGHUP and then other reasons, but no user there asks for a faster exit.
+        if reason == ExitReason::Request && now - first > SAME_REQUEST_MAX {
+            self.immediate.set();
         }
     }
 }
@@ -162,40 +159,40 @@ mod tests {
     #[test]
     fn work_that_takes_too_long_is_left_when_the_flag_is_raised() {
         let shutdown = Shutdown::default();
-        assert_eq!(shutdown.unless_set("work", || 5).unwrap(), Some(5));
+        assert_eq!(shutdown.run_unless_set("work", || 5).unwrap(), Some(5));
         let (until, released) = mpsc::channel::<()>();
         let raised = shutdown.clone();
         let work = move || {
             raised.set();
             released.recv()
         };
-        assert_eq!(shutdown.unless_set("work", work).unwrap(), None);
+        assert_eq!(shutdown.run_unless_set("work", work).unwrap(), None);
         drop(until);
     }
 
     #[test]
     fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
-        for signs in [
-            // Seconds, the sign, and whether both flags are raised then.
+        for reasons in [
+            // Seconds, the reason, and whether both flags are raised then.
             &[
-                (0.0, EndSign::Abandoned, false),
-                (5.0, EndSign::Abandoned, false),
-                (5.0, EndSign::Asked, true),
+                (0.0, ExitReason::Abandoned, false),
+                (5.0, ExitReason::Abandoned, false),
+                (5.0, ExitReason::Request, true),
             ][..],
             // The time counts from the first signal.
             &[
-                (0.0, EndSign::Asked, false),
-                (0.299, EndSign::Asked, false),
-                (0.31, EndSign::Asked, true),
+                (0.0, ExitReason::Request, false),
+                (0.299, ExitReason::Request, false),
+                (0.31, ExitReason::Request, true),
             ],
         ] {
-            let (steps, start, mut first) = (GracefulShutdown::default(), Instant::now(), None);
-            assert!(!steps.ending.is_set());
-            for &(seconds, sign, is_second) in signs {
+            let (flags, start, mut first) = (GracefulShutdown::default(), Instant::now(), None);
+            assert!(!flags.drain.is_set());
+            for &(seconds, reason, is_second) in reasons {
                 let at = start + Duration::from_secs_f64(seconds);
-                steps.note(sign, &mut first, at);
-                assert!(steps.ending.is_set());
-                assert_eq!(steps.now.is_set(), is_second, "{seconds} s");
+                flags.handle_reason(reason, &mut first, at);
+                assert!(flags.drain.is_set());
+                assert_eq!(flags.immediate.is_set(), is_second, "{seconds} s");
             }
         }
     }

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 /// The longest time between two failed attempts that counts, besides one attempt's time-out: a running process retries sooner.
-const LOOK_MAX: Duration = Duration::from_secs(15);
+const GAP_MAX: Duration = Duration::from_secs(15);
 
 /// The time for which another process has not answered.
 ///
@@ -13,40 +13,40 @@ const LOOK_MAX: Duration = Duration::from_secs(15);
 #[derive(Clone, Copy, Debug)]
 pub struct Silence {
     length: Duration,
-    looked: Instant,
-    look_max: Duration,
+    last_attempt: Instant,
+    gap_max: Duration,
 }
 
 /// A silence that begins now, for attempts with a time-out of at most 10 s.
 impl Default for Silence {
     fn default() -> Self {
-        Self::with_tries_of(Duration::ZERO)
+        Self::with_try_timeout(Duration::ZERO)
     }
 }
 
 impl Silence {
-    /// A silence that begins now, for attempts with a time-out of at most `try_max`.
-    pub fn with_tries_of(try_max: Duration) -> Self {
+    /// A silence that begins now, for attempts with a time-out of at most `try_timeout`.
+    pub fn with_try_timeout(try_timeout: Duration) -> Self {
         Self {
             length: Duration::ZERO,
-            looked: Instant::now(),
-            look_max: LOOK_MAX + try_max,
+            last_attempt: Instant::now(),
+            gap_max: GAP_MAX + try_timeout,
         }
     }
 
     /// Records an answer: the silence begins again.
-    pub fn answered(&mut self) {
-        (self.length, self.looked) = (Duration::ZERO, Instant::now());
+    pub fn record_answer(&mut self) {
+        (self.length, self.last_attempt) = (Duration::ZERO, Instant::now());
     }
 
     /// Records that an attempt just failed; returns the length of the silence.
-    pub fn unanswered(&mut self) -> Duration {
-        self.unanswered_at(Instant::now())
+    pub fn record_failure(&mut self) -> Duration {
+        self.failure_at(Instant::now())
     }
 
-    fn unanswered_at(&mut self, now: Instant) -> Duration {
-        self.length += (now - self.looked).min(self.look_max);
-        self.looked = now;
+    fn failure_at(&mut self, now: Instant) -> Duration {
+        self.length += (now - self.last_attempt).min(self.gap_max);
+        self.last_attempt = now;
         self.length
     }
 
@@ -63,13 +63,13 @@ mod tests {
     #[test]
     fn of_the_time_in_which_this_process_was_stopped_little_counts() {
         for (try_s, lengths) in [(0, [10, 20, 35, 46]), (120, [10, 20, 155, 166])] {
-            let mut silence = Silence::with_tries_of(Duration::from_secs(try_s));
-            let begin = silence.looked;
+            let mut silence = Silence::with_try_timeout(Duration::from_secs(try_s));
+            let begin = silence.last_attempt;
             for (now, length) in [10, 20, 500, 511].into_iter().zip(lengths) {
                 let now = begin + Duration::from_secs(now);
-                assert_eq!(silence.unanswered_at(now).as_secs(), length, "at {now:?}");
+                assert_eq!(silence.failure_at(now).as_secs(), length, "at {now:?}");
             }
-            silence.answered();
+            silence.record_answer();
             assert_eq!(silence.length(), Duration::ZERO);
         }
     }

@@ -1,5 +1,5 @@
 //! Watches for reasons to exit, as long as the process runs: a signal, a closed terminal or stderr, a dead parent.
-//! The caller decides whether a sign means to drain or to exit at once.
+//! The caller decides whether a reason means to drain or to exit at once.
 
 use std::{
     fs,
@@ -10,32 +10,32 @@ use std::{
 
 use nix::{
     poll::{PollFd, PollFlags, PollTimeout, poll},
-    sys::signal::Signal as Number,
+    sys::signal::Signal as SignalNumber,
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::fail_point;
 
 /// How often a process checks whether its parent and the reader of stderr still exist.
-const LOOK: Duration = Duration::from_millis(500);
+const CHECK_PERIOD: Duration = Duration::from_millis(500);
 
 /// A reason for a process to exit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum EndSign {
+pub(super) enum ExitReason {
     /// A request: SIGINT (Ctrl-C) or SIGTERM.
-    Asked,
+    Request,
     /// The terminal was closed (SIGHUP), the reader of stderr exited, or the parent died.
     Abandoned,
 }
 
-/// Calls `on_sign` at each sign, on a thread of this `name`, until `on_sign` breaks or the process exits. `parent` is the number of the
-/// process whose death is a sign, even if it died before this call.
+/// Calls `on_reason` at each reason, on a thread of this `name`, until it breaks or the process exits. `parent` is the number of the
+/// process whose death is a reason, even if it died before this call.
 ///
 /// SIGHUP stays ignored if it is ignored at the start, as under `nohup`.
-pub(super) fn listen(
+pub(super) fn watch(
     name: &'static str,
     parent: Option<u32>,
-    mut on_sign: impl FnMut(EndSign) -> ControlFlow<()> + Send + 'static,
+    mut on_reason: impl FnMut(ExitReason) -> ControlFlow<()> + Send + 'static,
 ) -> std::io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -44,48 +44,48 @@ pub(super) fn listen(
         let _inside = runtime.enter();
         // With a handler, a file at its size limit (`ulimit -f`) causes a write error, like a full disk; without one, this signal kills the
         // process. The handler stays after the drop.
-        drop(signal(SignalKind::from_raw(Number::SIGXFSZ as i32))?);
+        drop(signal(SignalKind::from_raw(SignalNumber::SIGXFSZ as i32))?);
         (
             signal(SignalKind::interrupt())?,
             signal(SignalKind::terminate())?,
             // `None` if the kernel's table shows that the signal was ignored before this process started.
-            match is_set("SigIgn:", Number::SIGHUP as u32 - 1) {
+            match is_bit_set("SigIgn:", SignalNumber::SIGHUP as u32 - 1) {
                 true => None,
                 false => Some(signal(SignalKind::hangup())?),
             },
         )
     };
-    let listening = async move {
-        let mut look = tokio::time::interval(LOOK);
+    let watching = async move {
+        let mut check = tokio::time::interval(CHECK_PERIOD);
         let mut abandoned = false;
         loop {
             fail_point::reach(name);
-            let sign = tokio::select! {
-                _ = interrupt.recv() => EndSign::Asked,
-                _ = terminate.recv() => EndSign::Asked,
-                () = received(&mut hangup) => EndSign::Abandoned,
+            let reason = tokio::select! {
+                _ = interrupt.recv() => ExitReason::Request,
+                _ = terminate.recv() => ExitReason::Request,
+                () = wait_for_signal(&mut hangup) => ExitReason::Abandoned,
                 // Reported once, because the state does not change back.
-                _ = look.tick(), if !abandoned => {
-                    abandoned = is_gone(std::io::stderr()) || parent.is_some_and(|pid| parent_id() != pid);
+                _ = check.tick(), if !abandoned => {
+                    abandoned = has_lost_reader(std::io::stderr()) || parent.is_some_and(|pid| parent_id() != pid);
                     if !abandoned {
                         continue;
                     }
-                    EndSign::Abandoned
+                    ExitReason::Abandoned
                 }
             };
-            if on_sign(sign).is_break() {
+            if on_reason(reason).is_break() {
                 return;
             }
         }
     };
     std::thread::Builder::new()
         .name(name.into())
-        .spawn(move || runtime.block_on(listening))?;
+        .spawn(move || runtime.block_on(watching))?;
     Ok(())
 }
 
 /// Waits for the signal; without one, never returns.
-async fn received(signal: &mut Option<Signal>) {
+async fn wait_for_signal(signal: &mut Option<Signal>) {
     match signal {
         Some(signal) => {
             signal.recv().await;
@@ -95,12 +95,12 @@ async fn received(signal: &mut Option<Signal>) {
 }
 
 /// Whether a bit is set in one of this process's signal or capability masks, named as in `/proc/PID/status`.
-pub(crate) fn is_set(mask: &str, bit: u32) -> bool {
+pub(crate) fn is_bit_set(mask: &str, bit: u32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
-    is_set_in(&status, mask, bit)
+    is_bit_set_in(&status, mask, bit)
 }
 
-fn is_set_in(status: &str, mask: &str, bit: u32) -> bool {
+fn is_bit_set_in(status: &str, mask: &str, bit: u32) -> bool {
     let bits = status.lines().find_map(|line| line.strip_prefix(mask));
     let bits = bits.and_then(|bits| u64::from_str_radix(bits.trim(), 16).ok());
     bits.is_some_and(|bits| bits >> bit & 1 == 1)
@@ -108,7 +108,7 @@ fn is_set_in(status: &str, mask: &str, bit: u32) -> bool {
 
 /// Whether an output has lost its reader: the pipe's reader exited, or the terminal was closed. A file that cannot be written does not
 /// count.
-fn is_gone(output: impl AsFd) -> bool {
+fn has_lost_reader(output: impl AsFd) -> bool {
     let mut output = [PollFd::new(output.as_fd(), PollFlags::empty())];
     let found = poll(&mut output, PollTimeout::ZERO);
     let events = output[0].revents().unwrap_or(PollFlags::empty());
@@ -123,18 +123,18 @@ mod tests {
     #[test]
     fn a_pipe_is_gone_with_its_reader() {
         let (reader, writer) = std::io::pipe().unwrap();
-        assert!(!is_gone(&writer));
+        assert!(!has_lost_reader(&writer));
         drop(reader);
-        assert!(is_gone(&writer));
-        assert!(!is_gone(tempfile::tempfile().unwrap()));
-        assert!(!is_gone(fs::File::open("/dev/null").unwrap()));
+        assert!(has_lost_reader(&writer));
+        assert!(!has_lost_reader(tempfile::tempfile().unwrap()));
+        assert!(!has_lost_reader(fs::File::open("/dev/null").unwrap()));
     }
 
     #[test]
     fn the_kernels_table_says_which_bits_are_set() {
         let status = "Name:\tx\nCapPrm:\t0000000000004000\nCapEff:\t000001ff00000001\n";
-        let set = (0..64).filter(|&bit| is_set_in(status, "CapEff:", bit));
+        let set = (0..64).filter(|&bit| is_bit_set_in(status, "CapEff:", bit));
         assert!(set.eq([0_u32].into_iter().chain(32..41)));
-        assert!(!is_set_in(status, "SigIgn:", 0));
+        assert!(!is_bit_set_in(status, "SigIgn:", 0));
     }
 }

@@ -11,7 +11,7 @@ use nix::sys::{
     statvfs::statvfs,
 };
 
-use crate::process::{lock_file, termination::is_set};
+use crate::process::{lock_file, termination::is_bit_set};
 
 /// The folder in which the operating system keeps memory that processes of one host share.
 pub const FOLDER: &str = "/dev/shm";
@@ -166,7 +166,7 @@ pub fn check_lockable(bytes: usize) -> Result<(), String> {
 
 /// Returns the bytes that this process may lock; `None` if there is no limit. Raises the soft limit to the hard one.
 pub fn lockable_bytes() -> Option<u64> {
-    if is_set("CapEff:", CAP_IPC_LOCK) {
+    if is_bit_set("CapEff:", CAP_IPC_LOCK) {
         return None;
     }
     // A system without this limit reports an error when memory is locked.

@@ -90,7 +90,7 @@ impl LogFolder {
     pub(super) fn open(path: &Path) -> Result<Self, PersistError> {
         fs::create_dir_all(path).map_err(io_error("making", path))?;
         let lock = path.join(".lock");
-        let lock = lock_file::create(&lock, "start no other replay server there")
+        let lock = lock_file::acquire(&lock, "start no other replay server there")
             .map_err(io_error("locking", &lock))?
             .ok_or_else(|| PersistError::InUse(path.to_owned()))?;
         Ok(Self {

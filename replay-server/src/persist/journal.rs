@@ -223,7 +223,7 @@ impl Journal {
             why: String::new(),
         });
         write_failure.why = e.to_string();
-        if let Some(more) = self.log_limiter.due() {
+        if let Some(more) = self.log_limiter.admit() {
             tracing::error!(
                 "the replay's log in {} cannot be written: {e}; nothing more is stored until it can: make room or make it writable{more}",
                 self.folder.path.display()
@@ -290,7 +290,7 @@ impl Journal {
 
     fn record_rotation_failure(&mut self, e: &io::Error) {
         self.rotate_failed_at = Some(Instant::now());
-        if let Some(more) = self.log_limiter.due() {
+        if let Some(more) = self.log_limiter.admit() {
             tracing::error!(
                 "no new file can be begun in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
                  writable{more}",

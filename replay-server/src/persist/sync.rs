@@ -173,7 +173,7 @@ fn flush_periodically(flusher: &Flusher, stop: &Shutdown, period: Duration) {
     while !stop.wait_timeout(period) {
         fail_point::reach("replay-fsync");
         if let Err(e) = flusher.flush()
-            && let Some(more) = log_limiter.due()
+            && let Some(more) = log_limiter.admit()
         {
             tracing::error!(
                 "the replay's log was not flushed, a power cut may lose what was stored since: {e}{more}"

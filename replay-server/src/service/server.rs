@@ -133,7 +133,7 @@ impl State {
 
     /// Logs a line of this kind, or only counts it if one was logged recently.
     pub(super) fn warn_limited(&mut self, kind: &'static str, line: &str) {
-        if let Some(more) = self.log_limiters.entry(kind).or_default().due() {
+        if let Some(more) = self.log_limiters.entry(kind).or_default().admit() {
             tracing::warn!("{line}{more}");
         }
     }

@@ -337,7 +337,7 @@ impl Queue {
         }
         let deadline = Instant::now() + DRAIN_MAX;
         while !self.running.is_empty() {
-            if progress.shutdown().now.is_set() || Instant::now() > deadline {
+            if progress.shutdown().immediate.is_set() || Instant::now() > deadline {
                 for running in &mut self.running {
                     // The child may have exited by itself in the meantime.
                     let _ = running.child.kill();

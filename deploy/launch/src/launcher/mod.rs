@@ -115,7 +115,7 @@ pub fn run(
     // An interrupted or failed run does not wait for the last evaluation.
     if outcome == Outcome::Finished {
         let evaluator = &mut launch.evaluator;
-        evaluator.finish(&launch.display.screen, &|| launch.shutdown.ending.is_set());
+        evaluator.finish(&launch.display.screen, &|| launch.shutdown.drain.is_set());
     }
     // All processes have exited, so these files are of no use. If they stay behind, the released locks show that.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
@@ -144,7 +144,7 @@ pub fn run(
         )
     })?;
     if outcome == Outcome::Finished {
-        let is_stopped = || launch.shutdown.ending.is_set();
+        let is_stopped = || launch.shutdown.drain.is_set();
         last_play::play(&mut summary, config, run_dir, &is_stopped);
     }
     resume::print_next_steps(&summary, &config.world, run_dir)
@@ -160,7 +160,7 @@ impl Launch<'_> {
         for (name, endpoint) in self.names.iter().zip(&self.endpoints) {
             let servers = &mut self.processes;
             let mut check_alive = || servers.iter_mut().try_for_each(ManagedProcess::check_alive);
-            if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
+            if !wait_until_listening(endpoint, &self.shutdown.drain, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
             let connection = ServerConnection::open(name, endpoint, hash);
@@ -183,7 +183,7 @@ impl Launch<'_> {
     fn watch(&mut self) -> anyhow::Result<Outcome> {
         let (mut standstill, mut counts_before) = (Silence::default(), (0, 0));
         loop {
-            if self.shutdown.ending.wait_timeout(POLL) {
+            if self.shutdown.drain.wait_timeout(POLL) {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_intact()?;
@@ -221,9 +221,9 @@ impl Launch<'_> {
             let counts = (view.replay.transitions_inserted, view.learner.updates);
             // While a replay server reads its replay back from disk, the other processes wait for it.
             if counts != counts_before || view.recovering().next().is_some() {
-                standstill.answered();
+                standstill.record_answer();
                 counts_before = counts;
-            } else if standstill.unanswered() > STALL_MAX {
+            } else if standstill.record_failure() > STALL_MAX {
                 bail!(
                     "no frame and no update for {}, at {} frames and {} updates ({}): see {}",
                     duration(STALL_MAX),
@@ -241,14 +241,14 @@ impl Launch<'_> {
     fn stop_all(&mut self, watched: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
         let failed = watched.as_ref().err().map(|e| format!("{e:#}"));
         // A signal that interrupts this process may reach the others first; their exit then counts as an interruption.
-        let watched = match self.shutdown.ending.is_set() {
+        let watched = match self.shutdown.drain.is_set() {
             false => watched,
             true => watched.or(Ok(Outcome::Interrupted)),
         };
         if matches!(watched, Ok(Outcome::Interrupted)) {
             self.display.screen.print_line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
         }
-        let now = self.shutdown.now.clone();
+        let now = self.shutdown.immediate.clone();
         let abort = move || now.is_set();
         let finished = matches!(watched, Ok(Outcome::Finished));
         // After a failure, the learner will hardly use what the actors still hold.

@@ -39,9 +39,9 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
-    let GracefulShutdown { ending, now } = shutdown.context("listening for signals")?;
-    let is_stopped = || ending.is_set();
-    exit_on_second_interrupt(now)?;
+    let GracefulShutdown { drain, immediate } = shutdown.context("listening for signals")?;
+    let is_stopped = || drain.is_set();
+    exit_on_second_interrupt(immediate)?;
     let mut schedule = EvaluationSchedule::new(config, run_dir)?;
     let events = config.local.tensorboard;
     let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed, events)?;

@@ -163,7 +163,7 @@ impl RunFolder {
     pub fn lock(&self) -> anyhow::Result<File> {
         let path = self.lock_file();
         let doing = || format!("locking {}", path.display());
-        let lock = lock_file::create(&path, "start no other run there").with_context(doing)?;
+        let lock = lock_file::acquire(&path, "start no other run there").with_context(doing)?;
         let folder = self.display();
         lock.ok_or_else(|| {
             usage!("the run in {folder} is still running: stop it first, or wait").into()

@@ -99,13 +99,13 @@ impl Poller {
         let shards: Option<Vec<_>> = servers.iter().map(|it| it.replay.clone()).collect();
         match shards {
             Some(shards) => view.set_replay(shards),
-            None => _ = view.replay_silence.unanswered(),
+            None => _ = view.replay_silence.record_failure(),
         }
         view.servers = servers;
         if view.recovering().next().is_some() {
             // The server is alive, but no other process can be asked through it.
-            view.replay_silence.answered();
-            view.learner_silence.answered();
+            view.replay_silence.record_answer();
+            view.learner_silence.record_answer();
         }
         view
     }

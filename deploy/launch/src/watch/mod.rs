@@ -138,7 +138,7 @@ fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Resu
         if is_another_run || view.replay_silence.length() > silent_max {
             bail!("{}", actions_needed(view).join("; "));
         }
-        if limiter.due().is_some() {
+        if limiter.admit().is_some() {
             for (server, progress) in view.recovering() {
                 console::eprintln(&describe_recovery(&server.name, progress));
             }

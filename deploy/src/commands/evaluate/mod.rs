@@ -109,7 +109,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         let shutdown = shutdown.context("listening for signals")?;
         let episodes = args.episodes;
         let play = move || evaluate_and_keep(&folder, choice, episodes, &|| false);
-        let ranked = shutdown.unless_set("evaluation", play);
+        let ranked = shutdown.run_unless_set("evaluation", play);
         let ranked = ranked.context("starting a thread")?.ok_or(Interrupted)??;
         let evaluation = ranked.evaluation.describe();
         return print(&format!("{evaluation}{}\n", compare_with_best(&ranked)));
