@@ -108,7 +108,7 @@ impl ChunkRecorder {
         let chunk = self.chunk.get_or_insert_with(|| {
             let bytes = header.payload_bytes();
             let bytes = bytes.expect("an actor's chunk is far below the address space");
-            Chunk::in_memory(header, pool.take(bytes))
+            Chunk::with_buffer(header, pool.take(bytes))
         });
         let frame_bytes = header.frame_bytes as usize;
         for (env, frame) in frames.chunks_exact(frame_bytes).enumerate() {

@@ -9,8 +9,8 @@ use std::{
 
 use anyhow::anyhow;
 use driml_protocol::{
-    Assembly, BufferPool, CodecError, LogLimiter, PIECE_BYTES, PendingReply, RunClient, Shutdown,
-    Silence, Weights, WeightsReply, WeightsRequest, WeightsVersion, fail_point, lock,
+    BufferPool, CodecError, LogLimiter, PIECE_BYTES, PendingReply, RunClient, Shutdown, Silence,
+    Weights, WeightsAssembly, WeightsReply, WeightsRequest, WeightsVersion, fail_point, lock,
     session::SessionError,
 };
 
@@ -217,15 +217,15 @@ fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
     else {
         return Ok(None);
     };
-    let mut assembly = Assembly::new(weights, bytes)?;
-    assembly.take(weights, offset, &piece)?;
+    let mut assembly = WeightsAssembly::new(weights, bytes)?;
+    assembly.push(weights, offset, &piece)?;
     let offsets = (assembly.next_offset()..assembly.bytes()).step_by(PIECE_BYTES);
     let mut requests = offsets.map(|offset| WeightsRequest::Piece {
         version: weights.version,
         offset,
     });
     let mut pending = VecDeque::new();
-    while !assembly.is_whole() {
+    while !assembly.is_complete() {
         while pending.len() < PIECES_IN_FLIGHT_MAX
             && let Some(request) = requests.next()
         {
@@ -242,7 +242,7 @@ fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
         else {
             return Err(error("were replaced too often while they were pulled"));
         };
-        assembly.take(weights, offset, &piece)?;
+        assembly.push(weights, offset, &piece)?;
     }
     Ok(Some(assembly.finish()?))
 }

@@ -44,20 +44,20 @@ pub use messages::{
     batch::{Batch, BatchStatesMut, NO_ACTION, RowScalars},
     batch_frames::StackedFrames,
     batch_header::{BatchHeader, BatchReply, NotReady, POOL_BATCHES},
-    batch_request::{BatchRequest, Learned, RequestId, ShardCounts},
+    batch_request::{BatchRequest, LearnerProgress, RequestId, ShardCounts},
     chunk::{Chunk, ChunkHeader, ChunkPoll, End, InsertReply, TRANSITION_BYTES, transitions_max},
-    episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Played},
+    episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Totals},
     join::{ActorJoin, JoinReply, LearnerJoin, Leave, RunInfo, Welcome},
     priorities::{Origin, PriorityPart, PriorityUpdate},
     recovering::{Recovering, RecoveryProgress},
     report::{
         LogStatus, Participant, ProcessStatus, ProcessesStatus, Report, WARNINGS_MAX, Warning,
     },
-    status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
+    status::{LearnerStatus, Quantiles, RETURNS_MAX, ReplayStatus, Returns, Waiting},
     table::{Ack, Kind},
     weights::{
-        Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
-        WeightsVersion,
+        PIECE_BYTES, Weights, WeightsAssembly, WeightsHeader, WeightsReply, WeightsRequest,
+        WeightsUpload, WeightsVersion,
     },
 };
 pub use process::{

@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// Version of the fields of [`RunSpec`], for their hash. The protocol version may change while checkpoints stay valid.
-const FIELDS: u16 = 1;
+const FIELDS_VERSION: u16 = 1;
 
 /// Most positives that a row can carry; a rule that needs more is rejected.
 const POSITIVES_MAX: usize = 32;
@@ -135,9 +135,9 @@ impl RunSpec {
         self.frame_bytes() * self.frame_stack as usize
     }
 
-    /// The hash that is in every message and checkpoint of this run: the first 8 bytes of the SHA-256 of `FIELDS` and the fields.
+    /// The hash that is in every message and checkpoint of this run: the first 8 bytes of the SHA-256 of `FIELDS_VERSION` and the fields.
     pub fn hash(&self) -> u64 {
-        let bytes = codec::encode_value(&(FIELDS, self))
+        let bytes = codec::encode_value(&(FIELDS_VERSION, self))
             .expect("a run spec is a few short fields, far below the limit");
         let digest = Sha256::digest(&bytes);
         u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))

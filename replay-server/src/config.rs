@@ -238,8 +238,8 @@ pub(crate) fn rows_max(spec: &RunSpec, sampling: &Sampling) -> u32 {
     // Counts each state with its full frame stack, as a receiver may expand the states to that.
     let header = BatchHeader {
         stacked: None,
-        ..BatchHeader::of(spec, 1)
+        ..BatchHeader::largest(spec, 1)
     };
-    let row_bytes = header.sampled_by(sampling).payload_bytes();
+    let row_bytes = header.with_sampling(sampling).payload_bytes();
     u32::try_from(PAYLOAD_BYTES_MAX / row_bytes).unwrap_or(u32::MAX)
 }

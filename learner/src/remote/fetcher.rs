@@ -11,9 +11,9 @@ use std::{
 };
 
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, BufferPool, Learned, LogLimiter, NotReady, PendingReply,
-    ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting, fail_point, lock,
-    session::SessionError, shared_memory::Trust,
+    Batch, BatchReply, BatchRequest, BufferPool, LearnerProgress, LogLimiter, NotReady,
+    PendingReply, ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting,
+    fail_point, lock, session::SessionError, shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -77,8 +77,8 @@ impl Counters {
         Self::new(0, &counts)
     }
 
-    fn learned(&self, shard: usize) -> Learned {
-        Learned {
+    fn learned(&self, shard: usize) -> LearnerProgress {
+        LearnerProgress {
             updates: self.updates.load(Ordering::Acquire),
             saved_updates: self.saved_updates.load(Ordering::Acquire),
             rows_received: self.rows_received[shard].load(Ordering::Acquire),
@@ -211,7 +211,7 @@ impl Fetcher {
         if self.shared.clients.len() > 1 {
             return self.fetch_from_shards();
         }
-        self.request_id = self.request_id.again();
+        self.request_id = self.request_id.retry();
         let pending = self.send_request(0, self.request_id, self.shared.requests.rows, None)?;
         let reply = self.receive_reply(pending)?;
         self.request_id = self.request_id.next();
@@ -258,7 +258,7 @@ impl Fetcher {
             let others = partial.other_shards(shard);
             let state = &mut partial.shards[shard];
             if state.pending_rows > 0 {
-                state.id = state.id.again();
+                state.id = state.id.retry();
                 let reply = self.send_request(shard, state.id, state.pending_rows, Some(others))?;
                 pending_replies.push((shard, reply));
             }

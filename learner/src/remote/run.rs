@@ -78,7 +78,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         shared_memory: config.transport.shared_memory,
         unreachable_max: Duration::from_millis(config.learner.unreachable_max_ms),
     };
-    let batch = BatchHeader::of(&config.spec, rows).sampled_by(&config.sampling);
+    let batch = BatchHeader::largest(&config.spec, rows).with_sampling(&config.sampling);
     let session_bytes = shared_memory::process_bytes(batch.pool_bytes());
     if requests.shared_memory
         && let Err(why) = shared_memory::check_lockable(session_bytes * shards.sessions.len())

@@ -101,12 +101,12 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
         state_bytes: STATE as u32,
         held: 9,
         weights_versions: (1, 1),
-        ..BatchHeader::of(&config.spec, 6).sampled_by(&config.sampling)
+        ..BatchHeader::largest(&config.spec, 6).with_sampling(&config.sampling)
     };
-    let mut batch = WireBatch::of_rows(header, &rows, Buffer::zeroed);
+    let mut batch = WireBatch::from_rows(header, &rows, Buffer::zeroed);
     let mut places = batch.states_mut();
     for row in 0..6 {
-        for number in places.of_row(row).collect::<Vec<_>>() {
+        for number in places.row_states(row).collect::<Vec<_>>() {
             rng.fill(places.frame(number));
         }
     }

@@ -32,14 +32,14 @@ pub struct Batch {
 
 impl Batch {
     /// Creates a batch of `rows`, whose states the caller then writes with [`Batch::states_mut`]. The counts of rows and states come from
-    /// `rows`, the count of frames from `header`. `memory` returns a buffer of the given bytes, with arbitrary content.
+    /// `rows`, the count of frames from `header`. `allocate` returns a buffer of the given bytes, with arbitrary content.
     ///
     /// # Panics
     /// If the memory is of another size, or a row has more positives than the header.
-    pub fn of_rows(
+    pub fn from_rows(
         header: BatchHeader,
         rows: &[RowScalars],
-        memory: impl FnOnce(usize) -> Buffer,
+        allocate: impl FnOnce(usize) -> Buffer,
     ) -> Self {
         let header = BatchHeader {
             rows: rows.len() as u32,
@@ -50,25 +50,25 @@ impl Batch {
         let positives = header.positives;
         let fits = rows.iter().all(|row| row.positives <= positives);
         assert!(fits, "a row has at most P positives");
-        let mut batch = Self::in_memory(header, memory(header.payload_bytes()));
+        let mut batch = Self::with_buffer(header, allocate(header.payload_bytes()));
         let returns = rows.iter().map(|row| row.n_step_return.to_le_bytes());
-        batch.fill(Column::NStepReturn, returns);
+        batch.fill_column(Column::NStepReturn, returns);
         let discounts = rows.iter().map(|row| row.bootstrap_discount.to_le_bytes());
-        batch.fill(Column::BootstrapDiscount, discounts);
-        batch.fill(Column::Action, rows.iter().map(|row| [row.action]));
-        batch.fill(Column::NextAction, rows.iter().map(|row| [row.next_action]));
+        batch.fill_column(Column::BootstrapDiscount, discounts);
+        batch.fill_column(Column::Action, rows.iter().map(|row| [row.action]));
+        batch.fill_column(Column::NextAction, rows.iter().map(|row| [row.next_action]));
         // The k of each positive [P, B], if the row has it.
         let k = |p: u32, row: &RowScalars| (p < row.positives).then_some(row.k_first + p);
         let ks = (0..positives).flat_map(|p| rows.iter().map(move |row| k(p, row)));
         let valid = ks.clone().map(|k| [u8::from(k.is_some())]);
-        batch.fill(Column::PositiveValid, valid);
+        batch.fill_column(Column::PositiveValid, valid);
         let capped = |k: Option<u32>| [k.map_or(0, |k| u8::try_from(k).unwrap_or(u8::MAX))];
-        batch.fill(Column::K, ks.map(capped));
+        batch.fill_column(Column::K, ks.map(capped));
         batch
     }
 
     /// Writes the values of a column of neither states nor frames.
-    fn fill<const BYTES: usize>(
+    fn fill_column<const BYTES: usize>(
         &mut self,
         column: Column,
         mut values: impl Iterator<Item = [u8; BYTES]>,
@@ -81,7 +81,7 @@ impl Batch {
     }
 
     /// Creates a batch in memory with arbitrary content.
-    fn in_memory(header: BatchHeader, payload: Buffer) -> Self {
+    fn with_buffer(header: BatchHeader, payload: Buffer) -> Self {
         assert_eq!(payload.len(), header.payload_bytes(), "memory for a batch");
         Self {
             header,
@@ -97,10 +97,10 @@ impl Batch {
     /// If the parts have no common header, or the memory is of another size.
     pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
-        let mut merged = Self::in_memory(header, memory);
+        let mut merged = Self::with_buffer(header, memory);
         for (column, _) in header.columns() {
             let mut to = &mut merged.payload[header.range(column)];
-            let pieces: Vec<_> = parts.iter().map(|part| part.pieces(column)).collect();
+            let pieces: Vec<_> = parts.iter().map(|part| part.split_column(column)).collect();
             // For each positive, the rows of all parts are adjacent.
             for piece in 0..pieces[0].len() {
                 let mut frames_before = 0;
@@ -110,8 +110,8 @@ impl Batch {
                     let place = place.expect("the parts fill the column");
                     place.copy_from_slice(from);
                     if let Some(stacked) = part.header.stacked {
-                        if column.is_of_states() {
-                            StackedFrames::shift(place, frames_before);
+                        if column.holds_states() {
+                            StackedFrames::shift_numbers(place, frames_before);
                         }
                         frames_before += stacked.frames;
                     }
@@ -123,15 +123,15 @@ impl Batch {
     }
 
     /// The values of a column, split by positive; a column without positives is one piece.
-    fn pieces(&self, column: Column) -> Vec<&[u8]> {
+    fn split_column(&self, column: Column) -> Vec<&[u8]> {
         let values = self.column(column);
         match column {
             Column::StatesK => {
                 let valid = self.positive_valid().chunks_exact(self.rows());
                 let mut rest = values;
                 let own = |valid: &[u8]| {
-                    let there = valid.iter().filter(|valid| **valid != 0).count();
-                    let (own, others) = rest.split_at(there * self.header.value_bytes());
+                    let present = valid.iter().filter(|valid| **valid != 0).count();
+                    let (own, others) = rest.split_at(present * self.header.value_bytes());
                     rest = others;
                     own
                 };
@@ -198,7 +198,7 @@ impl Batch {
             None => Cow::Borrowed(values),
             Some(stacked) => {
                 let (frames, state_bytes) = (self.column(Column::Frames), self.header.state_bytes);
-                Cow::Owned(stacked.stacked(frames, values, state_bytes as usize))
+                Cow::Owned(stacked.assemble(frames, values, state_bytes as usize))
             }
         }
     }
@@ -265,16 +265,16 @@ impl Batch {
         assert!(self.header.origin.is_some(), "rows drawn by priority");
         assert_eq!(draws.len(), self.rows(), "a draw a row");
         let transitions = draws.iter().map(|draw| draw.0.to_le_bytes());
-        self.fill(Column::Transition, transitions);
+        self.fill_column(Column::Transition, transitions);
         let chances = draws.iter().map(|draw| draw.1.to_le_bytes());
-        self.fill(Column::Probability, chances);
+        self.fill_column(Column::Probability, chances);
     }
 
     /// Multiplies the probability of each row by `share`, the probability that its replay server was chosen.
     pub fn scale_probabilities(&mut self, share: f32) {
         let chances = self.probabilities().expect("rows drawn by priority");
         let scaled = chances.into_iter().map(|it| (it * share).to_le_bytes());
-        self.fill(Column::Probability, scaled);
+        self.fill_column(Column::Probability, scaled);
     }
 
     /// Returns update `number` of `learner`, with the `priorities` [B] for the replay servers that drew the rows; `None` if rows are drawn
@@ -317,7 +317,7 @@ impl Batch {
     /// Makes a batch of a decoded reply. Checks that the payload has the length that `header` gives and the states that its rows need.
     pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.check_payload(&payload)?;
-        Ok(Self::in_memory(header, payload))
+        Ok(Self::with_buffer(header, payload))
     }
 }
 
@@ -373,8 +373,8 @@ impl<'a> BatchStatesMut<'a> {
     fn new(header: BatchHeader, payload: &'a mut [u8]) -> Self {
         let rows = header.rows as usize;
         let first_n = rows + header.states_k as usize;
-        let numbers_k = numbers(&header.positives_there(payload), rows);
-        let numbers_n = numbers(&header.bootstraps(payload), first_n);
+        let numbers_k = number_present(&header.positives_present(payload), rows);
+        let numbers_n = number_present(&header.bootstraps(payload), first_n);
         let (count, frame_bytes) = header.frames();
         let (frames, rest) = payload.split_at_mut(count * frame_bytes);
         let stack_bytes = header.stacked.map_or(0, |it| it.stack_bytes());
@@ -391,7 +391,7 @@ impl<'a> BatchStatesMut<'a> {
     }
 
     /// The numbers of the states that `row` has: of s_t, of s_{t+n}, and of s_{t+k} of each positive, in this order.
-    pub fn of_row(&self, row: usize) -> impl Iterator<Item = usize> {
+    pub fn row_states(&self, row: usize) -> impl Iterator<Item = usize> {
         let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
         let first = [Some(row), self.numbers_n[row]];
         first.into_iter().chain(of_positives.copied()).flatten()
@@ -405,13 +405,13 @@ impl<'a> BatchStatesMut<'a> {
     /// Writes the numbers of the frames of state `number`, oldest first.
     pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
         let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
-        StackedFrames::write(stack, frames);
+        StackedFrames::write_numbers(stack, frames);
     }
 }
 
-/// Numbers the entries of `there` that are true, from `first` on.
-fn numbers(there: &[bool], first: usize) -> Vec<Option<usize>> {
+/// Numbers the entries of `present` that are true, from `first` on.
+fn number_present(present: &[bool], first: usize) -> Vec<Option<usize>> {
     let mut numbers = first..;
-    let number = |&there: &bool| there.then(|| numbers.next()).flatten();
-    there.iter().map(number).collect()
+    let number = |&is_present: &bool| is_present.then(|| numbers.next()).flatten();
+    present.iter().map(number).collect()
 }

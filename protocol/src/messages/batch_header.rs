@@ -11,7 +11,7 @@ use super::{
 use crate::{
     run_spec::RunSpec,
     sampling::Sampling,
-    wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::no_payload, shared_memory},
+    wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::check_no_payload, shared_memory},
 };
 
 /// Batches for which a replay server has shared memory: those being assembled, sent, and copied by the learner.
@@ -46,7 +46,7 @@ pub struct BatchHeader {
 
 impl BatchHeader {
     /// Returns the header of the largest possible batch of `rows` rows in this run.
-    pub fn of(spec: &RunSpec, rows: u32) -> Self {
+    pub fn largest(spec: &RunSpec, rows: u32) -> Self {
         let positives = spec.horizon.positives() as u32;
         Self {
             rows,
@@ -55,14 +55,14 @@ impl BatchHeader {
             states_k: rows.saturating_mul(positives),
             states_n: rows,
             weights_versions: (0, u64::MAX),
-            stacked: StackedFrames::of(spec, rows),
+            stacked: StackedFrames::largest(spec, rows),
             ..Self::default()
         }
     }
 
     /// Returns the same header for rows drawn by the rule `sampling`.
     #[must_use]
-    pub fn sampled_by(self, sampling: &Sampling) -> Self {
+    pub fn with_sampling(self, sampling: &Sampling) -> Self {
         Self {
             origin: sampling.is_prioritised().then(Origin::default),
             ..self
@@ -100,15 +100,15 @@ impl BatchHeader {
                     self.rows
                 )));
             }
-            if let Some(number) = stacked.first_unknown(self.of_states(payload)) {
+            if let Some(number) = stacked.first_unknown(self.state_columns(payload)) {
                 return Err(CodecError::Header(format!(
                     "a state of frame {number}, of {} that travel",
                     stacked.frames
                 )));
             }
         }
-        let rows = (self.positives_there(payload), self.bootstraps(payload));
-        let count = |there: &[bool]| there.iter().filter(|there| **there).count();
+        let rows = (self.positives_present(payload), self.bootstraps(payload));
+        let count = |present: &[bool]| present.iter().filter(|it| **it).count();
         let counted = (count(&rows.0), count(&rows.1));
         if counted != (self.states_k as usize, self.states_n as usize) {
             return Err(CodecError::Header(format!(
@@ -146,7 +146,7 @@ pub(super) enum Column {
 }
 
 impl Column {
-    pub(super) const fn is_of_states(self) -> bool {
+    pub(super) const fn holds_states(self) -> bool {
         matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
     }
 }
@@ -157,7 +157,7 @@ impl BatchHeader {
     /// columns without states or frames are u8. Products of three numbers of 32 bits do not overflow a u128.
     pub(super) fn columns(&self) -> [(Column, u128); 12] {
         let rows = u128::from(self.rows);
-        let of_positives = rows * u128::from(self.positives);
+        let positives = rows * u128::from(self.positives);
         let by_priority = self.origin.map_or(0, |_| rows);
         let frames = |it: StackedFrames| {
             u128::from(it.frames) * it.frame_bytes(self.state_bytes as usize) as u128
@@ -172,8 +172,8 @@ impl BatchHeader {
             (Column::BootstrapDiscount, 4 * rows),
             (Column::Action, rows),
             (Column::NextAction, rows),
-            (Column::PositiveValid, of_positives),
-            (Column::K, of_positives),
+            (Column::PositiveValid, positives),
+            (Column::K, positives),
             (Column::Transition, 8 * by_priority),
             (Column::Probability, 4 * by_priority),
         ]
@@ -201,7 +201,7 @@ impl BatchHeader {
             && self.states_n <= self.rows
             && self
                 .stacked
-                .is_none_or(|it| it.fit(states, self.state_bytes as usize));
+                .is_none_or(|it| it.can_form(states, self.state_bytes as usize));
         let bytes = || self.columns().iter().map(|(_, bytes)| bytes).sum::<u128>();
         fits.then(bytes).and_then(|it| it.try_into().ok())
     }
@@ -223,12 +223,12 @@ impl BatchHeader {
     }
 
     /// Whether each positive [P, B] exists, from a payload whose scalars are written.
-    pub(super) fn positives_there(&self, payload: &[u8]) -> Vec<bool> {
+    pub(super) fn positives_present(&self, payload: &[u8]) -> Vec<bool> {
         let valid = payload[self.range(Column::PositiveValid)].iter();
         valid.map(|&valid| valid != 0).collect()
     }
 
-    fn of_states<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
+    fn state_columns<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
         &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
     }
 
@@ -272,10 +272,10 @@ pub enum BatchReply {
 }
 
 impl BatchReply {
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
             Self::Batch(header) => header.check_payload(payload),
-            Self::NotReady(_) => no_payload(payload),
+            Self::NotReady(_) => check_no_payload(payload),
         }
     }
 }

@@ -15,14 +15,14 @@ pub struct BatchRequest {
     /// Whether the batch may be sent through shared memory.
     pub shared_memory: bool,
     /// The learner's progress.
-    pub learned: Learned,
+    pub learned: LearnerProgress,
     /// The sum of the counts of all other shards, if the replay has several. The rows are then a part of a batch.
     pub other_shards: Option<ShardCounts>,
 }
 
 /// The progress of a learner, which only the learner knows. A restarted replay server learns it from here.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Learned {
+pub struct LearnerProgress {
     /// Updates since the start of the run.
     pub updates: u64,
     /// Updates in its newest checkpoint.
@@ -55,7 +55,7 @@ impl RequestId {
 
     /// The next attempt at this request.
     #[must_use]
-    pub const fn again(self) -> Self {
+    pub const fn retry(self) -> Self {
         Self {
             attempt: self.attempt + 1,
             ..self

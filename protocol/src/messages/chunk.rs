@@ -78,7 +78,7 @@ impl ChunkHeader {
             .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
     }
 
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
             return Ok(());
         }
@@ -93,7 +93,7 @@ impl ChunkHeader {
 }
 
 /// Transitions that a chunk of any run may have, because an actor may have this many environments whatever the settings say.
-const TRANSITIONS_LEAST: u64 = 4096;
+const TRANSITIONS_MAX_LEAST: u64 = 4096;
 
 /// Returns the transitions in the longest chunk of a run, from its settings `actor.envs`, `steps_per_chunk` and `round_transitions_max`.
 /// The result is at least 4,096, because an actor may have up to that many environments (`--envs`).
@@ -101,7 +101,7 @@ pub fn transitions_max(envs: u32, steps_per_chunk: u32, round_transitions_max: O
     let envs = u64::from(envs);
     let whole = envs.saturating_mul(steps_per_chunk.into());
     let longest = round_transitions_max.map_or(whole, |round| whole.min(round.max(envs)));
-    longest.max(TRANSITIONS_LEAST)
+    longest.max(TRANSITIONS_MAX_LEAST)
 }
 
 /// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, end of step t).
@@ -120,11 +120,11 @@ impl Chunk {
         let bytes = header
             .payload_bytes()
             .expect("an actor's chunk is far below the address space");
-        Self::in_memory(header, Buffer::zeroed(bytes))
+        Self::with_buffer(header, Buffer::zeroed(bytes))
     }
 
     /// Creates a chunk in memory with arbitrary content; the caller must write every row.
-    pub fn in_memory(header: ChunkHeader, payload: Buffer) -> Self {
+    pub fn with_buffer(header: ChunkHeader, payload: Buffer) -> Self {
         let bytes = header.payload_bytes();
         assert_eq!(Some(payload.len()), bytes, "memory for a chunk");
         Self { header, payload }
@@ -207,7 +207,7 @@ impl Chunk {
 
     /// Makes a chunk of a received header and payload, with all checks of [`Chunk::decode`].
     pub fn from_payload(header: ChunkHeader, payload: Buffer) -> Result<Self, CodecError> {
-        header.checked(&payload)?;
+        header.check_payload(&payload)?;
         let chunk = Self { header, payload };
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
             return Err(CodecError::Header(format!("end {end} is none that exists")));

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::{error::CodecError, message::no_payload};
+use crate::wire::{error::CodecError, message::check_no_payload};
 
 /// Most episodes in one reply; the requester asks again for the rest. With the longest numbers, a reply takes half of the longest header.
 pub const EPISODES_MAX: usize = 8_192;
@@ -27,12 +27,12 @@ pub struct EndedEpisode {
     /// The actor's environment in which it was played, from 0.
     pub env: u32,
     /// Return and length of the whole episode; `None` if a part of it was lost.
-    pub played: Option<Played>,
+    pub totals: Option<Totals>,
 }
 
 /// Return and length of an episode of which no part was lost, up to some step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Played {
+pub struct Totals {
     /// Sum of the rewards as the world gave them, undiscounted.
     pub episode_return: f64,
     /// Environment steps, the last one included.
@@ -52,12 +52,12 @@ pub struct EpisodesReply {
 
 impl EpisodesReply {
     /// Number of episodes that ended up to the last of these.
-    pub const fn up_to(&self) -> u64 {
+    pub const fn next_since(&self) -> u64 {
         self.before.saturating_add(self.episodes.len() as u64)
     }
 
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
-        if self.up_to() > self.ended || self.episodes.len() > EPISODES_MAX {
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
+        if self.next_since() > self.ended || self.episodes.len() > EPISODES_MAX {
             return Err(CodecError::Header(format!(
                 "{} episodes after {}, where {} ended",
                 self.episodes.len(),
@@ -65,6 +65,6 @@ impl EpisodesReply {
                 self.ended
             )));
         }
-        no_payload(payload)
+        check_no_payload(payload)
     }
 }

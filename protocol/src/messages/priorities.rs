@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::{error::CodecError, message::no_payload};
+use crate::wire::{error::CodecError, message::check_no_payload};
 
 /// The replay server and its incarnation that drew rows by priority. Other incarnations cannot interpret the transition numbers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,8 +42,8 @@ impl PriorityUpdate {
         self.parts.iter().map(|part| part.transitions.len()).sum()
     }
 
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
-        no_payload(payload)?;
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
+        check_no_payload(payload)?;
         for part in &self.parts {
             let (transitions, priorities) = (part.transitions.len(), part.priorities.len());
             if transitions != priorities {

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::{error::CodecError, message::no_payload};
+use crate::wire::{error::CodecError, message::check_no_payload};
 
 /// The progress of a replay server that reads its replay back from disk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -52,14 +52,14 @@ impl fmt::Display for Recovering {
 }
 
 impl Recovering {
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         let since_s = self.progress.since_s;
         if !since_s.is_finite() || since_s < 0.0 {
             return Err(CodecError::Header(format!(
                 "a recovery that began {since_s} s ago"
             )));
         }
-        no_payload(payload)
+        check_no_payload(payload)
     }
 }
 

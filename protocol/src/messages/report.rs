@@ -8,13 +8,13 @@ use super::status::Waiting;
 use crate::wire::{
     error::CodecError,
     keys::{Peer, ProcessName},
-    message::no_payload,
+    message::check_no_payload,
 };
 
 /// Most bytes of the description of what a process does.
-const DOING_MAX: usize = 80;
+const DOING_BYTES_MAX: usize = 80;
 /// Most bytes of a warning in a report.
-const WARNING_MAX: usize = 400;
+const WARNING_BYTES_MAX: usize = 400;
 /// Most processes whose last warning is in a status: those with the newest warnings.
 pub const WARNINGS_MAX: usize = 64;
 
@@ -70,7 +70,7 @@ impl Warning {
     /// Creates a warning whose text is cut to 400 bytes.
     pub fn new(text: &str, age_s: f64) -> Self {
         Self {
-            text: cut(text, WARNING_MAX),
+            text: truncate(text, WARNING_BYTES_MAX),
             age_s,
         }
     }
@@ -81,20 +81,20 @@ impl Report {
     pub fn new(who: Participant, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
         Self {
             who,
-            doing: cut(doing, DOING_MAX),
+            doing: truncate(doing, DOING_BYTES_MAX),
             since_s,
             last_warning,
             finished: None,
         }
     }
 
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         let warning = self.last_warning.as_ref();
-        let too_long = self.doing.len() > DOING_MAX
-            || warning.is_some_and(|warning| warning.text.len() > WARNING_MAX);
-        if too_long {
+        let is_too_long = self.doing.len() > DOING_BYTES_MAX
+            || warning.is_some_and(|warning| warning.text.len() > WARNING_BYTES_MAX);
+        if is_too_long {
             return Err(CodecError::Header(format!(
-                "a report of more than {DOING_MAX} bytes, or a warning of more than {WARNING_MAX}"
+                "a report of more than {DOING_BYTES_MAX} bytes, or a warning of more than {WARNING_BYTES_MAX}"
             )));
         }
         let times = [self.since_s, warning.map_or(0.0, |warning| warning.age_s)];
@@ -103,7 +103,7 @@ impl Report {
                 "a report of {times:?} seconds ago"
             )));
         }
-        no_payload(payload)
+        check_no_payload(payload)
     }
 
     pub(super) fn actor(&self) -> Option<u32> {
@@ -114,7 +114,7 @@ impl Report {
     }
 }
 
-fn cut(text: &str, bytes_max: usize) -> String {
+fn truncate(text: &str, bytes_max: usize) -> String {
     let mut end = text.len().min(bytes_max);
     while !text.is_char_boundary(end) {
         end -= 1;
@@ -195,8 +195,8 @@ mod tests {
 
     #[test]
     fn texts_are_cut_between_characters() {
-        assert_eq!(cut("grün", 3), "gr");
-        assert_eq!(cut("grün", 4), "grü");
-        assert_eq!(cut("", 4), "");
+        assert_eq!(truncate("grün", 3), "gr");
+        assert_eq!(truncate("grün", 4), "grü");
+        assert_eq!(truncate("", 4), "");
     }
 }

@@ -37,14 +37,14 @@ impl std::fmt::Display for Waiting {
 }
 
 /// Episodes over which a mean return is taken.
-pub const RETURNS_OF: usize = 100;
+pub const RETURNS_MAX: usize = 100;
 
 /// Returns of the episodes that ended last.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Returns {
     /// Episodes since the start whose return is known, because no part of them was lost.
     pub known: u64,
-    /// Undiscounted returns of the newest of these episodes, oldest first; at most [`RETURNS_OF`] per shard.
+    /// Undiscounted returns of the newest of these episodes, oldest first; at most [`RETURNS_MAX`] per shard.
     pub newest: Vec<f64>,
 }
 
@@ -159,7 +159,7 @@ impl ReplayStatus {
             return Self::default();
         };
         let mut sum = first.clone();
-        others.iter().for_each(|it| sum.add(it));
+        others.iter().for_each(|it| sum.add_shard(it));
         let ages = shards.iter();
         let ages: f64 = ages.map(|it| it.mean_age * it.rows_sampled as f64).sum();
         sum.mean_age = match sum.rows_sampled {
@@ -170,7 +170,7 @@ impl ReplayStatus {
     }
 
     /// Adds another shard's status, except for the mean age. Every shard has the warm-up of the whole run.
-    fn add(&mut self, it: &Self) {
+    fn add_shard(&mut self, it: &Self) {
         macro_rules! add {
             ($($count:ident)+) => {
                 $(self.$count = self.$count.saturating_add(it.$count);)+

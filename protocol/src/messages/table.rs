@@ -26,14 +26,14 @@ use crate::wire::{
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ack;
 
-/// `NUMBER NAME: TYPE [checked], at KEY of its actor (PRIORITY) -> REPLY;`
+/// `NUMBER NAME: TYPE [check_payload], at KEY of its actor (PRIORITY) -> REPLY;`
 ///
-/// `[checked]` names the method that checks each received message. `of its actor`: each actor has its own key. The default priority is
+/// `[check_payload]` names the method that checks each received message. `of its actor`: each actor has its own key. The default priority is
 /// `Data`. Replies have no key; a message that is its own reply is fetched by an empty query.
 macro_rules! messages {
     ($(
         #[doc = $doc:literal]
-        $number:literal $name:ident: $message:ident $([$checked:ident])?
+        $number:literal $name:ident: $message:ident $([$check:ident])?
         $(, at $key:literal $(of its $actor:ident)? $(of an $who:ident or the learner)? $(($priority:ident))?)?
         $(-> $reply:ident)?;
     )+) => {
@@ -50,7 +50,7 @@ macro_rules! messages {
                 const NAME: &'static str = stringify!($name);
 
                 $(fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
-                    self.$checked(payload)
+                    self.$check(payload)
                 })?
 
                 $(
@@ -80,17 +80,17 @@ macro_rules! messages {
 
 messages! {
     /// Transitions, actor to replay server.
-    1 Chunk: ChunkHeader [checked], at "ingest" of its actor -> InsertReply;
+    1 Chunk: ChunkHeader [check_payload], at "ingest" of its actor -> InsertReply;
     /// The reply to a chunk or to a question about one.
     2 InsertReply: InsertReply;
     /// A request for a batch, learner to replay server.
     3 BatchRequest: BatchRequest, at "batch" -> BatchReply;
     /// A batch, or why there is none yet.
-    4 BatchReply: BatchReply [checked];
+    4 BatchReply: BatchReply [check_payload];
     /// The action-affinity matrix, learner to replay server.
     5 Affinity: AffinityUpdate, at "affinity" (DataHigh) -> Ack;
     /// A piece of the newest weights, replay server to actors.
-    6 Weights: WeightsReply [checked];
+    6 Weights: WeightsReply [check_payload];
     /// "Newer weights exist", replay server to actors.
     7 WeightsVersion: WeightsVersion, at "weights-version" (InteractiveHigh);
     /// An actor leaves, with the count of its transitions.
@@ -112,19 +112,19 @@ messages! {
     /// A question about a chunk that may have been stored by now, actor to replay server.
     16 ChunkPoll: ChunkPoll, at "poll" of its actor -> InsertReply;
     /// New weights, learner to replay server.
-    17 WeightsUpload: WeightsUpload [checked], at "weights-upload" (DataHigh) -> Ack;
+    17 WeightsUpload: WeightsUpload [check_payload], at "weights-upload" (DataHigh) -> Ack;
     /// A request for a piece of the newest weights, actor to replay server.
     18 WeightsRequest: WeightsRequest, at "weights" (DataLow) -> WeightsReply;
     /// The state of an actor or the learner, to the replay server.
-    19 Report: Report [checked], at "report" of an actor or the learner -> Ack;
+    19 Report: Report [check_payload], at "report" of an actor or the learner -> Ack;
     /// The state of all processes of the run, as the replay server knows it.
     20 ProcessesStatus: ProcessesStatus, at "status/processes" (InteractiveHigh) -> ProcessesStatus;
     /// Priorities of the rows of a batch, learner to replay server.
-    21 Priorities: PriorityUpdate [checked], at "priorities" (DataHigh) -> Ack;
+    21 Priorities: PriorityUpdate [check_payload], at "priorities" (DataHigh) -> Ack;
     /// A request for the episodes that have ended.
     22 EpisodesRequest: EpisodesRequest, at "episodes" (InteractiveHigh) -> EpisodesReply;
     /// Episodes that have ended.
-    23 EpisodesReply: EpisodesReply [checked];
+    23 EpisodesReply: EpisodesReply [check_payload];
     /// "Not yet: the replay is being read back from disk", replay server in answer to any query.
-    24 Recovering: Recovering [checked];
+    24 Recovering: Recovering [check_payload];
 }

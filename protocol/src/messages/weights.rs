@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::no_payload};
+use crate::wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::check_no_payload};
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
@@ -48,8 +48,8 @@ pub struct WeightsUpload {
 }
 
 impl WeightsUpload {
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
-        self.weights.check(payload)
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
+        self.weights.check_hash(payload)
     }
 }
 
@@ -86,11 +86,11 @@ pub enum WeightsReply {
 }
 
 impl WeightsReply {
-    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
+    pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
-            // [`Assembly`] checks that the piece is the expected one.
+            // [`WeightsAssembly`] checks that the piece is the expected one.
             Self::Piece { .. } => Ok(()),
-            Self::NoneNewer | Self::Gone => no_payload(payload),
+            Self::NoneNewer | Self::Gone => check_no_payload(payload),
         }
     }
 }
@@ -111,7 +111,7 @@ impl WeightsHeader {
     }
 
     /// Checks that `safetensors` has the hash of this description.
-    pub fn check(&self, safetensors: &[u8]) -> Result<(), CodecError> {
+    pub fn check_hash(&self, safetensors: &[u8]) -> Result<(), CodecError> {
         if self.sha256 == <[u8; 32]>::from(Sha256::digest(safetensors)) {
             Ok(())
         } else {
@@ -124,13 +124,13 @@ impl WeightsHeader {
 
 /// Weights of which some pieces have arrived.
 #[derive(Debug)]
-pub struct Assembly {
+pub struct WeightsAssembly {
     weights: WeightsHeader,
     bytes: usize,
-    have: Vec<u8>,
+    received: Vec<u8>,
 }
 
-impl Assembly {
+impl WeightsAssembly {
     /// Starts to receive weights of `bytes` bytes in all.
     pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
         let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
@@ -138,7 +138,7 @@ impl Assembly {
         Ok(Self {
             weights,
             bytes,
-            have: Vec::new(),
+            received: Vec::new(),
         })
     }
 
@@ -146,13 +146,13 @@ impl Assembly {
     ///
     /// # Errors
     /// The piece is of other weights or is not the next one. It is then dropped.
-    pub fn take(
+    pub fn push(
         &mut self,
         weights: WeightsHeader,
         offset: u64,
         piece: &[u8],
     ) -> Result<(), CodecError> {
-        let left = self.bytes - self.have.len();
+        let left = self.bytes - self.received.len();
         if weights != self.weights
             || offset != self.next_offset()
             || piece.len() != left.min(PIECE_BYTES)
@@ -166,13 +166,13 @@ impl Assembly {
                 self.weights.version
             )));
         }
-        self.have.extend_from_slice(piece);
+        self.received.extend_from_slice(piece);
         Ok(())
     }
 
     /// Position at which the next piece starts, bytes.
     pub const fn next_offset(&self) -> u64 {
-        self.have.len() as u64
+        self.received.len() as u64
     }
 
     /// Bytes of the whole safetensors file.
@@ -181,16 +181,16 @@ impl Assembly {
     }
 
     /// Whether all pieces have arrived.
-    pub const fn is_whole(&self) -> bool {
-        self.have.len() == self.bytes
+    pub const fn is_complete(&self) -> bool {
+        self.received.len() == self.bytes
     }
 
     /// Returns the whole weights, after checking their hash.
     pub fn finish(self) -> Result<Weights, CodecError> {
-        self.weights.check(&self.have)?;
+        self.weights.check_hash(&self.received)?;
         Ok(Weights {
             header: self.weights,
-            safetensors: self.have,
+            safetensors: self.received,
         })
     }
 }
@@ -203,29 +203,29 @@ mod tests {
     fn pieces_make_the_whole_in_their_order_alone() {
         let file: Vec<u8> = (0..PIECE_BYTES + 10).map(|i| (i % 251) as u8).collect();
         let weights = WeightsHeader::new(3, 7, &file);
-        let mut assembly = Assembly::new(weights, file.len() as u64).unwrap();
+        let mut assembly = WeightsAssembly::new(weights, file.len() as u64).unwrap();
         let (first, second) = file.split_at(PIECE_BYTES);
         let at = PIECE_BYTES as u64;
-        assert!(assembly.take(weights, at, first).is_err(), "not its turn");
-        assert!(assembly.take(weights, 0, &first[1..]).is_err(), "too short");
+        assert!(assembly.push(weights, at, first).is_err(), "not its turn");
+        assert!(assembly.push(weights, 0, &first[1..]).is_err(), "too short");
         let other = WeightsHeader {
             version: 4,
             ..weights
         };
-        assert!(assembly.take(other, 0, first).is_err(), "of other weights");
-        assembly.take(weights, 0, first).unwrap();
-        assert!(!assembly.is_whole());
-        assembly.take(weights, at, second).unwrap();
-        assert!(assembly.is_whole());
+        assert!(assembly.push(other, 0, first).is_err(), "of other weights");
+        assembly.push(weights, 0, first).unwrap();
+        assert!(!assembly.is_complete());
+        assembly.push(weights, at, second).unwrap();
+        assert!(assembly.is_complete());
         let whole = Weights {
             header: weights,
             safetensors: file.clone(),
         };
         assert_eq!(assembly.finish().unwrap(), whole);
 
-        let mut damaged = Assembly::new(weights, 10).unwrap();
-        damaged.take(weights, 0, second).unwrap();
+        let mut damaged = WeightsAssembly::new(weights, 10).unwrap();
+        damaged.push(weights, 0, second).unwrap();
         assert!(damaged.finish().is_err(), "another SHA-256");
-        assert!(Assembly::new(weights, u64::MAX).is_err());
+        assert!(WeightsAssembly::new(weights, u64::MAX).is_err());
     }
 }

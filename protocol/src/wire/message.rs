@@ -16,7 +16,7 @@ pub trait Message: Clone + Serialize + DeserializeOwned {
     /// Checks what the type cannot guarantee, such as the length of the payload that the header gives. The receiver calls this for every
     /// message. By default, no payload may follow the header.
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
-        no_payload(payload)
+        check_no_payload(payload)
     }
 
     /// The actor that the message names as its sender, if it names one.
@@ -42,7 +42,7 @@ pub trait Request: Keyed {
     type Reply: Message;
 }
 
-pub(crate) fn no_payload(payload: &[u8]) -> Result<(), CodecError> {
+pub(crate) fn check_no_payload(payload: &[u8]) -> Result<(), CodecError> {
     match payload.len() {
         0 => Ok(()),
         bytes => Err(CodecError::Header(format!(

@@ -202,7 +202,7 @@ fn few_frames_do_not_make_more_than_a_message_may_have() {
             }),
             ..batch().header
         };
-        let (header, payload) = Batch::of_rows(header, &rows, Buffer::zeroed).into_payload();
+        let (header, payload) = Batch::from_rows(header, &rows, Buffer::zeroed).into_payload();
         let said =
             Batch::from_payload(header, payload).map_or_else(|e| e.to_string(), |_| String::new());
         let why = "states would fill more than";
@@ -236,10 +236,10 @@ fn parts_are_merged_row_by_row() {
             k_first: 1,
         };
         let rows: Vec<_> = values.clone().map(scalars).collect();
-        let mut batch = Batch::of_rows(header, &rows, Buffer::zeroed);
+        let mut batch = Batch::from_rows(header, &rows, Buffer::zeroed);
         let mut places = batch.states_mut();
         for (row, value) in values.enumerate() {
-            let numbers: Vec<_> = places.of_row(row).collect();
+            let numbers: Vec<_> = places.row_states(row).collect();
             let n = value.is_multiple_of(2).then_some(value + 20);
             let k = [40, 60, 80].map(|more| value + more);
             let bytes = [value].into_iter().chain(n).chain(k);

@@ -3,8 +3,8 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
-    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Participant, Played, Recovering,
-    RecoveryProgress, Report, RunInfo, Warning, WeightsHeader, WeightsUpload, WeightsVersion,
+    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Participant, Recovering, RecoveryProgress,
+    Report, RunInfo, Totals, Warning, WeightsHeader, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 
@@ -316,7 +316,7 @@ fn the_longest_messages_can_be_sent() {
         frames: u64::MAX,
         actor: u32::MAX,
         env: u32::MAX,
-        played: Some(Played {
+        totals: Some(Totals {
             episode_return: f64::MAX,
             steps: u64::MAX,
         }),

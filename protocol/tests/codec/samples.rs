@@ -6,11 +6,11 @@ use std::fmt::Debug;
 use driml_protocol::{
     Ack, ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
     ChunkHeader, ChunkPoll, CodecError, End, EndedEpisode, EpisodesReply, EpisodesRequest,
-    InsertReply, JoinReply, Learned, LearnerJoin, LearnerStatus, Leave, LogStatus, Message,
-    NO_ACTION, NotReady, Origin, Participant, Played, PriorityPart, PriorityUpdate, ProcessName,
+    InsertReply, JoinReply, LearnerJoin, LearnerProgress, LearnerStatus, Leave, LogStatus, Message,
+    NO_ACTION, NotReady, Origin, Participant, PriorityPart, PriorityUpdate, ProcessName,
     ProcessStatus, ProcessesStatus, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
-    Returns, RowScalars, RunInfo, ShardCounts, StackedFrames, Waiting, Warning, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, Welcome,
+    Returns, RowScalars, RunInfo, ShardCounts, StackedFrames, Totals, Waiting, Warning,
+    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, Welcome,
     codec::{self},
 };
 
@@ -139,10 +139,10 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
         origin,
         stacked: None,
     };
-    let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
     let mut places = batch.states_mut();
-    let numbers = |row| places.of_row(row).collect::<Vec<_>>();
+    let numbers = |row| places.row_states(row).collect::<Vec<_>>();
     assert_eq!([0, 1, 2].map(numbers), [vec![0, 3], vec![1], vec![2, 5, 4]]);
     for (number, byte) in [10, 11, 12, 30, 32, 22].into_iter().enumerate() {
         places.frame(number).fill(byte);
@@ -162,7 +162,7 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
         stacked: Some(STACKED),
         ..batch_from(origin).header
     };
-    let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
     let mut places = batch.states_mut();
     for frame in 0..5 {
@@ -238,7 +238,7 @@ pub(crate) fn episodes() -> EpisodesReply {
         frames: 1 << 20,
         actor: 3,
         env: 15,
-        played: Some(Played {
+        totals: Some(Totals {
             episode_return: 2.5,
             steps: 99,
         }),
@@ -249,7 +249,7 @@ pub(crate) fn episodes() -> EpisodesReply {
         episodes: vec![
             whole,
             EndedEpisode {
-                played: None,
+                totals: None,
                 ..whole
             },
         ],
@@ -358,10 +358,10 @@ pub(crate) fn samples() -> Vec<Sample> {
         })),
         Sample::of(&BatchRequest {
             learner: 5,
-            id: RequestId::first(u64::MAX).again(),
+            id: RequestId::first(u64::MAX).retry(),
             rows: 256,
             shared_memory: true,
-            learned: Learned {
+            learned: LearnerProgress {
                 updates: 4,
                 saved_updates: 2,
                 rows_received: 64,

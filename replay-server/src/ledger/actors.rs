@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use driml_protocol::{ActorJoin, ChunkHeader, ChunkPoll, Leave, Played};
+use driml_protocol::{ActorJoin, ChunkHeader, ChunkPoll, Leave, Totals};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
@@ -21,7 +21,7 @@ pub(crate) struct Stream {
     /// How the next transition is linked to the last one.
     pub(crate) link: Link,
     /// Return and length of the episode so far; `None` if a part of the episode was lost.
-    pub(crate) episode: Option<Played>,
+    pub(crate) episode: Option<Totals>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -242,7 +242,7 @@ impl Actors {
         if header.sequence == 0 || actor.streams.is_empty() {
             let start = || Stream {
                 link: Link::EpisodeStart,
-                episode: Some(Played::default()),
+                episode: Some(Totals::default()),
             };
             actor.streams.resize_with(header.streams as usize, start);
         }

@@ -65,13 +65,13 @@ mod tests {
             requests.begin(RequestId::first(client_id));
             requests.complete(client_id, vec![1]);
         }
-        let again = RequestId::first(0).again();
+        let again = RequestId::first(0).retry();
         assert_eq!(requests.begin(again), Some(vec![1]));
         requests.complete(0, vec![2]);
         requests.begin(RequestId::first(u64::MAX));
         assert_eq!(requests.last.len(), CLIENTS_MAX);
-        assert_eq!(requests.begin(again.again()), Some(vec![2]));
-        let forgotten = RequestId::first(1).again();
+        assert_eq!(requests.begin(again.retry()), Some(vec![2]));
+        let forgotten = RequestId::first(1).retry();
         assert_eq!(requests.begin(forgotten), Some(vec![]));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use driml_protocol::{EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, ReplayStatus};
+use driml_protocol::{EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_MAX, ReplayStatus};
 use serde::{Deserialize, Serialize};
 
 use super::actors::Difference;
@@ -102,12 +102,12 @@ impl Statistics {
         }
         self.newest.push_back(episode);
         let returns = &mut self.counted.returns;
-        if let Some(played) = episode.played {
+        if let Some(totals) = episode.totals {
             returns.known += 1;
-            if returns.newest.len() == RETURNS_OF {
+            if returns.newest.len() == RETURNS_MAX {
                 returns.newest.remove(0);
             }
-            returns.newest.push(played.episode_return);
+            returns.newest.push(totals.episode_return);
         }
     }
 
@@ -135,7 +135,7 @@ impl Statistics {
         let (ended, returns) = (self.counted.episodes, &self.counted.returns);
         let fits = self.newest.len() <= EPISODES_KEPT_MAX
             && self.newest.len() as u64 <= ended
-            && returns.newest.len() <= RETURNS_OF
+            && returns.newest.len() <= RETURNS_MAX
             && returns.known <= ended;
         match fits {
             true => Ok(()),
@@ -170,18 +170,18 @@ mod tests {
                 frames,
                 actor: 0,
                 env: 0,
-                played: None,
+                totals: None,
             });
         };
         let most = EPISODES_MAX as u64;
         (0..most + 5).for_each(|n| end(&mut statistics, n));
         let first = statistics.episodes_since(0);
         assert_eq!((first.before, first.episodes.len()), (0, EPISODES_MAX));
-        let second = statistics.episodes_since(first.up_to());
+        let second = statistics.episodes_since(first.next_since());
         let frames = second.episodes.iter().map(|it| it.frames);
         assert!(frames.eq(most..most + 5));
-        assert_eq!(second.up_to(), second.ended);
-        assert_eq!(statistics.episodes_since(second.up_to()).episodes, []);
+        assert_eq!(second.next_since(), second.ended);
+        assert_eq!(statistics.episodes_since(second.next_since()).episodes, []);
         // A client that has more episodes than ended here counts those of another server.
         assert_eq!(statistics.episodes_since(u64::MAX).before, most + 5);
 
@@ -197,7 +197,7 @@ mod tests {
         ] {
             statistics.recorded_episodes = recorded;
             let reply = statistics.for_snapshot().episodes_since(0);
-            assert_eq!((reply.up_to(), reply.episodes.len()), (all, logged));
+            assert_eq!((reply.next_since(), reply.episodes.len()), (all, logged));
         }
     }
 }

@@ -1,7 +1,7 @@
 //! The state of the replay without the transitions, as a value that is saved and restored, and the events that change it between chunks.
 //! `upkeep` decides when to save a snapshot; `journal` decides where.
 
-use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec, codec};
+use driml_protocol::{ActorJoin, LearnerJoin, LearnerProgress, Leave, RunSpec, codec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -35,7 +35,7 @@ pub(crate) struct ReplayState {
     pub(crate) actors: Actors,
     /// The learner that is served, as it joined.
     pub(crate) learner: Option<LearnerJoin>,
-    pub(crate) learned: Learned,
+    pub(crate) learned: LearnerProgress,
     /// Updates done when the run was resumed without this replay; 0 if it never was.
     pub(crate) resumed_after: u64,
     pub(crate) affinity: Affinity,
@@ -52,7 +52,7 @@ impl ReplayState {
         Self {
             actors: Actors::default(),
             learner: None,
-            learned: Learned::default(),
+            learned: LearnerProgress::default(),
             resumed_after: 0,
             affinity: Affinity::uniform(spec.num_actions),
             rng,

@@ -7,8 +7,8 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, InsertReply, Learned, LearnerJoin, Leave,
-    RunSpec, Sampling,
+    ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, InsertReply, LearnerJoin, LearnerProgress,
+    Leave, RunSpec, Sampling,
 };
 use tempfile::TempDir;
 
@@ -66,10 +66,10 @@ fn store(replay: &mut Replay, sequence: u64) {
 }
 
 fn save_checkpoint(replay: &mut Replay) {
-    let learned = Learned {
+    let learned = LearnerProgress {
         updates: 1,
         saved_updates: 1,
-        ..Learned::default()
+        ..LearnerProgress::default()
     };
     replay.set_progress(learned).unwrap();
 }

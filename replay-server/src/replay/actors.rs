@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{ActorJoin, Chunk, ChunkPoll, EndedEpisode, InsertReply, Leave, Played};
+use driml_protocol::{ActorJoin, Chunk, ChunkPoll, EndedEpisode, InsertReply, Leave, Totals};
 
 use super::Replay;
 use crate::{
@@ -223,7 +223,7 @@ impl Replay {
                         frames: total,
                         actor: header.actor,
                         env: number as u32,
-                        played: stream.episode.replace(Played::default()),
+                        totals: stream.episode.replace(Totals::default()),
                     });
                 }
             }

@@ -2,8 +2,8 @@
 //! `sampling` draws and assembles the rows.
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, NotReady, PriorityUpdate,
-    RequestId, Waiting,
+    AffinityUpdate, Batch, BatchHeader, Buffer, LearnerJoin, LearnerProgress, NotReady,
+    PriorityUpdate, RequestId, Waiting,
 };
 
 use super::{Replay, VERSION_AHEAD_MAX};
@@ -53,7 +53,7 @@ impl Replay {
         let state = &mut self.state;
         state.statistics.counted.rows_unlearned += unlearned;
         state.statistics.counted.updates_relearned += repeated_updates;
-        state.learned = Learned {
+        state.learned = LearnerProgress {
             updates: join.updates,
             saved_updates: join.updates,
             rows_received: learned,
@@ -97,7 +97,7 @@ impl Replay {
     }
 
     /// Takes the learner's progress. If the learner has saved a checkpoint, a replay on disk begins a new segment with a snapshot.
-    pub fn set_progress(&mut self, learned: Learned) -> Result<(), String> {
+    pub fn set_progress(&mut self, learned: LearnerProgress) -> Result<(), String> {
         let (updates, rows) = (learned.updates, learned.rows_received);
         if updates.max(learned.saved_updates).max(rows) > COUNT_MAX {
             return Err(format!(
@@ -215,7 +215,7 @@ impl Replay {
         let header = BatchHeader {
             held,
             origin: is_prioritised.then_some(self.origin),
-            ..BatchHeader::of(&self.spec, rows)
+            ..BatchHeader::largest(&self.spec, rows)
         };
         let state = &mut self.state;
         let (affinity, rng) = (&state.affinity, &mut state.rng);

@@ -85,7 +85,7 @@ impl BatchSampler {
             stacked.frames = shared.frames.len() as u32;
             shared
         });
-        let mut batch = Batch::of_rows(header, &scalars, alloc);
+        let mut batch = Batch::from_rows(header, &scalars, alloc);
         // Computed after all draws: a draw that finds an invalid anchor zeroes its mass, which makes the others more likely.
         let probability = |anchor| {
             let probability = self.rows.probability(anchor)? as f32;
@@ -96,7 +96,7 @@ impl BatchSampler {
             batch.set_draws(&draws);
         }
         let mut batch_states = batch.states_mut();
-        let numbers: Vec<usize> = (0..rows).flat_map(|row| batch_states.of_row(row)).collect();
+        let numbers: Vec<usize> = (0..rows).flat_map(|row| batch_states.row_states(row)).collect();
         let frames: Vec<NeededFrame> = match shared {
             None => {
                 let frame = |(RowState { row, index }, place)| NeededFrame { row, index, place };

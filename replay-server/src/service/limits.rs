@@ -79,7 +79,7 @@ pub fn shared_memory_bytes(settings: &Settings, servers: u32) -> anyhow::Result<
     let spec: RunSpec = settings.table("run")?;
     let config: Config = settings.table("replay")?;
     let batch_size = read_u32(settings, "learner", "batch_size")?;
-    let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
+    let batch = BatchHeader::largest(&spec, batch_size).with_sampling(&config.sampling);
     let server = process_bytes(batch.pool_bytes()) + OTHER_SESSIONS * SESSION_BYTES;
     let actors = read_u32(settings, "local", "actors").unwrap_or(1);
     let sharing_actors = actors.min(SHARED_INCARNATIONS_MAX) as usize;

@@ -93,7 +93,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     });
     let kept = kept.transpose()?;
     let transport: TransportConfig = settings.table("transport")?;
-    let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
+    let batch = BatchHeader::largest(&spec, batch_size).with_sampling(&config.sampling);
     // Computed for the whole run: if shared memory is too small, all messages go through sockets.
     let needed = shared_memory_bytes(&settings, 1)?;
     let is_granted =

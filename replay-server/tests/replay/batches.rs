@@ -89,13 +89,13 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
     (ages as f64 / rows as f64, versions)
 }
 
-/// Checks that each frame of stacked states is sent once, and that the payload is at most as long as `BatchHeader::of` computes.
+/// Checks that each frame of stacked states is sent once, and that the payload is at most as long as `BatchHeader::largest` computes.
 fn check_frames(batch: &Batch, spec: &RunSpec) {
     let (header, payload) = batch.clone().into_payload();
     assert_eq!(&Batch::from_payload(header, payload).unwrap(), batch);
     let reckoned = BatchHeader {
         origin: header.origin,
-        ..BatchHeader::of(spec, header.rows)
+        ..BatchHeader::largest(spec, header.rows)
     };
     assert_eq!(header.stacked.is_some(), spec.frame_stack > 1);
     assert!(header.payload_bytes() <= reckoned.payload_bytes());

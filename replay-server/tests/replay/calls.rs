@@ -1,8 +1,8 @@
 //! Calls of tests to a replay, and the expected replies.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Horizon, InsertReply, Learned, LearnerJoin,
-    Leave, RunSpec, ShardCounts,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Horizon, InsertReply, LearnerJoin,
+    LearnerProgress, Leave, RunSpec, ShardCounts,
 };
 use driml_replay_server::{Config, Replay};
 
@@ -87,11 +87,11 @@ pub(crate) const fn affinity(version: u64, num_actions: u32, matrix: Vec<f32>) -
     }
 }
 
-pub(crate) const fn learned(updates: u64, saved_updates: u64, rows_received: u64) -> Learned {
-    Learned {
+pub(crate) const fn learned(updates: u64, saved: u64, rows: u64) -> LearnerProgress {
+    LearnerProgress {
         updates,
-        saved_updates,
-        rows_received,
+        saved_updates: saved,
+        rows_received: rows,
     }
 }
 

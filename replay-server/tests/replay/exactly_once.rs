@@ -94,7 +94,7 @@ proptest! {
                 break;
             }
             let client_id = rng.random_range(0..clients) as usize;
-            requests[client_id] = requests[client_id].again();
+            requests[client_id] = requests[client_id].retry();
             in_flight.push(requests[client_id]);
             let at = rng.random_range(0..in_flight.len());
             let id = in_flight.remove(at);

@@ -151,7 +151,7 @@ impl StoredReplay {
                 let id = &mut self.requests[client];
                 // A batch that did not arrive is requested again.
                 *id = if self.rng.random_bool(0.3) {
-                    id.again()
+                    id.retry()
                 } else {
                     id.next()
                 };

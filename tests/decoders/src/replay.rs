@@ -1,9 +1,9 @@
 //! Well-formed messages in any order and with any numbers, sent to the core of a replay server: none breaks its state.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, ChunkPoll, End, Horizon, InsertReply, Learned,
-    LearnerJoin, Leave, Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling,
-    ShardCounts, TimeoutRule,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, ChunkPoll, End, Horizon, InsertReply,
+    LearnerJoin, LearnerProgress, Leave, Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec,
+    Sampling, ShardCounts, TimeoutRule,
 };
 use driml_replay_server::{Config, Replay};
 
@@ -169,7 +169,7 @@ fn send_message(replay: &mut Replay, numbers: &mut NumberReader<'_>) -> Option<(
                     other_shards: counts(numbers.count()?, numbers.count()?),
                     restart: byte % 8 == 0,
                 });
-                let _ = replay.set_progress(Learned {
+                let _ = replay.set_progress(LearnerProgress {
                     updates: numbers.count()?,
                     saved_updates: numbers.count()?,
                     rows_received: numbers.count()?,

@@ -6,7 +6,7 @@ mod results;
 mod settings;
 
 use driml_launch::metrics::rounded;
-use driml_protocol::RETURNS_OF;
+use driml_protocol::RETURNS_MAX;
 use minijinja::{Value, context};
 
 use self::{
@@ -99,7 +99,7 @@ fn page_values(results: &Results) -> Value {
         columns => LOSSES.map(|(column, _)| column),
         losses => results.losses,
         traces => results.traces,
-        returns_of => RETURNS_OF,
+        returns_of => RETURNS_MAX,
         episode_frames_max => EPISODE_FRAMES_MAX,
     }
 }

@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_launch::{evaluate::Levels, metrics::rounded};
-use driml_protocol::RETURNS_OF;
+use driml_protocol::RETURNS_MAX;
 use minijinja::{Value, context};
 use serde::Serialize;
 
@@ -173,7 +173,7 @@ fn figure(settings: &Settings, scored: &[Row]) -> anyhow::Result<Figure> {
     Ok(Figure {
         title: "Training return by game".into(),
         notes: vec![format!(
-            "Mean of the last {RETURNS_OF} training episodes, with exploration; over several seeds mean and range. Dashed: the paper's \
+            "Mean of the last {RETURNS_MAX} training episodes, with exploration; over several seeds mean and range. Dashed: the paper's \
              after 50 million frames. Grey: a random policy."
         )],
         columns: panels.len().min(4),
@@ -224,7 +224,7 @@ fn page_values(settings: &Settings, scored: &[Row]) -> Value {
         improvements => improvements.collect::<Vec<_>>(),
         percent => percent(settings.frames as f64 / PAPER_FRAMES),
         errors => STANDARD_ERRORS,
-        returns_of => RETURNS_OF,
+        returns_of => RETURNS_MAX,
         episodes => CHECKPOINTS_PLAYED * settings.episodes,
         some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),
     }

@@ -129,8 +129,8 @@ impl<'a> CostCounter<'a> {
     /// Bytes of a transition, of a batch whose rows have every state, and of a broadcast, without compression and socket overhead.
     pub(super) fn bytes(&self) -> Counts {
         let header = |run: &RunSpec| {
-            let header = BatchHeader::of(run, self.config.learner.batch_size);
-            header.sampled_by(&self.config.replay.sampling)
+            let header = BatchHeader::largest(run, self.config.learner.batch_size);
+            header.with_sampling(&self.config.replay.sampling)
         };
         let size = |header: BatchHeader| header.payload_bytes() as u64;
         let states = |run: &RunSpec| {

@@ -106,8 +106,8 @@ fn what_is_counted_is_what_is_built() {
             let weights = learner.export_weights().unwrap().safetensors.len();
             assert_eq!(find(&inspection.bytes, "a broadcast").is, weights as u64);
             // Rows with every state that a row may have.
-            let header = BatchHeader::of(&config.run, config.learner.batch_size)
-                .sampled_by(&config.replay.sampling);
+            let header = BatchHeader::largest(&config.run, config.learner.batch_size)
+                .with_sampling(&config.replay.sampling);
             let row = RowScalars {
                 action: 0,
                 next_action: 0,
@@ -117,7 +117,7 @@ fn what_is_counted_is_what_is_built() {
                 k_first: 1,
             };
             let rows = vec![row; header.rows as usize];
-            let batch = Batch::of_rows(header, &rows, Buffer::zeroed);
+            let batch = Batch::from_rows(header, &rows, Buffer::zeroed);
             let states = [batch.states_t(), batch.states_n(), batch.states_k()];
             let states = states.map(|states| states.len());
             let (_, payload) = batch.into_payload();

@@ -8,7 +8,7 @@
 
 use std::collections::VecDeque;
 
-use driml_protocol::{EndedEpisode, EpisodesReply, RETURNS_OF, ReplayStatus};
+use driml_protocol::{EndedEpisode, EpisodesReply, RETURNS_MAX, ReplayStatus};
 use serde::Deserialize;
 
 use super::{
@@ -78,7 +78,7 @@ impl TrainingEpisodes {
         rows.header = HEADER.split(',').map(String::from).collect();
         let table = AppendLog::create(&folder.episodes(), &rows.to_csv())?;
         let mut returns: Vec<_> = known.iter().filter_map(|it| it.episode_return).collect();
-        let newest = returns.split_off(returns.len().saturating_sub(RETURNS_OF));
+        let newest = returns.split_off(returns.len().saturating_sub(RETURNS_MAX));
         let last = known.last();
         Ok(Self {
             table,
@@ -185,10 +185,10 @@ impl TrainingEpisodes {
     fn add_episode(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; 7] {
         self.newest += 1;
         self.frames = self.frames.max(ended.frames);
-        let played = ended.played;
-        let episode_return = played.map(|it| rounded(it.episode_return));
+        let totals = ended.totals;
+        let episode_return = totals.map(|it| rounded(it.episode_return));
         if let Some(newest) = episode_return {
-            if self.newest_returns.len() == RETURNS_OF {
+            if self.newest_returns.len() == RETURNS_MAX {
                 self.newest_returns.pop_front();
             }
             self.newest_returns.push_back(newest);
@@ -200,7 +200,7 @@ impl TrainingEpisodes {
             ended.actor.to_string(),
             ended.env.to_string(),
             cell(episode_return),
-            cell(played.map(|it| it.steps)),
+            cell(totals.map(|it| it.steps)),
         ]
     }
 

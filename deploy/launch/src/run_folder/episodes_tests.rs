@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use driml_protocol::Played;
+use driml_protocol::Totals;
 
 use super::*;
 use crate::testing::make;
@@ -41,7 +41,7 @@ impl Shard {
             frames: self.frames,
             actor: self.actor,
             env: 2,
-            played: Some(Played {
+            totals: Some(Totals {
                 episode_return: (self.first + n) as f64,
                 steps: 9,
             }),
@@ -123,7 +123,7 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
     let shard = shard(10, 0, 1, 0);
     let fetch = |_, since| {
         let mut reply = shard.reply(since);
-        reply.episodes[0].played = None;
+        reply.episodes[0].totals = None;
         Some(reply)
     };
     episodes.update(&[shard.status()], fetch, None);

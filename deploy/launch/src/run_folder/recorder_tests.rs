@@ -1,7 +1,7 @@
 //! The run folder's files: what a run leaves, and what a resumed run continues.
 
 use driml_actor::Schedule;
-use driml_protocol::{EndedEpisode, LearnerStatus, Played, Waiting};
+use driml_protocol::{EndedEpisode, LearnerStatus, Totals, Waiting};
 use expect_test::expect;
 
 use super::*;
@@ -77,7 +77,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
         frames: 2_000,
         actor: 0,
         env: 0,
-        played: Some(Played {
+        totals: Some(Totals {
             episode_return: 0.5,
             steps: 9,
         }),

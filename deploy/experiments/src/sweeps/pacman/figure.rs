@@ -1,7 +1,7 @@
 //! Draws Fig. 3, up to the episodes and frames of the settings.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
-use driml_protocol::RETURNS_OF;
+use driml_protocol::RETURNS_MAX;
 
 use super::results::{LOSSES, Results};
 use crate::{
@@ -41,7 +41,7 @@ pub(super) fn figure(results: &Results) -> Figure {
     Figure {
         title: "Ms. PacMan: what DIM finds, and what it is good for".into(),
         notes: vec![format!(
-            "(a) Mean over a tenth of the run; mean and range over seeds. (b, c) Training return, mean of the last {RETURNS_OF} \
+            "(a) Mean over a tenth of the run; mean and range over seeds. (b, c) Training return, mean of the last {RETURNS_MAX} \
              episodes; mean and range over seeds; vertical lines: another ghost becomes the lethal one; dashed: where {} stood at the \
              end of each task.",
             settings.agents.first().map_or("", String::as_str)
