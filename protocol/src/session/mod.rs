@@ -63,7 +63,7 @@ pub fn open_as(
     let Some(credentials) = credentials else {
         return open_with_settings(endpoints, message_bytes_max, &[]);
     };
-    credentials.warn_if_it_expires_soon();
+    credentials.warn_if_expiring();
     let mut settings = vec![
         ("transport/link/tls", credentials.zenoh_settings()),
         (

@@ -59,7 +59,7 @@ impl std::str::FromStr for Role {
 
 impl Role {
     /// The arguments after DIR with which `deploy/certs.sh` makes the certificate of this role.
-    pub(super) fn how_to_make(self) -> String {
+    pub(super) fn certs_args(self) -> String {
         match self {
             Self::Actor(number) => format!("--actors {}", number.saturating_add(1)),
             Self::ReplayServer => "--host NAME_OR_ADDRESS".into(),
@@ -71,17 +71,17 @@ impl Role {
 /// The keys at which a role may ask, answer, subscribe and declare liveliness. Everything else is denied.
 #[derive(Default)]
 struct Grant {
-    asks: Vec<String>,
-    answers: Vec<String>,
-    subscribes: Vec<String>,
-    lives: Vec<String>,
+    query: Vec<String>,
+    reply: Vec<String>,
+    subscribe: Vec<String>,
+    liveliness: Vec<String>,
 }
 
 /// Returns the rights of `role` in the run with these keys; none for a replay server, which does not connect.
 fn grant(keys: &Keys, role: Role) -> Grant {
     match role {
         Role::Actor(actor) => Grant {
-            asks: vec![
+            query: vec![
                 keys.key::<RunInfo>(),
                 keys.actor_key::<ActorJoin>(actor),
                 keys.actor_key::<ChunkHeader>(actor),
@@ -90,12 +90,12 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.actor_key::<Report>(actor),
                 keys.key::<WeightsRequest>(),
             ],
-            subscribes: vec![keys.key::<WeightsVersion>()],
-            lives: vec![keys.liveliness_keys_of(ProcessName::Actor(actor))],
+            subscribe: vec![keys.key::<WeightsVersion>()],
+            liveliness: vec![keys.liveliness_keys_of(ProcessName::Actor(actor))],
             ..Grant::default()
         },
         Role::Learner => Grant {
-            asks: vec![
+            query: vec![
                 keys.key::<RunInfo>(),
                 keys.key::<LearnerJoin>(),
                 keys.key::<BatchRequest>(),
@@ -105,12 +105,12 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.key::<ReplayStatus>(),
                 keys.learner_key::<Report>(),
             ],
-            answers: vec![keys.key::<LearnerStatus>()],
-            lives: vec![keys.liveliness_keys_of(ProcessName::Learner)],
+            reply: vec![keys.key::<LearnerStatus>()],
+            liveliness: vec![keys.liveliness_keys_of(ProcessName::Learner)],
             ..Grant::default()
         },
         Role::Observer => Grant {
-            asks: vec![
+            query: vec![
                 keys.key::<RunInfo>(),
                 keys.key::<ReplayStatus>(),
                 keys.key::<ProcessesStatus>(),
@@ -125,26 +125,26 @@ fn grant(keys: &Keys, role: Role) -> Grant {
 
 /// The rules, subjects and policies of zenoh's access control, as JSON5.
 #[derive(Default)]
-struct Lists {
+struct AccessLists {
     rules: Vec<String>,
     subjects: Vec<String>,
     policies: Vec<String>,
 }
 
-impl Lists {
-    fn add(&mut self, name: Role, grant: &Grant) {
+impl AccessLists {
+    fn add_role(&mut self, name: Role, grant: &Grant) {
         let mut rules = Vec::new();
         let answers = r#""declare_queryable", "reply""#;
         let subscribes = r#""declare_subscriber""#;
         let lives = r#""liveliness_token""#;
         for (what, flow, messages, keys) in [
-            ("asks", "ingress", r#""query""#, &grant.asks),
-            ("is-answered", "egress", r#""reply""#, &grant.asks),
-            ("answers", "ingress", answers, &grant.answers),
-            ("is-asked", "egress", r#""query""#, &grant.answers),
-            ("listens", "ingress", subscribes, &grant.subscribes),
-            ("receives", "egress", r#""put""#, &grant.subscribes),
-            ("lives", "ingress", lives, &grant.lives),
+            ("asks", "ingress", r#""query""#, &grant.query),
+            ("is-answered", "egress", r#""reply""#, &grant.query),
+            ("answers", "ingress", answers, &grant.reply),
+            ("is-asked", "egress", r#""query""#, &grant.reply),
+            ("listens", "ingress", subscribes, &grant.subscribe),
+            ("receives", "egress", r#""put""#, &grant.subscribe),
+            ("lives", "ingress", lives, &grant.liveliness),
         ] {
             if keys.is_empty() {
                 continue;
@@ -179,10 +179,10 @@ impl Lists {
 
 /// Returns zenoh's whole `access_control`, JSON5, for the replay server of the run with these keys.
 pub(crate) fn access_rules(keys: &Keys) -> String {
-    let mut lists = Lists::default();
+    let mut lists = AccessLists::default();
     let actors = (0..ACTORS_MAX).map(Role::Actor);
     for role in actors.chain([Role::Learner, Role::Observer]) {
-        lists.add(role, &grant(keys, role));
+        lists.add_role(role, &grant(keys, role));
     }
     lists.add_unix_sockets();
     format!(
@@ -217,7 +217,7 @@ mod tests {
             (Role::ReplayServer, ""),
         ] {
             let grant = grant(&keys, role);
-            let lists = [grant.asks, grant.answers, grant.subscribes, grant.lives];
+            let lists = [grant.query, grant.reply, grant.subscribe, grant.liveliness];
             assert_eq!(lists.concat().join(" "), expected);
         }
     }

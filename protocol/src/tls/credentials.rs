@@ -44,7 +44,7 @@ pub struct Credentials {
     /// The path of the private key.
     pub key: PathBuf,
     /// When the certificate expires, seconds since 1970.
-    expires: i64,
+    expires_unix_s: i64,
     /// When the certificate expires, as text for the user.
     pub expires_on: String,
     /// The host names and addresses in the certificate. Clients connect to the replay server by one of them.
@@ -57,8 +57,8 @@ impl Credentials {
     /// # Errors
     /// A file is missing, unreadable, expired, not valid yet, or of another role, authority or key. The error says what to do.
     pub fn read(folder: &Path, role: Role) -> Result<Self, TlsError> {
-        let read = Self::examine(folder, role)?;
-        if read.is_key_open() {
+        let read = Self::read_quietly(folder, role)?;
+        if read.is_key_exposed() {
             let key = read.key.display();
             tracing::warn!(
                 "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
@@ -68,7 +68,7 @@ impl Credentials {
     }
 
     /// Like [`Credentials::read`], but logs no warning.
-    pub fn examine(folder: &Path, role: Role) -> Result<Self, TlsError> {
+    pub fn read_quietly(folder: &Path, role: Role) -> Result<Self, TlsError> {
         if let Role::Actor(number) = role
             && number >= ACTORS_MAX
         {
@@ -79,11 +79,11 @@ impl Credentials {
         }
         let file = |ending| folder.join(format!("{role}.{ending}"));
         let (authority, certificate, key) = (authority_path(folder), file("pem"), file("key"));
-        let authorities = certificates(&authority, role)?;
-        let chain = certificates(&certificate, role)?;
+        let authorities = read_certificates(&authority, role)?;
+        let chain = read_certificates(&certificate, role)?;
         let secret = PrivateKeyDer::from_pem_slice(&read(&key, role)?);
-        let secret = secret.map_err(|_| not_pem(&key))?;
-        let own = parsed(&chain[0], &certificate)?;
+        let secret = secret.map_err(|_| pem_error(&key))?;
+        let own = parse(&chain[0], &certificate)?;
         let names = own.subject().iter_common_name();
         let names: Vec<_> = names.map(|it| it.as_str().unwrap_or_default()).collect();
         if names != [role.to_string().as_str()] {
@@ -92,16 +92,16 @@ impl Credentials {
                 certificate.display(),
                 names.join(", "),
                 role.to_string(),
-                how_to_make(&certificate, role)
+                certs_args(&certificate, role)
             )));
         }
         check_dates(&own, &certificate, role)?;
-        let expires = own.validity().not_after.timestamp();
-        let (expires_on, hosts) = (own.validity().not_after.to_string(), hosts_of(&own));
+        let expires_unix_s = own.validity().not_after.timestamp();
+        let (expires_on, hosts) = (own.validity().not_after.to_string(), host_names(&own));
         let mut roots = RootCertStore::empty();
         for one in authorities {
-            check_dates(&parsed(&one, &authority)?, &authority, role)?;
-            roots.add(one).map_err(|_| not_pem(&authority))?;
+            check_dates(&parse(&one, &authority)?, &authority, role)?;
+            roots.add(one).map_err(|_| pem_error(&authority))?;
         }
         check_signed(&roots, &chain, role).map_err(|why| {
             TlsError(format!(
@@ -110,15 +110,15 @@ impl Credentials {
                 authority.display()
             ))
         })?;
-        let signer = provider().key_provider.load_private_key(secret);
-        let signer = signer.map_err(|_| not_pem(&key))?;
+        let signer = crypto_provider().key_provider.load_private_key(secret);
+        let signer = signer.map_err(|_| pem_error(&key))?;
         let pair = CertifiedKey::new(chain, signer);
         pair.keys_match().map_err(|_| {
             TlsError(format!(
                 "{} is not the key of {}: they were made at different times; remove both and `deploy/certs.sh {}` makes them anew",
                 key.display(),
                 certificate.display(),
-                how_to_make(&certificate, role)
+                certs_args(&certificate, role)
             ))
         })?;
         Ok(Self {
@@ -126,26 +126,26 @@ impl Credentials {
             authority,
             certificate,
             key,
-            expires,
+            expires_unix_s,
             expires_on,
             hosts,
         })
     }
 
     /// Whether other users of this machine can read the key, and so act in this role.
-    pub fn is_key_open(&self) -> bool {
+    pub fn is_key_exposed(&self) -> bool {
         let mode = fs::metadata(&self.key).map(|it| it.permissions().mode());
         mode.is_ok_and(|mode| mode & 0o077 != 0)
     }
 
     /// How long the certificate is still valid.
     pub fn expires_in(&self) -> Duration {
-        let left = self.expires.saturating_sub(now().as_secs() as i64);
+        let left = self.expires_unix_s.saturating_sub(now().as_secs() as i64);
         Duration::from_secs(u64::try_from(left).unwrap_or(0))
     }
 
     /// Warns if the certificate expires soon: an expired one is rejected in the middle of a run.
-    pub(crate) fn warn_if_it_expires_soon(&self) {
+    pub(crate) fn warn_if_expiring(&self) {
         let left = self.expires_in();
         if left < EXPIRES_SOON {
             tracing::warn!(
@@ -174,7 +174,7 @@ impl Credentials {
 }
 
 /// The provider of cryptographic algorithms, the same as zenoh's.
-fn provider() -> CryptoProvider {
+fn crypto_provider() -> CryptoProvider {
     ring::default_provider()
 }
 
@@ -190,7 +190,7 @@ fn read(path: &Path, role: Role) -> Result<Vec<u8>, TlsError> {
                 "{} is not there: the role {role} needs ca.pem, {role}.pem and {role}.key; `deploy/certs.sh {}` makes them, \
                  beside the authority's key, and you copy them here",
                 path.display(),
-                how_to_make(path, role)
+                certs_args(path, role)
             ),
             _ => format!(
                 "{} cannot be read: {why}; it belongs to the user who starts this process",
@@ -201,12 +201,12 @@ fn read(path: &Path, role: Role) -> Result<Vec<u8>, TlsError> {
 }
 
 /// The arguments of `deploy/certs.sh` that make the files of `role` beside `path`.
-fn how_to_make(path: &Path, role: Role) -> String {
+fn certs_args(path: &Path, role: Role) -> String {
     let folder = path.parent().unwrap_or(path).display();
-    format!("{folder} {}", role.how_to_make()).trim_end().into()
+    format!("{folder} {}", role.certs_args()).trim_end().into()
 }
 
-fn not_pem(path: &Path) -> TlsError {
+fn pem_error(path: &Path) -> TlsError {
     let what = match path.extension() {
         Some(ending) if ending == "key" => "private key",
         _ => "certificate",
@@ -218,18 +218,18 @@ fn not_pem(path: &Path) -> TlsError {
 }
 
 /// Reads the certificates in a file; an error if there are none.
-fn certificates(path: &Path, role: Role) -> Result<Vec<CertificateDer<'static>>, TlsError> {
+fn read_certificates(path: &Path, role: Role) -> Result<Vec<CertificateDer<'static>>, TlsError> {
     let bytes = read(path, role)?;
     let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
     match found {
         Ok(found) if !found.is_empty() => Ok(found),
-        _ => Err(not_pem(path)),
+        _ => Err(pem_error(path)),
     }
 }
 
-fn parsed<'a>(der: &'a CertificateDer<'_>, path: &Path) -> Result<X509Certificate<'a>, TlsError> {
+fn parse<'a>(der: &'a CertificateDer<'_>, path: &Path) -> Result<X509Certificate<'a>, TlsError> {
     let parsed = X509Certificate::from_der(der);
-    parsed.map(|(_, it)| it).map_err(|_| not_pem(path))
+    parsed.map(|(_, it)| it).map_err(|_| pem_error(path))
 }
 
 fn check_dates(certificate: &X509Certificate<'_>, path: &Path, role: Role) -> Result<(), TlsError> {
@@ -240,7 +240,7 @@ fn check_dates(certificate: &X509Certificate<'_>, path: &Path, role: Role) -> Re
             "{shown} expired at {}: remove it and its key, and `deploy/certs.sh {}` makes new ones; if it did not, this machine's clock is \
              wrong",
             validity.not_after,
-            how_to_make(path, role)
+            certs_args(path, role)
         )));
     }
     if now < validity.not_before.timestamp() {
@@ -265,7 +265,7 @@ fn check_signed(
         e => e.to_string(),
     };
     let (own, others) = (&chain[0], &chain[1..]);
-    let (provider, now) = (provider(), UnixTime::now());
+    let (provider, now) = (crypto_provider(), UnixTime::now());
     if role == Role::ReplayServer {
         let algorithms = provider.signature_verification_algorithms.all;
         let own = ParsedCertificate::try_from(own).map_err(describe)?;
@@ -280,7 +280,7 @@ fn check_signed(
     verified.map(drop).map_err(describe)
 }
 
-fn hosts_of(certificate: &X509Certificate<'_>) -> Vec<String> {
+fn host_names(certificate: &X509Certificate<'_>) -> Vec<String> {
     let Ok(Some(names)) = certificate.subject_alternative_name() else {
         return Vec::new();
     };

@@ -51,7 +51,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let mut actors = Vec::new();
     for role in roles {
         let what = format!("tls {role}");
-        match Credentials::examine(folder, role) {
+        match Credentials::read_quietly(folder, role) {
             Err(e) => add(&what, (State::Missing, e.to_string())),
             Ok(it) => match (advice(&it), role) {
                 (Some(text), _) => add(&what, (State::Note, text)),
@@ -84,7 +84,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
 fn advice(credentials: &Credentials) -> Option<String> {
     let (role, key) = (credentials.role, credentials.key.display());
     let left = credentials.expires_in();
-    if credentials.is_key_open() {
+    if credentials.is_key_exposed() {
         Some(format!(
             "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
         ))
