@@ -21,7 +21,7 @@ use driml_envs::{ProcgenEngine, StepEnd};
 use driml_machine::resources::Machine;
 use driml_protocol::{ActorJoin, Buffer, BufferPool, Chunk, InsertReply};
 use driml_replay_server::{Compression, Config, Replay};
-use driml_settings::{config::RunConfig, flags::of_names};
+use driml_settings::{config::RunConfig, flags::resolve_names};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -41,7 +41,7 @@ fn settings(game: &str) -> RunConfig {
         ..Machine::detect()
     };
     let world = format!("procgen:{game}");
-    let config = of_names("paper", &world, "driml-ada", &[], &machine).unwrap();
+    let config = resolve_names("paper", &world, "driml-ada", &[], &machine).unwrap();
     config.with_whole_frames().unwrap()
 }
 

@@ -12,7 +12,7 @@ use driml_learner::{
     insight::{Insight, NetworkOutputs},
 };
 use driml_machine::resources::Machine;
-use driml_settings::{config::RunConfig, flags::of_names};
+use driml_settings::{config::RunConfig, flags::resolve_names};
 use driml_tests::{
     TestSystem, check_has, print_line,
     python::{find_python, run_script},
@@ -148,7 +148,7 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
 fn the_page_has_the_actions_in_their_order() {
     let page = read("deploy/docs/src/reference/weights.md");
     for world in ["chain", "mspacman", "ising", "procgen:coinrun"] {
-        let config = of_names("smoke", world, "c51", &[], &Machine::detect()).unwrap();
+        let config = resolve_names("smoke", world, "c51", &[], &Machine::detect()).unwrap();
         let names = config.world.action_names().join(", ");
         let world = world.replace("coinrun", "GAME");
         let line = format!("| `{world}` | `{names}` |");

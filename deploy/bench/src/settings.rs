@@ -28,5 +28,5 @@ pub(super) fn run_config(
     preset: &str,
     sets: &[&str],
 ) -> Result<RunConfig, Usage> {
-    flags::of_names(preset, world, agent, sets, &Machine::detect())
+    flags::resolve_names(preset, world, agent, sets, &Machine::detect())
 }

@@ -4,7 +4,7 @@ use driml_learner::Compute;
 use driml_machine::resources::Machine;
 use driml_model::Parameters;
 use driml_protocol::{LearnerStatus, ReplayStatus};
-use driml_settings::{config::RunConfig, flags::of_names};
+use driml_settings::{config::RunConfig, flags::resolve_names};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -35,7 +35,7 @@ pub(crate) fn view(plan: Plan, replay: ReplayStatus, learner: Option<LearnerStat
 }
 
 pub(crate) fn config(preset: &str, world: &str, agent: &str, sets: &[&str]) -> RunConfig {
-    of_names(preset, world, agent, sets, &MACHINE).unwrap()
+    resolve_names(preset, world, agent, sets, &MACHINE).unwrap()
 }
 
 /// An untrained network for this world and agent, with DIM's heads if the agent has them.

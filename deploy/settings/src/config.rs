@@ -93,14 +93,14 @@ impl RunConfig {
     }
 
     /// Like [`Self::read`], after filling in the derived settings.
-    pub(crate) fn derived(mut table: Table) -> Result<Self, Usage> {
-        derived::derive(&mut table)?;
+    pub(crate) fn derive(mut table: Table) -> Result<Self, Usage> {
+        derived::fill_in_derived(&mut table)?;
         Self::read(table)
     }
 
     /// Reads resolved settings, as in a run folder's `config.toml`.
     pub fn parse(name: &str, text: &str) -> Result<Self, Usage> {
-        let config = Self::read(derived::read_file(name, text)?);
+        let config = Self::read(derived::parse_file(name, text)?);
         let checked = config.and_then(Self::checked);
         checked.map_err(|e| usage!("{name}: {e}"))
     }
@@ -120,7 +120,7 @@ impl RunConfig {
     pub fn with_whole_frames(&self) -> Result<Self, Usage> {
         let mut whole = self.clone();
         whole.input.frame = None;
-        Self::derived(whole.to_table())?.checked()
+        Self::derive(whole.to_table())?.checked()
     }
 
     /// The names of the run's actions, in the order of the action numbers.
@@ -147,11 +147,11 @@ impl RunConfig {
 
     /// Returns these settings if they pass the checks of each component and those that span two tables.
     pub(crate) fn checked(self) -> Result<Self, Usage> {
-        fn said(e: impl std::fmt::Display) -> Usage {
+        fn to_usage(e: impl std::fmt::Display) -> Usage {
             Usage(e.to_string())
         }
-        self.run.validate().map_err(said)?;
-        self.world.validate().map_err(said)?;
+        self.run.validate().map_err(to_usage)?;
+        self.world.validate().map_err(to_usage)?;
         let name = self.world.name().to_string();
         if name != self.run.world {
             return Err(usage!(
@@ -159,7 +159,7 @@ impl RunConfig {
                 self.run.world
             ));
         }
-        self.actor.validate().map_err(said)?;
+        self.actor.validate().map_err(to_usage)?;
         if self.replay.transitions_max.is_none() {
             return Err(usage!(
                 "replay.transitions_max is missing: say with --frames how long the run is"
@@ -174,11 +174,11 @@ impl RunConfig {
             ));
         }
         let checked = replay.validate(&self.run, learner.batch_size);
-        checked.map_err(said)?;
-        learner.validate().map_err(said)?;
+        checked.map_err(to_usage)?;
+        learner.validate().map_err(to_usage)?;
         let update = learner.update.validate();
         update.map_err(|e| usage!("learner.update cannot work: {e}"))?;
-        self.model.validate().map_err(said)?;
+        self.model.validate().map_err(to_usage)?;
         if !(1..=256).contains(&local.actors) {
             let actors = local.actors;
             return Err(usage!("local.actors = {actors}: a run has 1 to 256 actors"));
@@ -205,11 +205,11 @@ impl RunConfig {
             }
         }
         let device = local.learner_device.check_precision(learner.precision);
-        device.map_err(said)?;
+        device.map_err(to_usage)?;
         self.check_auxiliary_loss()?;
         let rng = &mut ChaCha8Rng::seed_from_u64(0);
         let affinity = learner.affinity.make_estimator(self.model.num_actions, rng);
-        affinity.map_err(said)?;
+        affinity.map_err(to_usage)?;
         let needs_affinity = matches!(self.run.horizon, Horizon::Nhg { .. });
         let learns_affinity = learner.affinity.estimator != EstimatorKind::None;
         match (needs_affinity, learns_affinity) {

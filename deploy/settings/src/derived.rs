@@ -1,5 +1,5 @@
 //! The derived settings, which follow from others: filled in, checked when read back, and known by name.
-//! The user cannot set those in `FOLLOWS` by hand.
+//! The user cannot set those in `DERIVED` by hand.
 
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::UpdateSettings;
@@ -9,10 +9,10 @@ use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use crate::overrides::inline;
+use crate::overrides::inline_text;
 
 /// The derived settings: their paths, and from what they follow.
-const FOLLOWS: &str = "\
+const DERIVED: &str = "\
 run.world world.kind world.game world.command world.library: is chosen by --env
 run.agent: is chosen by --agent
 run.frame_height run.frame_width: follows from the world and what the torso reads
@@ -23,34 +23,34 @@ model.width: follows from input.width and what the torso reads
 model.input_channels: follows from the world and run.frame_stack
 model.dim model.loss_layers: follows from learner.update";
 
-/// Each path in [`FOLLOWS`], and from what it follows.
-fn all_that_follows() -> impl Iterator<Item = (&'static str, &'static str)> {
-    let lines = FOLLOWS.lines().filter_map(|line| line.split_once(": "));
+/// Each path in [`DERIVED`], and from what it follows.
+fn derived_settings() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let lines = DERIVED.lines().filter_map(|line| line.split_once(": "));
     lines.flat_map(|(paths, how)| paths.split(' ').map(move |path| (path, how)))
 }
 
 /// The path of a whole frame's size, which is set if frames are cut to what the network reads. Settings of earlier versions lack it, and
 /// their runs keep whole frames.
-pub(crate) const FRAME: &str = "input.frame";
+pub(crate) const FRAME_PATH: &str = "input.frame";
 
 /// Asks a world that runs in its own process for its declaration, and fills in its shapes, actions and input size.
-pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
+pub(crate) fn fill_in_declaration(table: &mut Table, command: &str) -> Result<(), Usage> {
     let limits = ["world.start_timeout_ms", "world.step_timeout_ms"];
-    let [start, step] = limits.map(|limit| whole_size(table, limit));
+    let [start, step] = limits.map(|limit| read_size(table, limit));
     let declared = driml_envs::probe_exec_command(command, start? as u64, step? as u64)
         .map_err(|e| usage!("--env: {e}"))?;
     for (path, side) in [
         ("input.height", declared.height),
         ("input.width", declared.width),
     ] {
-        put_missing(table, path, Value::Integer(side as i64));
+        insert_missing(table, path, Value::Integer(side as i64));
     }
-    put(table, "world", as_toml(declared)?);
+    insert(table, "world", as_toml(declared)?);
     Ok(())
 }
 
 /// Replaces each precision `auto`: by bf16 if the processor is faster in it and does the computing, else by f32.
-pub(crate) fn precision(table: &mut Table, fast_bf16: bool) {
+pub(crate) fn resolve_precision(table: &mut Table, fast_bf16: bool) {
     let device = find(table, "local.learner_device").and_then(Value::as_str);
     let on_cpu = device.is_none_or(|device| device == "cpu");
     for (path, fast) in [
@@ -59,14 +59,14 @@ pub(crate) fn precision(table: &mut Table, fast_bf16: bool) {
     ] {
         if find(table, path).and_then(Value::as_str) == Some("auto") {
             let name = if fast { "bf16" } else { "f32" };
-            put(table, path, Value::String(name.into()));
+            insert(table, path, Value::String(name.into()));
         }
     }
 }
 
 /// Removes the presets' settings of torsos other than this network's. Settings in `by_hand` stay, so that their check rejects them.
 pub(crate) fn drop_other_torsos(table: &mut Table, by_hand: &[String]) -> Result<(), Usage> {
-    let others = torso(table)?.settings_of_others();
+    let others = read_torso(table)?.settings_of_others();
     if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
         for key in others {
             if !by_hand.contains(&format!("model.{key}")) {
@@ -77,49 +77,49 @@ pub(crate) fn drop_other_torsos(table: &mut Table, by_hand: &[String]) -> Result
     Ok(())
 }
 
-fn torso(table: &Table) -> Result<TorsoName, Usage> {
-    Ok(optional(table, "model.torso")?.unwrap_or(TorsoName::Nature))
+fn read_torso(table: &Table) -> Result<TorsoName, Usage> {
+    Ok(read_optional(table, "model.torso")?.unwrap_or(TorsoName::Nature))
 }
 
 /// Returns the derived setting that is `path` or a table around it, and from what it follows; `None` if `path` is not derived.
-pub(crate) fn follows(path: &str) -> Option<(&'static str, &'static str)> {
+pub(crate) fn find_derived(path: &str) -> Option<(&'static str, &'static str)> {
     let inside = |known: &str| {
         let rest = path.strip_prefix(known);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     };
-    all_that_follows().find(|(known, _)| inside(known))
+    derived_settings().find(|(known, _)| inside(known))
 }
 
-pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
+pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
     let world = find(table, "run.world").and_then(Value::as_str);
-    let world = world.ok_or_else(|| lack("run.world", "a word"))?.parse();
+    let world = world.ok_or_else(|| missing("run.world", "a word"))?.parse();
     let world: WorldName = world.map_err(|e| usage!("run.world: {e}"))?;
-    put(table, "world.kind", Value::String(world.kind().into()));
+    insert(table, "world.kind", Value::String(world.kind().into()));
     for (key, value) in world.settings() {
-        put(table, &format!("world.{key}"), Value::String(value.into()));
+        insert(table, &format!("world.{key}"), Value::String(value.into()));
     }
-    let config: WorldConfig = table_at(table, "world")?;
-    let update: UpdateSettings = table_at(table, "learner.update")?;
+    let config: WorldConfig = read_table(table, "world")?;
+    let update: UpdateSettings = read_table(table, "learner.update")?;
     let shape = config.frame_shape();
     let frame = (shape.height, shape.width);
     let input = (
-        whole_size(table, "input.height")?,
-        whole_size(table, "input.width")?,
+        read_size(table, "input.height")?,
+        read_size(table, "input.width")?,
     );
     let mut read = ReadArea { input, frame };
-    if find(table, FRAME).is_some() {
+    if find(table, FRAME_PATH).is_some() {
         let (height, width) = (shape.height as u32, shape.width as u32);
-        put(table, FRAME, as_toml(FrameSize { height, width })?);
+        insert(table, FRAME_PATH, as_toml(FrameSize { height, width })?);
         // Augmentation crops the frame and reads the borders too.
         if find(table, "learner.augment").is_none() {
-            let input: InputSize = table_at(table, "input")?;
-            let conv: Option<Vec<ConvLayer>> = optional(table, "model.conv")?;
-            read = input.read_area(torso(table)?, &conv.unwrap_or_default(), frame);
+            let input: InputSize = read_table(table, "input")?;
+            let conv: Option<Vec<ConvLayer>> = read_optional(table, "model.conv")?;
+            read = input.read_area(read_torso(table)?, &conv.unwrap_or_default(), frame);
         }
     }
-    let set = optional(table, "actor.actions")?.unwrap_or(ActionSet::All);
+    let set = read_optional(table, "actor.actions")?.unwrap_or(ActionSet::All);
     let num_actions = config.actions(set).len();
-    let stack = whole(table, "run.frame_stack")?;
+    let stack = read_whole(table, "run.frame_stack")?;
     let size = |value: usize| Value::Integer(value as i64);
     let channels = stack.saturating_mul(shape.channels as i64);
     for (path, value) in [
@@ -133,47 +133,47 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         ("model.num_actions", size(num_actions)),
         ("model.dim", as_toml(update.dim_heads(num_actions))?),
     ] {
-        put(table, path, value);
+        insert(table, path, value);
     }
-    loss_layers(table, &update)?;
-    visible_actions(table, &config, set);
-    ladder(table);
-    beta_updates(table);
+    fill_in_loss_layers(table, &update)?;
+    fill_in_visible_actions(table, &config, set);
+    fill_in_ladder_actors(table);
+    fill_in_beta_updates(table);
     Ok(())
 }
 
 /// Fills in the layers of the auxiliary loss, if it has any. If the model or the loss is invalid, later checks report why.
-fn loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
-    if let Ok(model) = table_at::<ModelConfig>(table, "model")
+fn fill_in_loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
+    if let Ok(model) = read_table::<ModelConfig>(table, "model")
         && let Ok(loss) = update.make_auxiliary_loss()
     {
         let layers = loss.layers(&model).into_iter().map(as_toml);
         let layers = layers.collect::<Result<Vec<_>, _>>()?;
         match table.get_mut("model").and_then(Value::as_table_mut) {
             Some(model) if layers.is_empty() => _ = model.remove("loss_layers"),
-            _ => put(table, "model.loss_layers", layers.into()),
+            _ => insert(table, "model.loss_layers", layers.into()),
         }
     }
     Ok(())
 }
 
 /// Fills in the number of actors on the epsilon ladder, if there is a ladder and the number is not set.
-fn ladder(table: &mut Table) {
+fn fill_in_ladder_actors(table: &mut Table) {
     if find(table, "actor.epsilon_ladder").is_some_and(Value::is_table)
         && let Some(actors) = find(table, "local.actors").cloned()
     {
-        put_missing(table, "actor.epsilon_ladder.actors", actors);
+        insert_missing(table, "actor.epsilon_ladder.actors", actors);
     }
 }
 
 /// Fills in the updates over which beta rises, those of the whole run, if rows are drawn by priority and the number is not set.
-fn beta_updates(table: &mut Table) {
+fn fill_in_beta_updates(table: &mut Table) {
     const PATH: &str = "replay.sampling.beta_updates";
     let rule = find(table, "replay.sampling.rule").and_then(Value::as_str);
     if rule != Some("prioritised") || find(table, PATH).is_some() {
         return;
     }
-    let number = |path| optional::<f64>(table, path).ok().flatten();
+    let number = |path| read_optional::<f64>(table, path).ok().flatten();
     let updates = || {
         let transitions = number("replay.transitions_max")? - number("replay.warmup_transitions")?;
         let rows = transitions * number("replay.replay_ratio")?;
@@ -181,12 +181,12 @@ fn beta_updates(table: &mut Table) {
     };
     // If a number is missing or not above 0, its own check reports it.
     if let Some(updates) = updates().filter(|updates| updates.is_finite() && *updates > 0.0) {
-        put(table, PATH, Value::Integer((updates as i64).max(1)));
+        insert(table, PATH, Value::Integer((updates as i64).max(1)));
     }
 }
 
 /// Fills in the visible action to which each action amounts, if the affinity's alphabet is `visible` and the map is not set.
-fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
+fn fill_in_visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
     if asked && find(table, "learner.affinity.visible").is_none() {
         let map = match set {
@@ -195,25 +195,25 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
             ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
         };
         let map: Vec<_> = map.into_iter().map(i64::from).collect();
-        put(table, "learner.affinity.visible", map.into());
+        insert(table, "learner.affinity.visible", map.into());
     }
 }
 
 /// Reads the text of a file that driml wrote. An error if a derived setting differs from what follows from the others.
-pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
+pub(crate) fn parse_file(name: &str, text: &str) -> Result<Table, Usage> {
     let read = text.parse::<Table>();
     let read = read.map_err(|e| usage!("{name} is not TOML: {}", e.message()))?;
     let mut right = read.clone();
-    derive(&mut right).map_err(|e| usage!("{name}: {e}"))?;
-    for (path, how) in all_that_follows() {
+    fill_in_derived(&mut right).map_err(|e| usage!("{name}: {e}"))?;
+    for (path, how) in derived_settings() {
         let is = find(&right, path);
         if let Some(was) = find(&read, path)
             && is != Some(was)
         {
             return Err(usage!(
                 "{name}: {path} = {}, but it {how} and is {}; correct the one or the other",
-                inline(was),
-                is.map_or("not there".into(), inline)
+                inline_text(was),
+                is.map_or("not there".into(), inline_text)
             ));
         }
     }
@@ -230,7 +230,7 @@ pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
 }
 
 /// Writes a value and creates the tables on its path. Another value in place of such a table stays, for its reader to reject.
-pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
+pub(crate) fn insert(table: &mut Table, path: &str, value: Value) {
     match path.split_once('.') {
         None => {
             table.insert(path.into(), value);
@@ -239,16 +239,16 @@ pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
             let new = || Value::Table(Table::new());
             let inner = table.entry(first).or_insert_with(new);
             if let Some(inner) = inner.as_table_mut() {
-                put(inner, rest, value);
+                insert(inner, rest, value);
             }
         }
     }
 }
 
 /// Writes a value if there is none at the path.
-pub(crate) fn put_missing(table: &mut Table, path: &str, value: Value) {
+pub(crate) fn insert_missing(table: &mut Table, path: &str, value: Value) {
     if find(table, path).is_none() {
-        put(table, path, value);
+        insert(table, path, value);
     }
 }
 
@@ -256,29 +256,29 @@ fn as_toml(value: impl serde::Serialize) -> Result<Value, Usage> {
     Value::try_from(value).map_err(|e| usage!("a setting as TOML: {e}"))
 }
 
-fn lack(path: &str, what: &str) -> Usage {
+fn missing(path: &str, what: &str) -> Usage {
     usage!("the settings lack {path}, {what}: use a config.toml that driml wrote")
 }
 
-fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
+fn read_whole(table: &Table, path: &str) -> Result<i64, Usage> {
     let value = find(table, path).and_then(Value::as_integer);
-    value.ok_or_else(|| lack(path, "a whole number"))
+    value.ok_or_else(|| missing(path, "a whole number"))
 }
 
 /// Reads a whole number as a size, which is not negative. Later checks limit its range.
-fn whole_size(table: &Table, path: &str) -> Result<usize, Usage> {
-    let size = whole(table, path)?;
+fn read_size(table: &Table, path: &str) -> Result<usize, Usage> {
+    let size = read_whole(table, path)?;
     usize::try_from(size).map_err(|_| usage!("{path} = {size}: a size is not below 0"))
 }
 
-fn table_at<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
-    optional(table, path)?.ok_or_else(|| {
+fn read_table<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+    read_optional(table, path)?.ok_or_else(|| {
         usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
     })
 }
 
 /// Reads the value at a dotted path, if there is one.
-pub(crate) fn optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
+fn read_optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
     let read = find(table, path).cloned().map(Value::try_into).transpose();
     read.map_err(|e| usage!("in the settings' [{path}] table: {}", describe(&e)))
 }

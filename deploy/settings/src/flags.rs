@@ -20,9 +20,9 @@ use crate::{
 };
 
 /// The default world.
-pub const ENV: &str = "procgen:coinrun";
+pub const DEFAULT_ENV: &str = "procgen:coinrun";
 /// The default agent.
-pub const AGENT: &str = "driml-ada";
+pub const DEFAULT_AGENT: &str = "driml-ada";
 
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
@@ -42,7 +42,7 @@ pub struct RunFlags {
     pub config: Option<PathBuf>,
     /// What applies over them.
     #[command(flatten)]
-    pub over: Flags,
+    pub flags: Flags,
 }
 
 /// Flags over the source; `--set` applies after the others.
@@ -81,19 +81,19 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             (Source::File(name.clone(), text), name)
         }
         None => {
-            let world = presets::world(args.env.as_deref().unwrap_or(ENV));
+            let world = presets::world(args.env.as_deref().unwrap_or(DEFAULT_ENV));
             let world = world.map_err(|e| usage!("--env: {e}"))?;
-            let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
+            let agent = presets::agent(args.agent.as_deref().unwrap_or(DEFAULT_AGENT))?;
             let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
             let source = Source::Layers(preset, world, agent);
             (source, format!("preset {}", preset.name))
         }
     };
-    Ok((source.resolve(&args.over, machine)?, from))
+    Ok((source.resolve(&args.flags, machine)?, from))
 }
 
 /// Like [`resolve`], from names and `--set` values, for code without a command line.
-pub fn of_names(
+pub fn resolve_names(
     preset: &str,
     world: &str,
     agent: &str,
@@ -105,7 +105,7 @@ pub fn of_names(
         agent: Some(agent.into()),
         preset: Some(preset.into()),
         config: None,
-        over: Flags {
+        flags: Flags {
             sets: sets.iter().map(|&set| set.into()).collect(),
             ..Flags::default()
         },
@@ -130,20 +130,20 @@ impl Source {
     pub fn resolve(&self, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
         let mut table = match self {
             Self::Layers(preset, world, agent) => {
-                let mut table = presets::layers(preset, *world, agent)?;
+                let mut table = presets::merged(preset, *world, agent)?;
                 // Everything else follows from these names.
-                derived::put(&mut table, "run.world", world.to_string().into());
-                derived::put(&mut table, "run.agent", agent.name.into());
-                derived::put(&mut table, derived::FRAME, Table::new().into());
+                derived::insert(&mut table, "run.world", world.to_string().into());
+                derived::insert(&mut table, "run.agent", agent.name.into());
+                derived::insert(&mut table, derived::FRAME_PATH, Table::new().into());
                 if let Some(command) = world.command() {
                     // The start of the world needs its time-outs now.
                     for text in &flags.sets {
-                        let one = Override::parse(text)?;
-                        if one.path.starts_with("world.") {
-                            one.apply(&mut table)?;
+                        let parsed = Override::parse(text)?;
+                        if parsed.path.starts_with("world.") {
+                            parsed.apply(&mut table)?;
                         }
                     }
-                    derived::declare(&mut table, command)?;
+                    derived::fill_in_declaration(&mut table, command)?;
                 }
                 for (path, value) in [
                     ("local.actors", Value::from(machine.default_actors())),
@@ -152,11 +152,11 @@ impl Source {
                     ("actor.envs", resources::ENVS_PER_ACTOR.into()),
                     ("actor.world_threads", 0.into()),
                 ] {
-                    derived::put_missing(&mut table, path, value);
+                    derived::insert_missing(&mut table, path, value);
                 }
                 table
             }
-            Self::File(name, text) => derived::read_file(name, text)?,
+            Self::File(name, text) => derived::parse_file(name, text)?,
         };
         for (path, value) in [
             ("local.actors", flags.actors.map(u64::from)),
@@ -168,55 +168,55 @@ impl Source {
             if let Some(number) = value {
                 let whole = i64::try_from(number)
                     .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
-                derived::put(&mut table, path, whole.into());
+                derived::insert(&mut table, path, whole.into());
             }
         }
         let sized_by_machine = matches!(self, Self::Layers(..));
-        let by_hand = set(&mut table, &flags.sets)?;
+        let by_hand = apply_sets(&mut table, &flags.sets)?;
         let is_set = |path: &str| by_hand.iter().any(|set| set == path);
         if sized_by_machine || is_set("model.torso") {
             derived::drop_other_torsos(&mut table, &by_hand)?;
         }
-        let capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
-        derived::precision(&mut table, machine.fast_bf16);
-        let of_file = |e| match self {
+        let is_capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
+        derived::resolve_precision(&mut table, machine.fast_bf16);
+        let in_file = |e| match self {
             Self::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
             _ => e,
         };
-        let mut config = RunConfig::derived(table).map_err(of_file)?;
-        memory::fit(&mut config, capacity_set, flags.server_alone, machine).map_err(of_file)?;
-        config = config.checked().map_err(of_file)?;
+        let mut config = RunConfig::derive(table).map_err(in_file)?;
+        memory::fit(&mut config, is_capacity_set, flags.server_alone, machine).map_err(in_file)?;
+        config = config.checked().map_err(in_file)?;
         if let Self::Layers(preset, ..) = self {
-            let price = preset.price.iter().copied();
-            config.notes.extend(price.map(str::to_owned));
+            let notes = preset.accuracy_notes.iter().copied();
+            config.notes.extend(notes.map(str::to_owned));
         }
         Ok(config)
     }
 }
 
 /// Applies every `--set`; returns the paths that were set.
-fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
+fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
     let mut paths = Vec::with_capacity(sets.len());
     for text in sets {
-        let one = Override::parse(text)?;
-        if let Some((known, how)) = derived::follows(&one.path) {
+        let parsed = Override::parse(text)?;
+        if let Some((known, how)) = derived::find_derived(&parsed.path) {
             return Err(usage!("{known} cannot be set by hand: it {how}"));
         }
         let mut tried = table.clone();
-        let new = one.apply(&mut tried)?;
+        let is_new = parsed.apply(&mut tried)?;
         // A new key may be an optional setting, which the type of its table knows.
-        if new {
+        if is_new {
             let mut read = tried.clone();
-            derived::precision(&mut read, false);
-            let read = RunConfig::derived(read);
-            let key = one.path.rsplit('.').next().unwrap_or_default();
+            derived::resolve_precision(&mut read, false);
+            let read = RunConfig::derive(read);
+            let key = parsed.path.rsplit('.').next().unwrap_or_default();
             let unknown = format!("unknown field `{key}`");
             if read.is_err_and(|e| e.0.contains(&unknown)) {
-                return Err(one.unknown(table));
+                return Err(parsed.unknown_key(table));
             }
         }
         *table = tried;
-        paths.push(one.path);
+        paths.push(parsed.path);
     }
     Ok(paths)
 }

@@ -10,16 +10,16 @@ use toml::{Table, Value};
 use crate::{
     derived::{self, find},
     flags::{Flags, Source},
-    presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, preset_or_default, stack},
+    presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, merged, preset_or_default},
 };
 
 /// The column at which a setting's source begins, if the setting leaves room.
 const SOURCE_COLUMN: usize = 44;
-const BY_MACHINE: &str =
+const SET_BY_MACHINE: &str =
     "local.actors local.learner_threads local.learner_device actor.envs actor.world_threads";
 
 /// Settings that a world in its own process declares.
-const DECLARED: &str =
+const SET_BY_WORLD: &str =
     "world.height world.width world.channels world.actions input.height input.width";
 
 /// Returns the list of presets, agents and differences by game.
@@ -40,8 +40,8 @@ pub fn menu() -> Result<String, Usage> {
     );
     for world in WorldName::all() {
         let preset = preset_or_default(None, world)?;
-        let of = |name: &str| layers(preset, world, agent(name)?);
-        let (fix, noact) = (of("driml-fix")?, of("driml-noact")?);
+        let settings = |name: &str| merged(preset, world, agent(name)?);
+        let (fix, noact) = (settings("driml-fix")?, settings("driml-noact")?);
         let augments = find(&fix, "learner.augment").map_or("-", |_| "yes");
         let (world, fix_k, noact_k, lambdas) =
             (world.to_string(), k(&fix), k(&noact), lambdas(&fix));
@@ -49,9 +49,9 @@ pub fn menu() -> Result<String, Usage> {
     }
     text += "\noff in every preset\n";
     text += "--set 'actor.epsilon_ladder={base=0.4,alpha=7}'  fixed epsilons from actor to actor smaller, as Ape-X has them\n";
-    text += "\nof tuned on bigfish, fruitbot and starpilot alone, for any game\n";
+    text += "\ntuned uses it on bigfish, fruitbot and starpilot; works on any game\n";
     text += "--set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4\n";
-    text += "\nof rainbow alone, for any agent\n";
+    text += "\nrainbow uses it; works with any agent\n";
     text += "--set 'model.head={dueling=true,noisy_sigma=0.5}'  two streams of the C51 head; noisy layers (then --set actor.epsilon_start=0 too)\n";
     text += "\nEvery setting of one of them with its source: driml presets --env bigfish --agent driml-fix\n";
     Ok(text)
@@ -70,7 +70,7 @@ fn lambdas(table: &Table) -> String {
 }
 
 /// Returns the resolved settings, each with its source.
-pub fn sourced(
+pub fn settings_with_sources(
     preset: &'static Preset,
     world: WorldName,
     agent: &'static Agent,
@@ -83,8 +83,8 @@ pub fn sourced(
     };
     let table = source.resolve(&Flags::default(), &machine)?.to_table();
     let mut sources = BTreeMap::new();
-    for layer in stack(preset, world, agent) {
-        note_sources(&layer, &world.without_library().to_string(), &mut sources);
+    for layer in layers(preset, world, agent) {
+        record_sources(&layer, &world.without_library().to_string(), &mut sources);
     }
     let mut text = format!(
         "# {} in {world}, preset {}: every setting and its source. `driml train --config` takes this file.\n",
@@ -113,7 +113,7 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
         let setting = format!("{} = {value}", quoted(key));
         // Only a world in its own process has this setting.
         let is_process = sources.contains_key("world.start_timeout_ms");
-        let source = source_of(&inner(key), sources, is_process);
+        let source = find_source(&inner(key), sources, is_process);
         out.push_str(&format!("{setting:SOURCE_COLUMN$} # {source}\n"));
     }
     for (key, value) in tables {
@@ -131,20 +131,20 @@ fn quoted(key: &str) -> String {
     }
 }
 
-fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: bool) -> &'a str {
-    let is_one = |paths: &str| paths.split(' ').any(|it| it == path);
+fn find_source<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: bool) -> &'a str {
+    let is_listed = |paths: &str| paths.split(' ').any(|it| it == path);
     match sources.get(path) {
         Some(source) => source,
-        None if is_one(BY_MACHINE) => "this machine",
-        None if is_process && is_one(DECLARED) => "the world declares it",
-        None => derived::follows(path).map_or("not said", |(_, how)| how),
+        None if is_listed(SET_BY_MACHINE) => "this machine",
+        None if is_process && is_listed(SET_BY_WORLD) => "the world declares it",
+        None => derived::find_derived(path).map_or("not said", |(_, how)| how),
     }
 }
 
 /// Adds the comment on each setting of a layer, in place of the comment of an earlier layer.
-fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
-    for part in layer.parts().iter().filter(|it| it.is_for(world)) {
-        let how = if part.is_everywhere { "" } else { ", by world" };
+fn record_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
+    for part in layer.parts().iter().filter(|it| it.applies_to(world)) {
+        let how = if part.is_general { "" } else { ", by world" };
         for (path, comment) in comments(&part.text) {
             let source = format!("{comment} [{}{how}]", layer.name);
             sources.insert(path, source.trim_start().to_owned());
@@ -194,7 +194,7 @@ mod tests {
     fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {
         for world in WorldName::all() {
             for agent in AGENTS {
-                let text = sourced(&PRESETS[0], world, agent).unwrap();
+                let text = settings_with_sources(&PRESETS[0], world, agent).unwrap();
                 assert!(!text.contains("not said"), "{text}");
                 RunConfig::parse("printed", &text).unwrap();
             }
@@ -204,7 +204,7 @@ mod tests {
     #[test]
     fn a_game_s_own_choice_is_named_as_such() {
         let world = "procgen:bigfish".parse().unwrap();
-        let text = sourced(&PRESETS[0], world, agent("driml-fix").unwrap()).unwrap();
+        let text = settings_with_sources(&PRESETS[0], world, agent("driml-fix").unwrap()).unwrap();
         let mut lines = text.lines();
         let horizon = lines.find(|line| line.starts_with("horizon")).unwrap();
         assert!(

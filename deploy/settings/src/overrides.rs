@@ -38,7 +38,7 @@ impl Override {
     ///
     /// A new key is accepted in an existing table; the reader of that table decides whether the key is a setting.
     pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
-        let unknown = self.unknown(table);
+        let unknown = self.unknown_key(table);
         let (tables, key) = self.path.rsplit_once('.').ok_or_else(|| unknown.clone())?;
         let mut inner = table;
         for name in tables.split('.') {
@@ -46,14 +46,14 @@ impl Override {
             inner = found.ok_or_else(|| unknown.clone())?;
         }
         let value = match inner.get(key) {
-            Some(old) => self.as_type_of(old)?,
+            Some(old) => self.convert_to_type_of(old)?,
             None => self.value.clone(),
         };
         Ok(inner.insert(key.to_owned(), value).is_none())
     }
 
     /// Converts the value to the type of `old`, which it replaces.
-    fn as_type_of(&self, old: &Value) -> Result<Value, Usage> {
+    fn convert_to_type_of(&self, old: &Value) -> Result<Value, Usage> {
         match (old, &self.value) {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
             // A number of frames may be written as 1e6. Floats are exact whole numbers up to 2^53.
@@ -66,16 +66,16 @@ impl Override {
             (old, new) => Err(usage!(
                 "--set {}={}: the value is {}, and {new} is {}",
                 self.path,
-                inline(new),
+                inline_text(new),
                 type_name(old),
                 type_name(new),
-                new = inline(new),
+                new = inline_text(new),
             )),
         }
     }
 
     /// The error for an unknown key: the keys that exist, and the nearest one.
-    pub(crate) fn unknown(&self, table: &Table) -> Usage {
+    pub(crate) fn unknown_key(&self, table: &Table) -> Usage {
         let mut known = table;
         let mut at = Vec::new();
         for name in self.path.split('.') {
@@ -134,7 +134,7 @@ fn type_name(value: &Value) -> &'static str {
 }
 
 /// A value on one line, strings without quotes.
-pub(crate) fn inline(value: &Value) -> String {
+pub(crate) fn inline_text(value: &Value) -> String {
     match value {
         Value::String(word) => word.clone(),
         other => other.to_string(),

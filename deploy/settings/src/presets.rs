@@ -35,9 +35,9 @@ pub struct Preset {
     /// Settings over base and world, under the agent: a preset does not change what defines an agent, such as Rainbow's epsilon of 0.
     layer: Option<Layer>,
     /// The kinds of world for which the preset is made; empty means all.
-    families: &'static [&'static str],
+    world_kinds: &'static [&'static str],
     /// The accuracy that the preset gives up for speed, with the largest measured errors: lines that a run prints.
-    pub(crate) price: &'static [&'static str],
+    pub(crate) accuracy_notes: &'static [&'static str],
 }
 
 const TUNED: &str = "tuned";
@@ -51,22 +51,22 @@ pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'stati
 /// Makes [`PRESETS`]. A line has the preset's name, which is that of its file in `presets/variant/`, the kind of world if the preset is not
 /// for all, the description, and what the preset gives up.
 macro_rules! presets {
-    ($($name:literal $(for $family:literal)?: $about:literal $(, $price:literal)?;)+) => {
+    ($($name:literal $(for $kind:literal)?: $about:literal $(, $note:literal)?;)+) => {
         /// Every preset, `paper` first.
         pub const PRESETS: &[Preset] = &[
             Preset {
                 name: "paper",
                 about: "as the paper's authors ran it, at the world's own frame size (the default outside Procgen)",
                 layer: None,
-                families: &[],
-                price: &[],
+                world_kinds: &[],
+                accuracy_notes: &[],
             },
             $(Preset {
                 name: $name,
                 about: $about,
                 layer: Some(layer!("variant/" $name)),
-                families: &[$($family)?],
-                price: &[$($price)?],
+                world_kinds: &[$($kind)?],
+                accuracy_notes: &[$($note)?],
             }),+
         ];
     };
@@ -113,8 +113,8 @@ agents! {
     "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
     "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";
     "driml-randk": "DIM at a k drawn uniformly";
-    "driml-noact": "DIM that is not told the action";
-    "cpc": "one InfoNCE for each of k = 1..5, not told the action";
+    "driml-noact": "DIM without the action as input";
+    "cpc": "one InfoNCE for each of k = 1..5, without the action as input";
     "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
 }
 
@@ -178,20 +178,20 @@ pub fn world(name: &str) -> Result<WorldName, Usage> {
 pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
     let agents = agents();
     let found = agents.iter().copied().find(|agent| agent.name == name);
-    found.ok_or_else(|| Usage(unknown("agent", name, agents.iter().map(|it| it.name))))
+    found.ok_or_else(|| Usage(unknown_name("agent", name, agents.iter().map(|it| it.name))))
 }
 
 /// Finds a preset by name.
 pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
     let found = PRESETS.iter().find(|preset| preset.name == name);
     found.ok_or_else(|| {
-        let unknown = unknown("preset", name, PRESETS.iter().map(|it| it.name));
+        let unknown = unknown_name("preset", name, PRESETS.iter().map(|it| it.name));
         usage!("{unknown} (`driml presets` describes them)")
     })
 }
 
 /// The error for an unknown name after the flag `kind`: the nearest name, as a question, and all names.
-fn unknown(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> String {
+fn unknown_name(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> String {
     let all: Vec<_> = all.collect();
     let (near, names) = (did_you_mean(name, all.iter().copied()), all.join(", "));
     format!("there is no {kind} {name:?}{near}; --{kind} takes {names}")
@@ -199,18 +199,18 @@ fn unknown(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> S
 
 /// Merges base, world, preset and agent in this order: a later layer wins. In each file, the settings for all worlds come first, then each
 /// `[[only]]` block that names the world.
-pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
-    if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
+pub(crate) fn merged(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
+    if !preset.world_kinds.is_empty() && !preset.world_kinds.contains(&world.kind()) {
         return Err(usage!(
             "preset {:?} is for {} only, not for {world}; take --preset paper",
             preset.name,
-            preset.families.join(", ")
+            preset.world_kinds.join(", ")
         ));
     }
     let name = world.without_library().to_string();
     let mut table = Table::new();
-    for layer in stack(preset, world, agent) {
-        for part in layer.parts().into_iter().filter(|it| it.is_for(&name)) {
+    for layer in layers(preset, world, agent) {
+        for part in layer.parts().into_iter().filter(|it| it.applies_to(&name)) {
             merge(&mut table, part.set);
         }
     }
@@ -218,7 +218,7 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
 }
 
 /// The layers to be merged, the lowest first.
-pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
+pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
     let below = [BASE, world_layer(world)].into_iter();
     below.chain(preset.layer).chain([agent.layer]).collect()
 }
@@ -226,9 +226,9 @@ pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Lay
 /// The settings of a layer for all worlds, or one of its `[[only]]` blocks.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Part {
+pub(crate) struct LayerPart {
     #[serde(skip)]
-    pub(crate) is_everywhere: bool,
+    pub(crate) is_general: bool,
     worlds: Vec<String>,
     #[serde(default)]
     set: Table,
@@ -237,15 +237,15 @@ pub(crate) struct Part {
     pub(crate) text: String,
 }
 
-impl Part {
-    pub(crate) fn is_for(&self, world: &str) -> bool {
-        self.is_everywhere || self.worlds.iter().any(|name| name == world)
+impl LayerPart {
+    pub(crate) fn applies_to(&self, world: &str) -> bool {
+        self.is_general || self.worlds.iter().any(|name| name == world)
     }
 }
 
 impl Layer {
     /// The settings for all worlds, then the blocks for some.
-    pub(crate) fn parts(&self) -> Vec<Part> {
+    pub(crate) fn parts(&self) -> Vec<LayerPart> {
         let bad = |e| -> ! {
             panic!(
                 "presets/{}.toml, or what a program has registered by that name, is not a layer of settings: {e}",
@@ -254,10 +254,10 @@ impl Layer {
         };
         let mut set: Table = self.text.parse().unwrap_or_else(|e| bad(e));
         let blocks = set.remove("only");
-        let blocks: Option<Vec<Part>> =
+        let blocks: Option<Vec<LayerPart>> =
             blocks.map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
-        let mut parts = vec![Part {
-            is_everywhere: true,
+        let mut parts = vec![LayerPart {
+            is_general: true,
             worlds: Vec::new(),
             set,
             text: String::new(),

@@ -23,9 +23,9 @@ pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.env.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);
     }
-    let env = args.env.as_deref().unwrap_or(flags::ENV);
+    let env = args.env.as_deref().unwrap_or(flags::DEFAULT_ENV);
     let world = presets::world(env).map_err(|e| usage!("--env: {e}"))?;
     let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
-    let agent = presets::agent(args.agent.as_deref().unwrap_or(flags::AGENT))?;
-    print(&menu::sourced(preset, world, agent)?)
+    let agent = presets::agent(args.agent.as_deref().unwrap_or(flags::DEFAULT_AGENT))?;
+    print(&menu::settings_with_sources(preset, world, agent)?)
 }

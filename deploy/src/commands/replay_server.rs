@@ -45,7 +45,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     check_unused(&args.listen)?;
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;
-    args.run.over.server_alone = true;
+    args.run.flags.server_alone = true;
     let (config, _) = flags::resolve(&args.run, &Machine::detect())?;
     if config.replay.shards > 1 && !args.connect.is_empty() {
         let why = "replay shards behind one router would each store every transition: leave --connect out";

@@ -78,7 +78,7 @@ const CHECKPOINT_PERIOD: u64 = 1_000;
 
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::detect();
-    let sets = &mut args.run.over.sets;
+    let sets = &mut args.run.flags.sets;
     sets.extend((args.device).map(|device| format!("local.learner_device={device}")));
     for (is_set, set) in [
         (args.durable, "local.durable=true"),
@@ -99,7 +99,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let found = match resume::prepare(&RunFolder::new(folder), &args.run.over, &machine)? {
+            let found = match resume::prepare(&RunFolder::new(folder), &args.run.flags, &machine)? {
                 Resumption::Done(sentence) => return console::print(&format!("{sentence}\n")),
                 Resumption::Resumed(found) => found,
             };

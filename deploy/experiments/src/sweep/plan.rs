@@ -48,7 +48,7 @@ impl TrainCall {
             agent: self.agent.clone(),
             preset: self.preset.clone(),
             config: None,
-            over: Flags {
+            flags: Flags {
                 frames: self.frames,
                 seed: Some(self.seed.into()),
                 sets: self.sets.clone(),

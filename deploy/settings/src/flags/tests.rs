@@ -40,7 +40,7 @@ fn of_file(name: &str, text: String, set: &[&str]) -> Result<RunConfig, String> 
 }
 
 fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
-    of_names("paper", world, agent, set, &MACHINE).map_err(|e| e.to_string())
+    resolve_names("paper", world, agent, set, &MACHINE).map_err(|e| e.to_string())
 }
 
 #[test]
@@ -155,7 +155,7 @@ fn settings_follow_from_one_another() {
             }
         }
         let [preset, world, agent] = [words[0], words[1], words[2]];
-        let config = of_names(preset, world, agent, &words[3..], &machine).unwrap();
+        let config = resolve_names(preset, world, agent, &words[3..], &machine).unwrap();
         let text = config.to_toml();
         assert_eq!(RunConfig::parse("it", &text).unwrap().to_toml(), text);
         let table = config.to_table();

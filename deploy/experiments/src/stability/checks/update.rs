@@ -8,7 +8,7 @@ use driml_learner::{
 use driml_machine::resources::Machine;
 use driml_model::{ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
-use driml_settings::flags::of_names;
+use driml_settings::flags::resolve_names;
 
 use crate::{small, stability::property::*};
 
@@ -73,7 +73,7 @@ impl Setting {
 
     /// Creates two agents with the same scaled initial weights: one with our kernels, one with candle's.
     fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
-        let run = of_names("paper", "chain", "driml-fix", &SETS, &Machine::detect())?;
+        let run = resolve_names("paper", "chain", "driml-fix", &SETS, &Machine::detect())?;
         let model = ModelConfig {
             height: 20,
             width: 20,

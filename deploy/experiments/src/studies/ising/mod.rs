@@ -7,7 +7,7 @@ use driml_envs::WorldConfig;
 use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Outline, Panel, Series};
 use driml_launch::metrics::rounded;
 use driml_machine::{error::usage, resources::Machine};
-use driml_settings::flags::of_names;
+use driml_settings::flags::resolve_names;
 use minijinja::{Value, context};
 
 use self::training::{Episodes, Measurement, Outcome, ReceptiveFields, Settings, Task, train};
@@ -27,7 +27,7 @@ const LOSS_WINDOW: usize = 10;
 fn new_task(settings: &Settings) -> anyhow::Result<Task> {
     let sets: Vec<_> = settings.sets.iter().map(String::as_str).collect();
     // `driml-fix` gives DIM with k = 1. Nothing else of the agent is used here.
-    let config = of_names("paper", "ising", "driml-fix", &sets, &Machine::detect())?;
+    let config = resolve_names("paper", "ising", "driml-fix", &sets, &Machine::detect())?;
     // The experiment steps the world directly, and the world has full-size frames.
     let config = config.with_whole_frames()?;
     let WorldConfig::Ising(world) = config.world else {
