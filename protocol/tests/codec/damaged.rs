@@ -311,7 +311,7 @@ fn what_no_process_says_is_refused() {
 fn the_longest_messages_can_be_sent() {
     let long = "x".repeat(401);
     let warning = Some(Warning::new(&long, 0.0));
-    Sample::of(&Report::new(Participant::Learner(1), &long, 0.0, warning));
+    Sample::new(&Report::new(Participant::Learner(1), &long, 0.0, warning));
     let most = EndedEpisode {
         frames: u64::MAX,
         actor: u32::MAX,
@@ -321,7 +321,7 @@ fn the_longest_messages_can_be_sent() {
             steps: u64::MAX,
         }),
     };
-    Sample::of(&EpisodesReply {
+    Sample::new(&EpisodesReply {
         ended: u64::MAX,
         before: u64::MAX - EPISODES_MAX as u64,
         episodes: vec![most; EPISODES_MAX],

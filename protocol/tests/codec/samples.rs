@@ -26,11 +26,11 @@ pub(crate) struct Sample {
 
 impl Sample {
     /// Encodes `header`, checks that it comes back, and keeps the bytes.
-    pub(crate) fn of<M: Message + PartialEq + Debug>(header: &M) -> Self {
-        Self::with(header, &[])
+    pub(crate) fn new<M: Message + PartialEq + Debug>(header: &M) -> Self {
+        Self::with_payload(header, &[])
     }
 
-    fn with<M: Message + PartialEq + Debug>(header: &M, payload: &[u8]) -> Self {
+    fn with_payload<M: Message + PartialEq + Debug>(header: &M, payload: &[u8]) -> Self {
         let bytes = codec::encode(SPEC, header, payload).unwrap();
         for run in [Some(SPEC), None] {
             let back = codec::decode::<M>(&bytes, run).unwrap();
@@ -48,7 +48,7 @@ impl Sample {
         let (header, payload) = batch.into_payload();
         Self {
             read: read_batch,
-            ..Self::with(&BatchReply::Batch(header), &payload)
+            ..Self::with_payload(&BatchReply::Batch(header), &payload)
         }
     }
 }
@@ -339,7 +339,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         incarnation: 2,
         produced: 3,
     };
-    let mut samples: Vec<Sample> = replies.iter().map(Sample::of).collect();
+    let mut samples: Vec<Sample> = replies.iter().map(Sample::new).collect();
     let joined = [
         JoinReply::Welcome(Welcome {
             inserted_total: 3,
@@ -349,14 +349,14 @@ pub(crate) fn samples() -> Vec<Sample> {
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },
     ];
-    samples.extend(joined.map(|reply| Sample::of(&reply)));
-    samples.extend(waits.map(|waiting| Sample::of(&BatchReply::NotReady(NotReady::Wait(waiting)))));
+    samples.extend(joined.map(|reply| Sample::new(&reply)));
+    samples.extend(waits.map(|wait| Sample::new(&BatchReply::NotReady(NotReady::Wait(wait)))));
     samples.extend([
-        Sample::of(&BatchReply::NotReady(NotReady::Finished)),
-        Sample::of(&BatchReply::NotReady(NotReady::Refused {
+        Sample::new(&BatchReply::NotReady(NotReady::Finished)),
+        Sample::new(&BatchReply::NotReady(NotReady::Refused {
             why: String::new(),
         })),
-        Sample::of(&BatchRequest {
+        Sample::new(&BatchRequest {
             learner: 5,
             id: RequestId::first(u64::MAX).retry(),
             rows: 256,
@@ -368,20 +368,20 @@ pub(crate) fn samples() -> Vec<Sample> {
             },
             other_shards: Some(ShardCounts::default()),
         }),
-        Sample::of(&affinity),
-        Sample::of(&priority_update()),
-        Sample::of(&WeightsVersion { version: 9 }),
-        Sample::of(&leave),
-        Sample::of(&ReplayStatus::default()),
-        Sample::of(&replay),
-        Sample::of(&learner),
-        Sample::of(&run_info),
-        Sample::of(&recovering),
-        Sample::of(&ActorJoin {
+        Sample::new(&affinity),
+        Sample::new(&priority_update()),
+        Sample::new(&WeightsVersion { version: 9 }),
+        Sample::new(&leave),
+        Sample::new(&ReplayStatus::default()),
+        Sample::new(&replay),
+        Sample::new(&learner),
+        Sample::new(&run_info),
+        Sample::new(&recovering),
+        Sample::new(&ActorJoin {
             actor: 1,
             incarnation: 2,
         }),
-        Sample::of(&LearnerJoin {
+        Sample::new(&LearnerJoin {
             learner: 5,
             run: 1 << 60,
             updates: 9,
@@ -392,49 +392,49 @@ pub(crate) fn samples() -> Vec<Sample> {
             other_shards: ShardCounts::default(),
             restart: true,
         }),
-        Sample::of(&ChunkPoll {
+        Sample::new(&ChunkPoll {
             actor: 1,
             incarnation: 2,
             sequence: 3,
             leaving: true,
         }),
-        Sample::of(&WeightsRequest::NewerThan(7)),
-        Sample::of(&WeightsRequest::Piece {
+        Sample::new(&WeightsRequest::NewerThan(7)),
+        Sample::new(&WeightsRequest::Piece {
             version: 8,
             offset: 1 << 18,
         }),
-        Sample::of(&WeightsReply::NoneNewer),
-        Sample::of(&WeightsReply::Gone),
-        Sample::of(&WeightsReply::Piece {
+        Sample::new(&WeightsReply::NoneNewer),
+        Sample::new(&WeightsReply::Gone),
+        Sample::new(&WeightsReply::Piece {
             weights: WeightsHeader::new(8, 9, b"these"),
             bytes: 5,
             offset: 0,
         }),
-        Sample::of(&Ack),
-        Sample::of(&Report::new(
+        Sample::new(&Ack),
+        Sample::new(&Report::new(
             Participant::Learner(5),
             "learns",
             1.5,
             Some(Warning::new("a chunk was refused", 3.0)),
         )),
-        Sample::of(&processes_status()),
-        Sample::of(&EpisodesRequest {
+        Sample::new(&processes_status()),
+        Sample::new(&EpisodesRequest {
             since: 7,
             is_launcher: true,
         }),
-        Sample::of(&episodes()),
+        Sample::new(&episodes()),
     ]);
     let (upload, payload) = weights();
     samples.extend([
         Sample {
             read: read_chunk,
-            ..Sample::with(&chunk().header, chunk().payload())
+            ..Sample::with_payload(&chunk().header, chunk().payload())
         },
         Sample::batch(batch()),
         Sample::batch(prioritised_batch()),
         Sample::batch(stacked_batch(None)),
         Sample::batch(stacked_batch(Some(ORIGIN))),
-        Sample::with(&upload, &payload),
+        Sample::with_payload(&upload, &payload),
     ]);
     samples
 }

@@ -33,13 +33,13 @@ fn frames(frames: u64, set: &[&str]) -> Flags {
     }
 }
 
-fn of_file(name: &str, text: String, set: &[&str]) -> Result<RunConfig, String> {
+fn resolve_file(name: &str, text: String, set: &[&str]) -> Result<RunConfig, String> {
     let file = Source::File(name.into(), text);
     file.resolve(&sets(set), &MACHINE)
         .map_err(|e| e.to_string())
 }
 
-fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
+fn paper(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
     resolve_names("paper", world, agent, set, &MACHINE).map_err(|e| e.to_string())
 }
 
@@ -56,7 +56,7 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
                     Err(e) => panic!("{} {world} {}: {e}", preset.name, agent.name),
                 };
                 let text = config.to_toml();
-                let again = of_file("config.toml", text.clone(), &[]).unwrap();
+                let again = resolve_file("config.toml", text.clone(), &[]).unwrap();
                 assert_eq!(again.run.hash(), config.run.hash());
                 assert_eq!(again.to_toml(), text);
                 let mut read = RunConfig::parse("config.toml", &text).unwrap();
@@ -83,17 +83,17 @@ fn frames_that_are_whole_stay_whole() {
         let frame = (run.frame_height, run.frame_width);
         (frame, (model.height, model.width))
     };
-    let cut = with("procgen:bigfish", "driml-ada", &[]).unwrap();
+    let cut = paper("procgen:bigfish", "driml-ada", &[]).unwrap();
     let old = cut.with_whole_frames().unwrap();
     assert_eq!(sizes(&old), ((64, 64), (64, 64)));
     assert_eq!(old.run.seed, cut.run.seed);
     let text = old.to_toml();
     assert!(!text.contains("[input.frame]"), "{text}");
     assert_eq!(RunConfig::parse("old.toml", &text).unwrap(), old);
-    let again = of_file("old.toml", text, &["run.seed=7"]).unwrap();
+    let again = resolve_file("old.toml", text, &["run.seed=7"]).unwrap();
     assert_eq!((sizes(&again), again.run.seed), (sizes(&old), 7));
     let size = ["input.height=104", "input.width=80"];
-    let again = of_file("new.toml", cut.to_toml(), &size).unwrap();
+    let again = resolve_file("new.toml", cut.to_toml(), &size).unwrap();
     assert_eq!(sizes(&again), ((62, 61), (100, 76)));
     let text = cut.to_toml();
     let wrong = text.replace("frame_height = 60", "frame_height = 64");
@@ -104,15 +104,15 @@ fn frames_that_are_whole_stay_whole() {
 /// Settings of earlier versions do not name the set of actions.
 #[test]
 fn an_agent_has_all_actions_unless_it_chooses_among_those_that_differ() {
-    let all = with("procgen:plunder", "driml-ada", &[]).unwrap();
+    let all = paper("procgen:plunder", "driml-ada", &[]).unwrap();
     assert_eq!(all.action_names().len(), all.world.num_actions());
     let old = all.to_toml().replace("actions = \"all\"\n", "");
     assert_eq!(RunConfig::parse("old.toml", &old).unwrap(), all);
-    let names = with("procgen:plunder", "c51", &["actor.actions=visible"]).unwrap();
+    let names = paper("procgen:plunder", "c51", &["actor.actions=visible"]).unwrap();
     assert_eq!(names.action_names(), ["left", "no-op", "right", "d"]);
     for world in ["procgen:plunder", "procgen:maze", "mspacman", "chain"] {
         for set in ["actor.actions=all", "actor.actions=visible"] {
-            let config = with(world, "c51", &[set]).unwrap();
+            let config = paper(world, "c51", &[set]).unwrap();
             let names = config.action_names().len();
             assert_eq!(names, config.run.num_actions as usize, "{world} {set}");
         }
@@ -120,9 +120,9 @@ fn an_agent_has_all_actions_unless_it_chooses_among_those_that_differ() {
 }
 
 /// Returns the comments of a file, and its rows that begin with `> `, each with its answer below.
-fn answered(text: &str, answer: impl Fn(&str) -> String) -> String {
+fn fill_in_answers(text: &str, answer: impl Fn(&str) -> String) -> String {
     let lines = text.lines().filter_map(|row| match row.strip_prefix("> ") {
-        Some(asked) => Some(format!("{row}\n{}\n", answer(asked))),
+        Some(question) => Some(format!("{row}\n{}\n", answer(question))),
         None => row.starts_with('#').then(|| format!("{row}\n")),
     });
     lines.collect()
@@ -132,9 +132,9 @@ fn answered(text: &str, answer: impl Fn(&str) -> String) -> String {
 #[test]
 fn settings_that_cannot_work_are_answered_with_what_to_do() {
     let text = include_str!("../../tests/snapshots/refusals.txt");
-    let answers = answered(text, |row| {
+    let answers = fill_in_answers(text, |row| {
         let words: Vec<_> = row.split(' ').collect();
-        with(words[0], words[1], &words[2..]).unwrap_err()
+        paper(words[0], words[1], &words[2..]).unwrap_err()
     });
     expect_file!["../../tests/snapshots/refusals.txt"].assert_eq(&answers);
 }
@@ -144,7 +144,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
 #[test]
 fn settings_follow_from_one_another() {
     let text = include_str!("../../tests/snapshots/resolved.txt");
-    let answers = answered(text, |row| {
+    let answers = fill_in_answers(text, |row| {
         let (row, asked) = row.split_once(" ? ").unwrap();
         let (at, words): (Vec<_>, Vec<_>) = row.split(' ').partition(|it| it.starts_with('@'));
         let mut machine = MACHINE;
@@ -177,7 +177,7 @@ fn settings_follow_from_one_another() {
 
 #[test]
 fn a_file_at_odds_with_itself_is_refused() {
-    let text = with("mspacman", "c51", &[]).unwrap().to_toml();
+    let text = paper("mspacman", "c51", &[]).unwrap().to_toml();
     let layers =
         format!("{text}\n[[model.loss_layers]]\nname = \"next\"\ninputs = 1\noutputs = 1\n");
     let said = [
@@ -189,7 +189,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         String::new(),
         text.replace("envs = 16", "envs = 16\ncolour = 1"),
     ]
-    .map(|text| of_file("x.toml", text, &[]).unwrap_err() + "\n");
+    .map(|text| resolve_file("x.toml", text, &[]).unwrap_err() + "\n");
     expect![[r#"
         x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other
         x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct the one or the other
@@ -225,7 +225,7 @@ fn flags_come_before_set_and_both_before_the_machine() {
 
 #[test]
 fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
-    let of = |server_alone, actors, replay_shards, set: &[&str]| {
+    let size = |server_alone, actors, replay_shards, set: &[&str]| {
         let flags = Flags {
             actors: Some(actors),
             replay_shards: Some(replay_shards),
@@ -237,21 +237,21 @@ fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
         capacity.map_err(|e| e.to_string())
     };
     // Actors on other machines take none of the server's memory, and two shards have the memory of two machines.
-    assert!(of(false, 64, 1, &[]).unwrap_err().contains("64 actors"));
-    let [one, two] = [1, 2].map(|shards| of(true, 64, shards, &[]).unwrap());
+    assert!(size(false, 64, 1, &[]).unwrap_err().contains("64 actors"));
+    let [one, two] = [1, 2].map(|shards| size(true, 64, shards, &[]).unwrap());
     assert_eq!((one, two), (793_014, 1_000_000));
     // A restarted server keeps the size that fitted beside actors and learner, which now run.
     let most = "replay.capacity_transitions=1400000";
-    let said = of(false, 4, 1, &[most]).unwrap_err();
+    let said = size(false, 4, 1, &[most]).unwrap_err();
     expect!["replay.capacity_transitions = 1400000 needs 14.1 GiB, and may take 13.8 GiB, as 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said);
-    assert_eq!(of(true, 4, 1, &[most]), Ok(1_400_000));
+    assert_eq!(size(true, 4, 1, &[most]), Ok(1_400_000));
 }
 
 /// The sampling rule does not change the hash of the run's settings, so checkpoints stay valid.
 #[test]
 fn by_which_rule_rows_are_drawn_is_for_replay_and_learner_alone() {
     let all = "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
-    let [uniform, prioritised] = [&[][..], &[all]].map(|it| with("chain", "c51", it).unwrap());
+    let [uniform, prioritised] = [&[][..], &[all]].map(|it| paper("chain", "c51", it).unwrap());
     assert_eq!(uniform.replay.sampling, Sampling::Uniform {});
     assert!(prioritised.replay.sampling.is_prioritised());
     let learner = driml_learner::LearnerConfig::from_toml(&prioritised.to_toml()).unwrap();
@@ -261,10 +261,10 @@ fn by_which_rule_rows_are_drawn_is_for_replay_and_learner_alone() {
 
 #[test]
 fn a_file_s_torso_is_switched_with_its_settings() {
-    let nature = with("procgen:bigfish", "c51", &[]).unwrap();
-    let of_nature = |set: &[&str]| of_file("it.toml", nature.to_toml(), set);
-    let switched = of_nature(&["model.torso=impala", "model.channels=[8]"]).unwrap();
+    let nature = paper("procgen:bigfish", "c51", &[]).unwrap();
+    let resolve_nature = |set: &[&str]| resolve_file("it.toml", nature.to_toml(), set);
+    let switched = resolve_nature(&["model.torso=impala", "model.channels=[8]"]).unwrap();
     assert!(switched.model.conv.is_empty() && switched.run.frame_height == 64);
     expect!["model configuration: channels is empty, and torso = impala is made of it: set model.channels, or set model.torso to nature"]
-        .assert_eq(&of_nature(&["model.torso=impala"]).unwrap_err());
+        .assert_eq(&resolve_nature(&["model.torso=impala"]).unwrap_err());
 }
