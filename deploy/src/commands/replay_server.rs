@@ -67,7 +67,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
         keep_alive: args.lifetime.keep_alive,
-        drain: ending: shutdown.drain,
+        drain: shutdown.drain,
         config_toml: config.to_toml(),
     };
     clean_up_after(driml_replay_server::run(run, &shutdown.immediate))

@@ -108,7 +108,11 @@ fn tensor_files(
     extras: Extras<'_>,
 ) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
     let described = |parameters: &Parameters, description: &str| {
-        parameters.to_described_safetensors(WeightDtype::F32, description::METADATA_KEY, description)
+        parameters.to_described_safetensors(
+            WeightDtype::F32,
+            description::METADATA_KEY,
+            description,
+        )
     };
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;

@@ -96,7 +96,9 @@ impl BatchSampler {
             batch.set_draws(&draws);
         }
         let mut batch_states = batch.states_mut();
-        let numbers: Vec<usize> = (0..rows).flat_map(|row| batch_states.row_states(row)).collect();
+        let numbers: Vec<usize> = (0..rows)
+            .flat_map(|row| batch_states.row_states(row))
+            .collect();
         let frames: Vec<NeededFrame> = match shared {
             None => {
                 let frame = |(RowState { row, index }, place)| NeededFrame { row, index, place };

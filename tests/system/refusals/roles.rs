@@ -104,8 +104,16 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
         [
             Row::new(chunks, one.encode_chunk(&chunk), reason),
             Row::new(keys.actor_key::<Leave>(1), encoded(one, &leave), NO_REPLY),
-            Row::new(keys.actor_key::<ActorJoin>(1), encoded(one, &join), NO_REPLY),
-            Row::new(keys.actor_key::<ChunkPoll>(1), encoded(one, &poll), NO_REPLY),
+            Row::new(
+                keys.actor_key::<ActorJoin>(1),
+                encoded(one, &join),
+                NO_REPLY,
+            ),
+            Row::new(
+                keys.actor_key::<ChunkPoll>(1),
+                encoded(one, &poll),
+                NO_REPLY,
+            ),
         ],
     );
     wait_until("four refusals", || run.refusals() >= before + 4);

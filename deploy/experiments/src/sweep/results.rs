@@ -67,7 +67,10 @@ impl PlaySettings {
     }
 }
 
-fn checkpoints_to_play(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<CheckpointChoice>> {
+fn checkpoints_to_play(
+    folder: &RunFolder,
+    checkpoints: usize,
+) -> anyhow::Result<Vec<CheckpointChoice>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
@@ -88,7 +91,10 @@ mod tests {
     fn the_average_plays_before_the_newest_checkpoints() {
         let folder = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(folder.path());
-        assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
+        assert_eq!(
+            checkpoints_to_play(&folder, 3).unwrap(),
+            [CheckpointChoice::Newest]
+        );
         for updates in [1, 2, 3, 4] {
             let name = format!("checkpoint-{updates:012}");
             let path = folder.checkpoints().join(name);
@@ -98,6 +104,9 @@ mod tests {
         assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
-        assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), [CheckpointChoice::Newest]);
+        assert_eq!(
+            checkpoints_to_play(&folder, 3).unwrap(),
+            [CheckpointChoice::Newest]
+        );
     }
 }

@@ -77,8 +77,8 @@ impl Runs {
             false => format!("{earlier}+{commit}"),
         };
         let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
-        write_atomically(&self.beside(plan, "call.json"), &call)?;
-        write_atomically(&self.beside(plan, "commit"), commits.as_bytes())
+        write_atomically(&self.path_beside(plan, "call.json"), &call)?;
+        write_atomically(&self.path_beside(plan, "commit"), commits.as_bytes())
     }
 
     /// Returns the end of the output of the run's process.

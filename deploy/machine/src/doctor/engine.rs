@@ -15,7 +15,9 @@ pub(super) fn check_engine() -> Finding {
                 Err(why) => (State::Missing, why.to_string()),
             }
         }
-        Err(ProcgenError::Missing { reason, .. }) => not_installed(&reason, Engine::describe_source()),
+        Err(ProcgenError::Missing { reason, .. }) => {
+            not_installed(&reason, Engine::describe_source())
+        }
         Err(why) => (State::Missing, why.to_string()),
     }
 }
