@@ -65,14 +65,8 @@ pub fn load(
         let loaded = Parameters::load_part(model, part, bytes, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let key = has_key.then(|| {
-        parameters(
-            model,
-            Encoder::has_parameter,
-            KEY_ENCODER,
-            &tensors(KEY_ENCODER)?,
-        )
-    });
+    let in_key = Encoder::has_parameter;
+    let key = has_key.then(|| parameters(model, in_key, KEY_ENCODER, &tensors(KEY_ENCODER)?));
     let has_average = state.sha256.contains_key(AVERAGE);
     let average = (settings.average_tau.is_some() && has_average)
         .then(|| parameters(&model.without_dim(), |_| true, AVERAGE, &tensors(AVERAGE)?));

@@ -95,10 +95,8 @@ impl BatchSampler {
         if let Some(draws) = draws.collect::<Option<Vec<_>>>() {
             batch.set_draws(&draws);
         }
-        let mut batch_states = batch.states_mut();
-        let numbers: Vec<usize> = (0..rows)
-            .flat_map(|row| batch_states.row_states(row))
-            .collect();
+        let mut target = batch.states_mut();
+        let numbers: Vec<usize> = (0..rows).flat_map(|row| target.row_states(row)).collect();
         let frames: Vec<NeededFrame> = match shared {
             None => {
                 let frame = |(RowState { row, index }, place)| NeededFrame { row, index, place };
@@ -107,12 +105,12 @@ impl BatchSampler {
             Some(SharedFrames { frames, stacks }) => {
                 let stacks = stacks.chunks_exact(self.rules.frame_stack);
                 for (number, stack) in numbers.into_iter().zip(stacks) {
-                    batch_states.set_stack(number, stack);
+                    target.set_stack(number, stack);
                 }
                 frames
             }
         };
-        let packed_frames = write_or_defer(ring, &frames, &mut batch_states);
+        let packed_frames = write_or_defer(ring, &frames, &mut target);
         let ks = scalars.iter().map(|row| row.ks().max().unwrap_or(0));
         Some(PackedBatch {
             batch,
@@ -185,13 +183,13 @@ struct PackedFrame {
 fn write_or_defer(
     ring: &Ring,
     needed: &[NeededFrame],
-    batch_states: &mut BatchStatesMut<'_>,
+    target: &mut BatchStatesMut<'_>,
 ) -> Vec<PackedFrame> {
     match ring.frames() {
         FrameStore::Plain(frames) => {
             for &NeededFrame { index, place, .. } in needed {
                 let frame = frames.frame(ring.slot(index));
-                batch_states.frame(place).copy_from_slice(frame);
+                target.frame(place).copy_from_slice(frame);
             }
             Vec::new()
         }
@@ -219,7 +217,7 @@ impl PackedBatch {
             packed_frames,
             ..
         } = self;
-        let mut batch_states = batch.states_mut();
+        let mut target = batch.states_mut();
         let mut cache = UnpackCache {
             layout,
             parts: Vec::new(),
@@ -234,7 +232,7 @@ impl PackedBatch {
                 let at = cache.part_offset(&frame.block, part);
                 let at = at + (frame.position - first) * layout.frame_bytes;
                 let bytes = &cache.bytes[at..at + layout.frame_bytes];
-                batch_states.frame(frame.place).copy_from_slice(bytes);
+                target.frame(frame.place).copy_from_slice(bytes);
             }
         }
         batch

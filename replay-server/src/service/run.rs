@@ -307,9 +307,7 @@ impl<'a> Queries<'a> {
         let (gate, spec_hash) = (self.gate.clone(), self.client.spec_hash());
         let answer = move |incoming: Incoming<R>| match gate.service.get() {
             Some(service) => answer(service, incoming),
-            None => incoming
-                .into_responder()
-                .retry_later(&gate.recovering_reply()),
+            None => incoming.into_responder().retry_later(&gate.retry_reply()),
         };
         let workers = QueryWorkers::start(name, threads, spec_hash, answer)?;
         let gate = self.gate.clone();

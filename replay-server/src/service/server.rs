@@ -148,7 +148,7 @@ pub(super) struct ServiceGate {
 }
 
 impl ServiceGate {
-    pub(super) fn recovering_reply(&self) -> Recovering {
+    pub(super) fn retry_reply(&self) -> Recovering {
         Recovering {
             progress: self.recovery.progress(),
             config_toml: self.config_toml.clone(),

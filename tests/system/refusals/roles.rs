@@ -98,22 +98,18 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
     // At the actor's own keys, send messages that speak for another actor.
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
     let chunks = keys.actor_key::<ChunkHeader>(1);
+    let (joins, polls) = (
+        keys.actor_key::<ActorJoin>(1),
+        keys.actor_key::<ChunkPoll>(1),
+    );
     let reason = "speaks for actor 0 at the key";
     send_in_parallel(
         one,
         [
             Row::new(chunks, one.encode_chunk(&chunk), reason),
             Row::new(keys.actor_key::<Leave>(1), encoded(one, &leave), NO_REPLY),
-            Row::new(
-                keys.actor_key::<ActorJoin>(1),
-                encoded(one, &join),
-                NO_REPLY,
-            ),
-            Row::new(
-                keys.actor_key::<ChunkPoll>(1),
-                encoded(one, &poll),
-                NO_REPLY,
-            ),
+            Row::new(joins, encoded(one, &join), NO_REPLY),
+            Row::new(polls, encoded(one, &poll), NO_REPLY),
         ],
     );
     wait_until("four refusals", || run.refusals() >= before + 4);

@@ -55,7 +55,7 @@ impl PlaySettings {
         folder: &RunFolder,
         progress: &mut Progress,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        let chosen = checkpoints_to_play(folder, self.checkpoints)?;
+        let chosen = choose_checkpoints(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(chosen.len().max(1) as u32);
         let returns = chosen.into_iter().map(|choice| {
             progress.advance(0)?;
@@ -67,17 +67,14 @@ impl PlaySettings {
     }
 }
 
-fn checkpoints_to_play(
-    folder: &RunFolder,
-    checkpoints: usize,
-) -> anyhow::Result<Vec<CheckpointChoice>> {
+fn choose_checkpoints(folder: &RunFolder, count: usize) -> anyhow::Result<Vec<CheckpointChoice>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
         // Averages of three checkpoints differ little, so the newest suffices. Without a checkpoint the player reports the error.
         return Ok(vec![CheckpointChoice::Newest]);
     }
-    let newest = all.iter().rev().take(checkpoints);
+    let newest = all.iter().rev().take(count);
     Ok(newest.map(|it| CheckpointChoice::After(it.0)).collect())
 }
 
@@ -92,7 +89,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(folder.path());
         assert_eq!(
-            checkpoints_to_play(&folder, 3).unwrap(),
+            choose_checkpoints(&folder, 3).unwrap(),
             [CheckpointChoice::Newest]
         );
         for updates in [1, 2, 3, 4] {
@@ -101,11 +98,11 @@ mod tests {
             fs::create_dir_all(path).unwrap();
         }
         let newest = [4, 3, 2].map(CheckpointChoice::After);
-        assert_eq!(checkpoints_to_play(&folder, 3).unwrap(), newest);
+        assert_eq!(choose_checkpoints(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
         assert_eq!(
-            checkpoints_to_play(&folder, 3).unwrap(),
+            choose_checkpoints(&folder, 3).unwrap(),
             [CheckpointChoice::Newest]
         );
     }
