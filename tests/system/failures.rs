@@ -140,6 +140,7 @@ fn a_process_whose_launcher_died_before_it_looked_ends() {
     let parent = launcher.id();
     let server = format!("replay-server {SHORT} --exit-with-parent {parent}");
     system
-        .run_ok(&system.listen_args(&server))
+        .run(&system.listen_args(&server))
+        .expect_code(130)
         .expect_stderr("replay server stops");
 }
