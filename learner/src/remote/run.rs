@@ -168,7 +168,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     publisher.update_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
     if args.keep_alive {
-        activity.begin("has finished and stays to be asked");
+        activity.begin("has finished and is kept alive");
         shutdown.wait();
     }
     publisher.wait_until_fetched(LAST_FETCH_MAX, shutdown);

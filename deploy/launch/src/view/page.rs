@@ -55,7 +55,7 @@ pub(crate) fn status_page(view: &RunView) -> String {
         notes.extend(log.map(|log| log_line(server, log, view.servers.len())));
         notes.extend(warning_note("replay-server", status.last_warning.as_ref()));
         for process in status.processes.iter().take(ACTORS_MAX + 1) {
-            rows.push(process_row(process));
+            rows.push(process_row(process, view.is_over()));
             let who = process.who.to_string();
             notes.extend(warning_note(&who, process.last_warning.as_ref()));
         }
@@ -145,9 +145,10 @@ fn server_row(server: &ServerAnswer, server_count: usize) -> Vec<String> {
     vec![name, state, does, String::new(), String::new(), weights]
 }
 
-fn process_row(process: &ProcessStatus) -> Vec<String> {
+fn process_row(process: &ProcessStatus, is_over: bool) -> Vec<String> {
     let state = match process.connected {
         true => format!("there for {}", format_s(process.since_s)),
+        false if is_over => format!("left {} ago", format_s(process.since_s)),
         false => format!("GONE for {}", format_s(process.since_s)),
     };
     let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", format_s(age)));
