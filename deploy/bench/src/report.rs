@@ -24,7 +24,7 @@ pub(super) struct Bench<'a> {
     pub(super) table: Option<String>,
 }
 
-/// One figure.
+/// A measured rate or amount, with its name and unit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Measurement {
     /// What was measured; unique in its bench.

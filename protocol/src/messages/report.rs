@@ -21,7 +21,7 @@ pub const WARNINGS_MAX: usize = 64;
 /// One incarnation of a process, by a number that only this process and the replay server know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Participant {
-    /// An actor.
+    /// An actor, by its number and the incarnation that acts now.
     Actor {
         /// The actor's number in the run.
         actor: u32,

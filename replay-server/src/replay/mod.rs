@@ -42,7 +42,6 @@ pub struct Replay {
     pub(crate) journal: Option<Journal>,
 }
 
-/// Constructors.
 impl Replay {
     /// Creates an empty replay in memory for batches of `batch_size` rows. `spec.seed` and the order of calls determine its draws. With
     /// several shards this is shard 0; [`Replay::shard`] creates any shard.

@@ -17,7 +17,7 @@ pub enum Precision {
 }
 
 impl Precision {
-    /// Every precision.
+    /// All precisions, the more exact one first.
     pub const ALL: [Self; 2] = [Self::F32, Self::Bf16];
 
     /// Largest error of a sum of `terms` products of f32 numbers, relative to the sum of the products' magnitudes, in addition
