@@ -282,7 +282,7 @@ fn killed_and_resumed() {
     assert_eq!(summary.outcome, Outcome::Finished, "{summary:#?}");
     assert!(summary.resumed_after_updates > 0, "{summary:#?}");
     let page = system.read("x/README.md");
-    assert!(page.contains("* 1 of 1 runs are finished"), "{page}");
+    assert!(page.contains("* Finished: 1 of 1 run, each"), "{page}");
 }
 
 #[test]

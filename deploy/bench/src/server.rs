@@ -117,7 +117,10 @@ impl Server {
         let unwanted = delivery.finish()?;
         drop(alive);
         let seconds = started.elapsed().as_secs_f64();
-        ensure!(unwanted == 0, "{unwanted} transitions were not wanted");
+        ensure!(
+            unwanted == 0,
+            "transitions that the replay server did not store: {unwanted}"
+        );
         Ok(chunks.transitions() as f64 / seconds)
     }
 

@@ -1,7 +1,7 @@
 //! The page that an experiment writes: claim, command, time, expected and actual results, differences.
 //! The text is a minijinja template beside the experiment. All numbers come from the results, so that none can be stale.
 
-use driml_machine::units::rough_duration;
+use driml_machine::units::{count, rough_duration};
 use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context};
 
 use crate::{
@@ -21,7 +21,7 @@ pub(crate) fn describe_time(seconds: f64, jobs: u32, cores: Option<u32>) -> Stri
     };
     let time = format!("{}{jobs}", rough_duration(seconds));
     match cores {
-        Some(cores) => format!("{time} on a machine with {cores} cores."),
+        Some(cores) => format!("{time} on a machine with {}.", count(cores, "core")),
         None => format!("{}.", time.trim_end_matches(',')),
     }
 }
@@ -67,6 +67,7 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
         or_dash(&value, |it| format!("x{it:.2}"))
     });
     environment.add_filter("duration", |value: Value| or_dash(&value, rough_duration));
+    environment.add_filter("counted", |number: u64, noun: &str| count(number, noun));
     environment.add_filter("mean", |list: Value| reduce(&list, mean));
     environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
         reduce(&list, |all| mean_and_sd(all, decimals.unwrap_or(3), true))
@@ -183,6 +184,7 @@ mod tests {
                 "2.00 (standard deviation 1.41 over 2 seeds)\n",
             ),
             (vec![1.0], "{{ it | interval }}", "1.00 (one seed)\n"),
+            (vec![1.0], "{{ it | length | counted('run') }}", "1 run\n"),
             (
                 vec![2.0],
                 "{{ it | mean | factor }} {{ none | mean | sci }}",

@@ -6,7 +6,7 @@ use std::{path::PathBuf, str::FromStr};
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_learner::checkpoint;
-use driml_machine::{error::usage, whole_number};
+use driml_machine::{error::usage, units::count, whole_number};
 use driml_settings::config::RunConfig;
 
 use crate::run_folder::RunFolder;
@@ -86,7 +86,8 @@ pub(crate) fn checkpoint_path(
              with `driml evaluate {run} --checkpoint UPDATES --keep`"
         ),
         CheckpointChoice::After(wanted) if !known.is_empty() => usage!(
-            "{run} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
+            "{run} has no checkpoint after {}; it has those after {}. learner.checkpoints_kept sets how many are kept",
+            count(wanted, "update"),
             known.join(", ")
         ),
         _ => usage!("{run} has no checkpoint yet: let the run continue, or start it again"),

@@ -129,19 +129,19 @@ pub fn describe_error(error: &anyhow::Error) -> String {
     text
 }
 
-/// Joins lines of the form `WHAT are lost: WHY` that have the same cause into one. Other lines come first, unchanged.
+/// Joins lines of the form `lost WHAT: WHY` that have the same cause into one. Other lines come first, unchanged.
 pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String> {
-    const LOST: &str = " are lost: ";
     let mut by_cause = BTreeMap::<String, Vec<String>>::new();
     let mut joined = Vec::new();
     for line in lines {
-        match line.split_once(LOST) {
+        let lost = line.strip_prefix("lost ");
+        match lost.and_then(|it| it.split_once(": ")) {
             Some((what, why)) => by_cause.entry(why.into()).or_default().push(what.into()),
             None => joined.push(line),
         }
     }
     let lost = by_cause.iter();
-    joined.extend(lost.map(|(why, what)| format!("{}{LOST}{why}", what.join(", "))));
+    joined.extend(lost.map(|(why, what)| format!("lost {}: {why}", what.join(", "))));
     joined
 }
 
@@ -375,8 +375,8 @@ mod tests {
         assert!(is_due("a.csv: No space left on device (os error 28)", 601));
         assert_eq!(full.omitted, 1);
 
-        let lost = "2 rows of a are lost: full\nx\n1 rows of b are lost: full";
+        let lost = "lost 2 rows of a: full\nx\nlost 1 row of b: full";
         let joined = join_losses(lost.lines().map(str::to_owned));
-        assert_eq!(joined, ["x", "2 rows of a, 1 rows of b are lost: full"]);
+        assert_eq!(joined, ["x", "lost 2 rows of a, 1 row of b: full"]);
     }
 }

@@ -8,7 +8,7 @@ use std::{
 };
 
 use driml_learner::checkpoint;
-use driml_machine::error::Interrupted;
+use driml_machine::{error::Interrupted, units::count};
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
@@ -180,7 +180,8 @@ impl Evaluator {
         match ManagedProcess::start("evaluation", &args, 1, &logs, screen, None) {
             Ok(process) => self.process = Some(process),
             Err(e) => screen.print_line(&format!(
-                "the checkpoint after {updates} updates is not played: {e:#}"
+                "the checkpoint after {} is not played: {e:#}",
+                count(updates, "update")
             )),
         }
         self.process.is_some()

@@ -3,7 +3,7 @@
 //! Measured on runs of 1, 4 and 12 actors: a replay server has 40 open files and 4 per actor (2 without shared memory), the launcher
 //! 40 and 3 per process, each other process 33.
 
-use driml_machine::error::Usage;
+use driml_machine::{error::Usage, units::count};
 use driml_settings::config::RunConfig;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
@@ -43,14 +43,16 @@ pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
         true => (server_files, "the replay server"),
         false => (launcher_files, "the launcher"),
     };
-    check_limit(needed, &format!("{whose} of a run with {actors} actors")).map_err(Usage)
+    let whose = format!("{whose} of a run with {}", count(actors, "actor"));
+    check_limit(needed, &whose).map_err(Usage)
 }
 
 /// Warns if a replay server that is started by hand may not open as many files as the actors in its settings need.
 pub fn warn_if_limit_low(config: &RunConfig) {
     let actors = u64::from(config.local.actors);
     let needed = server_files(actors, config.transport.shared_memory);
-    if let Err(why) = check_limit(needed, &format!("a replay server for {actors} actors")) {
+    let whose = format!("a replay server for {}", count(actors, "actor"));
+    if let Err(why) = check_limit(needed, &whose) {
         tracing::warn!("{why}");
     }
 }

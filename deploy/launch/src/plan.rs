@@ -7,7 +7,10 @@ use driml_learner::{
     DeviceName, Precision,
     cost::{UpdateCost, UpdateShape},
 };
-use driml_machine::{resources::Machine, units::duration};
+use driml_machine::{
+    resources::Machine,
+    units::{count, duration},
+};
 use driml_settings::{
     config::RunConfig,
     memory::{COMPRESSED_FIELDS_BYTES, replay_bytes_each},
@@ -58,13 +61,14 @@ pub fn describe(
     let left = (1.0 - resume_point.updates as f64 / updates.max(1) as f64).max(0.0);
     let time = format_estimate(estimate(config, machine.cores).mul_f64(left));
     let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
+    let (updates, rows) = (count(updates, "update"), count(rows, "row"));
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);
     let (processes, run_dir) = (processes(config, lockstep), run_dir.display());
     let note = |note: &String| format!("{:INDENT$}{note}\n", "note");
     let notes: String = config.notes.iter().map(note).collect();
     format!(
         "trains      {agent} on {world}, seed {seed}, from {source}\n\
-         frames      {frames} in all, with {updates} updates of {rows} rows (replay ratio {ratio})\n\
+         frames      {frames} in all, with {updates} of {rows} (replay ratio {ratio})\n\
          processes   {processes}\n\
          replay      the newest {held} transitions, up to {bytes} of memory{disk}\n\
          run folder  {run_dir}\n\
@@ -80,15 +84,15 @@ fn processes(config: &RunConfig, lockstep: bool) -> String {
         1 => "replay server".into(),
         shards => format!("{shards} replay servers"),
     };
-    let threads = config.local.learner_threads;
+    let threads = count(config.local.learner_threads, "thread");
     let learner = match (config.local.learner_device, config.learner.precision) {
-        (DeviceName::Cpu, Precision::F32) => format!("with {threads} threads"),
-        (DeviceName::Cpu, precision) => format!("with {threads} threads, in {precision}"),
+        (DeviceName::Cpu, Precision::F32) => format!("with {threads}"),
+        (DeviceName::Cpu, precision) => format!("with {threads}, in {precision}"),
         (gpu, _) => format!("on {gpu}"),
     };
-    let (count, envs) = (config.local.actors, config.actor.envs);
-    let actors = if count == 1 { "actor" } else { "actors" };
-    format!("{servers}; learner {learner}; {count} {actors} with {envs} environments each")
+    let actors = count(config.local.actors, "actor");
+    let envs = count(config.actor.envs, "environment");
+    format!("{servers}; learner {learner}; {actors} with {envs} each")
 }
 
 fn format_size(bytes: u64) -> String {

@@ -39,7 +39,7 @@ impl ProcessLog {
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
         let path = logs.join(format!("{name}.log"));
         let state = LogState {
-            file: AppendLog::open(&path, format!("the log of {name}"), "lines", WAITING_MAX)?,
+            file: AppendLog::open(&path, format!("the log of {name}"), "line", WAITING_MAX)?,
             tail: VecDeque::new(),
             error: None,
         };

@@ -17,6 +17,7 @@ use driml_learner::{
 use driml_machine::{
     error::{Interrupted, usage},
     resources::Machine,
+    units::count,
 };
 use driml_protocol::Sampling;
 use driml_replay_server::RatioStart;
@@ -239,9 +240,10 @@ pub fn prepare(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::
     // The last chunk is stored whole, so a run may have more frames than planned.
     let is_shortened = config.frames() < frames.min(before.frames());
     if is_complete && (is_shortened || Summary::is_finished(folder)) {
-        let run = folder.quoted();
+        let (run, updates) = (folder.quoted(), count(updates, "update"));
+        let frames = count(frames, "frame");
         return Ok(Resumption::Done(format!(
-            "nothing is left to do: the run in {run} has done {updates} updates and {frames} frames.\n\
+            "nothing is left to do: the run in {run} has done {updates} and {frames}.\n\
              `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains on, up to N frames"
         )));
     }

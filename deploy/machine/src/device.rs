@@ -4,7 +4,10 @@
 use clap::Args;
 use driml_model::DeviceName;
 
-use crate::error::{Usage, usage};
+use crate::{
+    error::{Usage, usage},
+    units,
+};
 
 #[cfg(not(feature = "cuda"))]
 const BUILD_HINT: &str = "this program was built without CUDA; with a CUDA toolkit `cargo build --release --features cuda` builds one \
@@ -26,7 +29,8 @@ pub fn check_device(device: DeviceName) -> Result<(), Usage> {
     let described = device_count().and_then(|count| match ordinal < count {
         true => describe_cuda(ordinal),
         false => Err(format!(
-            "the driver finds {count} device(s), counted from cuda:0"
+            "the driver finds {}, numbered from cuda:0",
+            units::count(count, "device")
         )),
     });
     let checked = described.map(drop);
@@ -85,7 +89,7 @@ fn describe_cuda(ordinal: usize) -> Result<String, String> {
     };
     let (name, (major, minor), free, total) =
         query().map_err(|why| format!("asking for its properties: {why}"))?;
-    let [free, total] = [free, total].map(|bytes| crate::units::gib(bytes as u64));
+    let [free, total] = [free, total].map(|bytes| units::gib(bytes as u64));
     let text = format!("{name}, compute capability {major}.{minor}, {total}, {free} free");
     match option_env!("CUDA_COMPUTE_CAP").and_then(|it| it.parse().ok()) {
         Some(built) if !runs_on(built, (major, minor)) => Err(format!(

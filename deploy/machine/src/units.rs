@@ -1,6 +1,6 @@
 //! Times, sizes and other numbers in human-readable form.
 
-use std::time::Duration;
+use std::{fmt::Display, time::Duration};
 
 /// Formats a time in at most two units, such as `17 min 23 s`.
 pub fn duration(time: Duration) -> String {
@@ -22,6 +22,12 @@ pub fn rough_duration(seconds: f64) -> String {
     } else {
         format!("{:.1} h", seconds / 3_600.0)
     }
+}
+
+/// Formats a count and its noun, which gets an s unless the count is 1: `1 frame`, `2 frames`.
+pub fn count<N: Display + PartialEq + From<u8>>(number: N, noun: &str) -> String {
+    let ending = if number == N::from(1) { "" } else { "s" };
+    format!("{number} {noun}{ending}")
 }
 
 /// Formats a size in GiB, with one decimal.
@@ -60,6 +66,8 @@ mod tests {
         let texts = [0.9994, 0.9996, 9.994, 9.996, 99.94, 99.96].map(format_number);
         assert_eq!(texts, ["0.999", "1.00", "9.99", "10.0", "99.9", "100"]);
         assert_eq!(gib(3 << 29), "1.5 GiB");
+        let texts = [0, 1, 2].map(|number: u64| count(number, "frame"));
+        assert_eq!(texts, ["0 frames", "1 frame", "2 frames"]);
     }
 
     #[test]

@@ -3,7 +3,10 @@
 
 use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
-use driml_machine::error::{Usage, usage};
+use driml_machine::{
+    error::{Usage, usage},
+    units::count,
+};
 use driml_model::{InputSize, ModelConfig};
 use driml_protocol::{
     Horizon, RunSpec,
@@ -169,7 +172,8 @@ impl RunConfig {
         let (frames, warmup) = (self.frames(), replay.warmup_transitions);
         if frames <= warmup {
             return Err(usage!(
-                "{frames} frames are no more than the warm-up of {warmup}: ask for more --frames, or --set replay.warmup_transitions={}",
+                "a run of {} ends within the warm-up of {warmup}: ask for more --frames, or --set replay.warmup_transitions={}",
+                count(frames, "frame"),
                 frames / 10
             ));
         }
@@ -194,8 +198,9 @@ impl RunConfig {
             let period = learner.checkpoint_period_updates;
             if every_updates == 0 || !every_updates.is_multiple_of(period) {
                 return Err(usage!(
-                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every {period} updates; \
-                     take a multiple of that, or --set learner.checkpoint_period_updates"
+                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every {}; \
+                     take a multiple of that, or --set learner.checkpoint_period_updates",
+                    count(period, "update")
                 ));
             }
             if !(1..=1_000_000).contains(&episodes) {

@@ -4,7 +4,7 @@
 use driml_machine::{
     error::{Usage, usage},
     resources::{self, Machine},
-    units::gib,
+    units::{count, gib},
 };
 use driml_protocol::RunSpec;
 use driml_replay_server::Compression;
@@ -37,7 +37,8 @@ pub(crate) fn fit(
     let free = gib(machine.memory_bytes);
     if machine.memory_bytes <= other_bytes {
         return Err(usage!(
-            "{actors} actors of {world} and a learner take about {}, and {free} are free: use fewer --actors, with more --envs each; in a sweep fewer --jobs",
+            "{} of {world} and a learner take about {}, and {free} are free: use fewer --actors, with more --envs each; in a sweep fewer --jobs",
+            count(actors, "actor"),
             gib(other_bytes)
         ));
     }

@@ -5,7 +5,10 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::console::print;
 use driml_learner::{Kernels, Precision};
-use driml_machine::device::{DeviceFlag, check_device};
+use driml_machine::{
+    device::{DeviceFlag, check_device},
+    units::count,
+};
 
 #[derive(Debug, Args)]
 pub(crate) struct ParityArgs {
@@ -35,7 +38,7 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }
-    let all = args.files.len();
-    anyhow::ensure!(failed == 0, "{failed} of {all} files are out of tolerance");
+    let all = count(args.files.len(), "file");
+    anyhow::ensure!(failed == 0, "{failed} of {all} out of tolerance");
     Ok(())
 }

@@ -13,7 +13,9 @@ use driml_launch::{
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
-use driml_machine::{device::check_device, error::usage, resources::Machine, whole_number};
+use driml_machine::{
+    device::check_device, error::usage, resources::Machine, units::count, whole_number,
+};
 use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
     config::RunConfig,
@@ -109,7 +111,10 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
                     "a run in lockstep is one process: leave --listen out"
                 ));
             }
-            let from = format!("its checkpoint after {} updates", found.point.updates);
+            let from = format!(
+                "its checkpoint after {}",
+                count(found.point.updates, "update")
+            );
             (found.config, from, Some(found.point))
         }
         None => {
@@ -162,7 +167,8 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
     let shards = replay.shards;
     if shards > actors {
         bail!(usage!(
-            "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
+            "{shards} replay shards for {}: a shard without actors would stay empty; add --actors {shards} or use fewer shards",
+            count(actors, "actor")
         ));
     }
     // All actors are started here, so the ladder of epsilons must have exactly one rung for each.
@@ -170,8 +176,8 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
         && ladder.actors != actors
     {
         bail!(usage!(
-            "actor.epsilon_ladder is for {} actors, but {actors} are started: --set actor.epsilon_ladder.actors={actors}",
-            ladder.actors
+            "actor.epsilon_ladder is for {}, but --actors is {actors}: --set actor.epsilon_ladder.actors={actors}",
+            count(ladder.actors, "actor")
         ));
     }
     if lockstep && shards > 1 {

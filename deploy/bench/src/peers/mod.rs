@@ -12,7 +12,11 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console::{self, align_columns};
-use driml_machine::{resources::MachineInfo, speed_meter::median, units::format_number};
+use driml_machine::{
+    resources::MachineInfo,
+    speed_meter::median,
+    units::{count, format_number},
+};
 use serde::Serialize;
 
 use crate::{
@@ -215,11 +219,13 @@ fn format_table(comparison: &Comparison) -> String {
     }
     let mut text = align_columns(&cells, &[1, 2, 5, 6]);
     text.extend(skipped);
-    let (rounds, threads) = (comparison.rounds, comparison.threads);
+    let rounds = count(comparison.rounds, "round");
+    let threads = count(comparison.threads, "thread");
     let machine = &comparison.machine;
-    let (processor, cores, load) = (&machine.processor, machine.cores, machine.load);
+    let (processor, load) = (&machine.processor, machine.load);
+    let cores = count(machine.cores, "core");
     text.push_str(&format!(
-        "Medians of {rounds} rounds of ours, theirs; the ratio is the median of the rounds' ratios. {threads} threads; {processor}, {cores} cores.\n"
+        "ours, theirs: medians of {rounds}; ratio: median of the rounds' ratios. {threads}; {processor}, {cores}.\n"
     ));
     if load > LOAD_MAX {
         text.push_str(&format!(

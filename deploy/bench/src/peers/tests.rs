@@ -61,7 +61,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
         what  ours  theirs                      ratio  goal
         C51   6.00       -  updates/s  PyTorch      -  1.50  skipped
         skipped: python3 has no PyTorch
-        Medians of 1 rounds of ours, theirs; the ratio is the median of the rounds' ratios. 2 threads; a processor, 2 cores.
+        ours, theirs: medians of 1 round; ratio: median of the rounds' ratios. 2 threads; a processor, 2 cores.
         The machine was not idle before: 6.60 tasks wanted a core. These figures are not reliable.
         Quick: a few iterations only; these figures are not reliable.
     "#]]

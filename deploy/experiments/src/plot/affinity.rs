@@ -4,7 +4,7 @@
 use driml_figure::{Figure, Heat, Panel};
 use driml_launch::{checkpoint_choice::read_config, run_folder::RunFolder};
 use driml_learner::checkpoint;
-use driml_machine::error::usage;
+use driml_machine::{error::usage, units::count};
 
 use super::runs::folder_name;
 
@@ -36,7 +36,8 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
         .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
     let side = affinity.num_actions();
     let values = affinity.matrix().into_iter().map(|a| Some(f64::from(a)));
-    let title = format!("{}, {updates} updates", folder_name(folder.path()));
+    let updates = count(*updates, "update");
+    let title = format!("{}, {updates}", folder_name(folder.path()));
     Ok(Heat {
         names: action_names(folder, side),
         labels: ("next action".into(), "action".into()),

@@ -19,7 +19,7 @@ use driml_launch::{
     stats::mean_and_deviation,
     view::loss_title,
 };
-use driml_machine::error::usage;
+use driml_machine::{error::usage, units::count};
 
 pub(crate) use self::{
     flags::Band,
@@ -220,7 +220,8 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
         None => notes.push("Not smoothed.".into()),
     }
     if let Some(episodes) = args.random {
-        notes.push(format!("Random policy: mean of {episodes} whole episodes."));
+        let episodes = count(episodes, "whole episode");
+        notes.push(format!("Random policy: mean of {episodes}."));
     }
     notes
 }

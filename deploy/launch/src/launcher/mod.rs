@@ -11,7 +11,7 @@ pub(crate) use processes::process_names;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use driml_machine::units::duration;
+use driml_machine::units::{count, duration};
 use driml_protocol::{GracefulShutdown, Silence, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
@@ -225,10 +225,10 @@ impl Launch<'_> {
                 counts_before = counts;
             } else if standstill.record_failure() > STALL_MAX {
                 bail!(
-                    "no frame and no update for {}, at {} frames and {} updates ({}): see {}",
+                    "no frame and no update for {}, at {} and {} ({}): see {}",
                     duration(STALL_MAX),
-                    counts.0,
-                    counts.1,
+                    count(counts.0, "frame"),
+                    count(counts.1, "update"),
                     view.replay.waiting,
                     self.run_dir.logs().display()
                 );

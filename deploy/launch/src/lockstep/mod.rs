@@ -10,6 +10,7 @@ mod tests;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use driml_machine::units::count;
 use driml_protocol::{GracefulShutdown, Shutdown};
 use driml_settings::config::RunConfig;
 
@@ -81,8 +82,9 @@ pub fn run(
             save_tried_at = updates;
             // A failed save does not end the training, but at the end of the run it is an error.
             if let Err(e) = lockstep.save(&folder) {
+                let updates = count(updates, "update");
                 screen.print_line(&format!(
-                    "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
+                    "no checkpoint after {updates}, retrying at the next period: {e:#}"
                 ));
             } else {
                 saved = Some((updates, lockstep.replay.inserted_total()));

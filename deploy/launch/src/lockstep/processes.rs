@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
 use driml_envs::EnvError;
 use driml_learner::{BatchPart, Learner, LearnerConfig, checkpoint};
-use driml_machine::error::usage;
+use driml_machine::{error::usage, units::count};
 use driml_protocol::{
     ActorJoin, Batch, BufferPool, InsertReply, LearnerStatus, Leave, WeightsHeader, codec,
 };
@@ -123,10 +123,11 @@ impl Lockstep {
         let learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
         let replay = open(config, run_dir, Some(saved.replay))?;
         let (actors, turn) = (saved.actors, saved.turn);
-        let (found, count) = (actors.len(), config.local.actors as usize);
+        let (found, wanted) = (actors.len(), config.local.actors as usize);
         let resuming = "resuming the actors from the checkpoint";
-        if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
-            bail!("{resuming}: it holds {found} actors, and this run has {count}");
+        if found != wanted || turn.unwanted.len() != wanted || turn.next_actor >= wanted {
+            let found = count(found, "actor");
+            bail!("{resuming}: it holds {found}, and this run has {wanted}");
         }
         let mut this = Self::assemble(config, learner, replay, turn).context(resuming)?;
         for (actor, state) in this.actors.iter_mut().zip(actors) {

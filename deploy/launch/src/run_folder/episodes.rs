@@ -8,6 +8,7 @@
 
 use std::collections::VecDeque;
 
+use driml_machine::units::count;
 use driml_protocol::{EndedEpisode, EpisodesReply, RETURNS_MAX, ReplayStatus};
 use serde::Deserialize;
 
@@ -138,7 +139,8 @@ impl TrainingEpisodes {
                 let missing = reply.before - received;
                 if missing > 0 {
                     warnings.extend((self.lost == 0).then(|| {
-                        format!("{missing} episodes have no row in episodes.csv: the replay server keeps no more between two looks")
+                        let missing = count(missing, "episode");
+                        format!("episodes.csv lacks {missing}: more ended between two requests than the replay server keeps")
                     }));
                     self.lost += missing;
                     self.newest += missing;
@@ -212,8 +214,8 @@ impl TrainingEpisodes {
     pub(super) fn loss_messages(&self) -> Vec<String> {
         let lost = (self.lost > 0).then(|| {
             format!(
-                "{} episodes have no row in episodes.csv: more ended between two looks than the replay server keeps",
-                self.lost
+                "episodes.csv lacks {}: more ended between two requests than the replay server keeps",
+                count(self.lost, "episode")
             )
         });
         self.table.loss_message().into_iter().chain(lost).collect()

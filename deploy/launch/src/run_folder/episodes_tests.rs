@@ -105,7 +105,7 @@ fn what_the_server_has_let_go_is_counted_and_said() {
     let (_root, folder, mut episodes) = begun();
     update(&mut episodes, &[shard(10, 0, 5, 0)]);
     let said = update(&mut episodes, &[shard(90, 155, 255, 0)]);
-    let why = "150 episodes have no row in episodes.csv";
+    let why = "episodes.csv lacks 150 episodes";
     for said in [&said[0], &episodes.loss_messages()[0]] {
         assert!(said.starts_with(why), "{said}");
     }

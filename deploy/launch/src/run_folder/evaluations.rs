@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_machine::error::usage;
+use driml_machine::{error::usage, units::count};
 use driml_protocol::atomic_write;
 use serde::Deserialize;
 
@@ -88,8 +88,11 @@ impl EvaluationRow {
     /// Describes the evaluation in one line.
     pub fn describe(&self) -> String {
         format!(
-            "evaluated after {} updates: mean return {:.3}, standard deviation {:.3} over {} episodes",
-            self.updates, self.mean_return, self.deviation, self.episodes
+            "evaluated after {}: mean return {:.3}, standard deviation {:.3} over {}",
+            count(self.updates, "update"),
+            self.mean_return,
+            self.deviation,
+            count(self.episodes, "episode")
         )
     }
 

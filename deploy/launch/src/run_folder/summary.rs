@@ -4,7 +4,7 @@
 use std::{collections::BTreeMap, fs, time::Duration};
 
 use anyhow::Context;
-use driml_machine::units::duration;
+use driml_machine::units::{count, duration};
 use driml_protocol::ReplayStatus;
 use serde::{Deserialize, Serialize};
 
@@ -216,11 +216,11 @@ impl Summary {
 
     /// How the run ended and what it counted, in one line.
     pub(crate) fn describe_counts(&self) -> String {
-        let (count, episodes) = (self.mean_return_of, self.episodes);
+        let (of, episodes) = (self.mean_return_of, count(self.episodes, "episode"));
         let returns = match self.mean_return {
             None => "no episode ended".into(),
             Some(mean) => {
-                format!("mean return {mean:.2} over the last {count} of {episodes} episodes")
+                format!("mean return {mean:.2} over the last {of} of {episodes}")
             }
         };
         let ratio = self.replay_ratio.map(|it| format!("{it:.2}"));
@@ -229,9 +229,9 @@ impl Summary {
             _ => "interrupted",
         };
         format!(
-            "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
-            self.frames,
-            self.updates,
+            "{how}: {} and {} in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
+            count(self.frames, "frame"),
+            count(self.updates, "update"),
             duration(Duration::try_from_secs_f64(self.wall_seconds).unwrap_or_default()),
             self.frames_per_second,
             self.updates_per_second,

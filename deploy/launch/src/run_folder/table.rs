@@ -12,7 +12,7 @@ use std::{
 
 use anyhow::Context;
 use csv::StringRecord;
-use driml_machine::error::usage;
+use driml_machine::{error::usage, units::count};
 use driml_protocol::atomic_write;
 use serde::de::DeserializeOwned;
 
@@ -125,8 +125,8 @@ impl Table {
         write_atomically(&aside_path, &set_aside.to_csv())?;
         let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
         console::eprintln(&format!(
-            "{} rows of {} are past the point where the run is resumed; they are now in {}",
-            set_aside.rows.len(),
+            "{} of {} past the point where the run is resumed: moved to {}",
+            count(set_aside.rows.len(), "row"),
             name(path),
             name(&aside_path)
         ));
@@ -138,7 +138,7 @@ impl Table {
 #[derive(Debug)]
 pub(crate) struct AppendLog {
     name: String,
-    /// The word for what is appended: rows or lines.
+    /// The word for one entry: row or line.
     unit: &'static str,
     file: File,
     waiting: VecDeque<Vec<u8>>,
@@ -152,10 +152,10 @@ impl AppendLog {
     pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
         write_atomically(path, first)?;
         let name = path.file_name().unwrap_or_default();
-        Self::open(path, name.to_string_lossy().into(), "rows", WAITING_MAX)
+        Self::open(path, name.to_string_lossy().into(), "row", WAITING_MAX)
     }
 
-    /// Opens a file to append, or makes it. Messages call it `name`, and its entries `unit`; at most `waiting_max` entries wait.
+    /// Opens a file to append, or makes it. Messages call it `name`, and an entry `unit`; at most `waiting_max` entries wait.
     pub(crate) fn open(
         path: &Path,
         name: String,
@@ -182,7 +182,7 @@ impl AppendLog {
         let error = self.write().err()?;
         let (name, unit) = (&self.name, self.unit);
         let warning = self.error.is_none().then(|| {
-            format!("{name} cannot be written: {error}; its {unit} wait in memory until it can be")
+            format!("{name} cannot be written: {error}; its {unit}s wait in memory until it can be")
         });
         self.error.get_or_insert(error);
         warning
@@ -197,10 +197,10 @@ impl AppendLog {
 
     /// How many rows are not in the file, and why; none if all are in it.
     pub(crate) fn loss_message(&self) -> Option<String> {
-        let rows = self.lost + self.waiting.len() as u64;
-        let error = self.error.as_ref().filter(|_| rows > 0)?;
-        let (name, unit) = (&self.name, self.unit);
-        Some(format!("{rows} {unit} of {name} are lost: {error}"))
+        let lost = self.lost + self.waiting.len() as u64;
+        let error = self.error.as_ref().filter(|_| lost > 0)?;
+        let (name, lost) = (&self.name, count(lost, self.unit));
+        Some(format!("lost {lost} of {name}: {error}"))
     }
 }
 
@@ -259,7 +259,7 @@ mod tests {
         let aside = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
         assert_eq!(aside, b"a,b\n3,\"4, of five\"\n");
         let log = AppendLog::create(&path, &table.to_csv()).unwrap();
-        assert_eq!((log.name.as_str(), log.unit), ("x.csv", "rows"));
+        assert_eq!((log.name.as_str(), log.unit), ("x.csv", "row"));
     }
 
     #[test]
@@ -268,18 +268,18 @@ mod tests {
         let text = |n: u64| format!("\"{n}, of five\"\n");
         let row = |n| [text(n).into_bytes()];
         for (name, unit, waiting_max, lost) in [
-            ("metrics.csv", "rows", WAITING_MAX, 0),
-            ("the log of actor-0", "lines", 2, 1),
+            ("metrics.csv", "row", WAITING_MAX, 0),
+            ("the log of actor-0", "line", 2, 1),
         ] {
             let full = Path::new("/dev/full");
             let mut log = AppendLog::open(full, name.into(), unit, waiting_max).unwrap();
             let said = log.add(row(1)).unwrap();
             let why = format!("{name} cannot be written: No space left");
-            let wait = format!("; its {unit} wait in memory until it can be");
+            let wait = format!("; its {unit}s wait in memory until it can be");
             assert!(said.starts_with(&why) && said.ends_with(&wait), "{said}");
             assert_eq!(log.add(row(2)), None, "it is logged once");
             let missing = log.loss_message().unwrap();
-            let why = format!("2 {unit} of {name} are lost: No space left");
+            let why = format!("lost 2 {unit}s of {name}: No space left");
             assert!(missing.starts_with(&why), "{missing}");
 
             let path = folder.path().join(unit);

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_machine::units::duration;
+use driml_machine::units::{count, duration};
 use driml_protocol::{ReplayStatus, Waiting};
 
 use super::advice::notes;
@@ -107,9 +107,9 @@ impl Display {
         [
             progress_text(view, Some(frames), Some(updates)),
             format!(
-                "return {} ({} episodes){losses}{}  {}{}",
+                "return {} ({}){losses}{}  {}{}",
                 two_decimals(episodes.mean_return),
-                episodes.count,
+                count(episodes.count, "episode"),
                 k.unwrap_or_default(),
                 waiting_text(&view.replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
@@ -126,11 +126,13 @@ fn plain_line(elapsed: Duration, texts: &[String]) -> String {
 fn waiting_text(replay: &ReplayStatus) -> String {
     match (replay.waiting, replay.actors_waiting) {
         (Waiting::ActorsWaitForLearner, waiting @ 1..) if waiting <= replay.actors => {
-            format!("{waiting} of {} actors wait for learner", replay.actors)
+            let actors = count(replay.actors, "actor");
+            format!("waiting for learner: {waiting} of {actors}")
         }
         // The chunk of an actor that has disconnected waits too.
         (Waiting::ActorsWaitForLearner, waiting @ 1..) => {
-            format!("chunks of {waiting} actors wait for learner")
+            let actors = count(waiting, "actor");
+            format!("waiting for learner: chunks of {actors}")
         }
         (waiting, _) => waiting.to_string(),
     }
@@ -189,7 +191,7 @@ mod tests {
         display.learning_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
-            return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
+            return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  waiting for learner: 23 of 24 actors  17 min 23 s left"#]]
         .assert_eq(&display.lines(&view).join("\n"));
     }
 
@@ -223,8 +225,8 @@ mod tests {
             }))
         });
         let expected = [
-            "2 of 2 actors wait for learner",
-            "chunks of 2 actors wait for learner",
+            "waiting for learner: 2 of 2 actors",
+            "waiting for learner: chunks of 2 actors",
         ];
         assert_eq!(said, expected);
     }

@@ -7,7 +7,10 @@ use std::{path::PathBuf, time::Duration};
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use driml_machine::error::{Interrupted, usage};
+use driml_machine::{
+    error::{Interrupted, usage},
+    units::count,
+};
 use driml_protocol::{LogLimiter, Shutdown, atomic_write, reach};
 use serde::Serialize;
 
@@ -245,7 +248,8 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<St
     let run = folder.display();
     // A running launcher holds the lock, and so does a run in lockstep.
     let is_locked = folder.is_locked();
-    let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
+    let counts =
+        |it: Progress| [count(it.frames, "frame"), count(it.episodes, "episode")].join(" and ");
     let so_far = read_progress(folder).map_or("nothing".into(), counts);
     let mut state = Box::new(UnreachableRun {
         finished: !is_locked && Summary::is_finished(folder),

@@ -6,6 +6,7 @@ use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 use driml_protocol::tls::{self, Credentials, Role};
 
 use super::fact::{Fact, Finding, State};
+use crate::units::count;
 
 /// A certificate that expires within this time gets the state `Note`.
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
@@ -90,9 +91,9 @@ fn advice(credentials: &Credentials) -> Option<String> {
         ))
     } else if left < EXPIRES_SOON {
         Some(format!(
-            "good for {} days more, then its process is cut off: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
+            "good for {} more, then its process is cut off: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
              start that process again",
-            left.as_secs() / DAY_S
+            count(left.as_secs() / DAY_S, "day")
         ))
     } else if role == Role::ReplayServer && credentials.hosts.is_empty() {
         Some(format!(
@@ -105,8 +106,8 @@ fn advice(credentials: &Credentials) -> Option<String> {
 }
 
 fn validity(credentials: &Credentials) -> String {
-    let days = credentials.expires_in().as_secs() / DAY_S;
-    format!("good until {} ({days} days)", credentials.expires_on)
+    let days = count(credentials.expires_in().as_secs() / DAY_S, "day");
+    format!("good until {} ({days})", credentials.expires_on)
 }
 
 /// One text for all actors that have no complaint.

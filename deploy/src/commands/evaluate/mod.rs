@@ -29,6 +29,7 @@ use driml_launch::{
 use driml_machine::{
     error::{Interrupted, usage},
     shell::quoted_path,
+    units::count,
 };
 use driml_protocol::Shutdown;
 
@@ -145,12 +146,12 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     };
     let print_text = |text: &str| if args.json { Ok(()) } else { print(text) };
     print_text(&format!(
-        "{} {on}, {} episodes each, {} {} weights after {} updates played in {}, seed {}{}\n",
+        "{} {on}, {} each, {} {} weights after {} played in {}, seed {}{}\n",
         spec.world,
-        args.episodes,
+        count(args.episodes, "episode"),
         player.weights_name(),
         player.config.learner.publish_dtype,
-        player.updates,
+        count(player.updates, "update"),
         player.config.actor.precision,
         args.seed,
         args.epsilon
@@ -203,9 +204,9 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     let bytes = pretrained::export(player)?;
     write_atomically(path, &bytes)?;
     print(&format!(
-        "{} weights after {} updates as f16, {} kB; `driml evaluate {}` plays them\n",
+        "{} weights after {} as f16, {} kB; `driml evaluate {}` plays them\n",
         player.weights_name(),
-        player.updates,
+        count(player.updates, "update"),
         bytes.len() / 1000,
         quoted_path(path)
     ))
@@ -216,8 +217,8 @@ fn compare_with_best(ranked: &RankedEvaluation) -> String {
     match &ranked.best_before {
         _ if ranked.is_best => ", the most so far".into(),
         Some(best) if best.episodes > ranked.evaluation.episodes => format!(
-            "; the best stays: it was played for {} episodes, and fewer do not compare",
-            best.episodes
+            "; the best stays: it was played for {}, and fewer do not compare",
+            count(best.episodes, "episode")
         ),
         _ => String::new(),
     }
@@ -280,7 +281,8 @@ fn progress(policy: &str, returns: &[f64], of: usize) -> String {
         [] => String::new(),
         _ => format!(", mean return {:.3}", mean_and_deviation(returns).0),
     };
-    format!("{policy}: {} of {of} episodes{mean}", returns.len())
+    let of = count(of as u64, "episode");
+    format!("{policy}: {} of {of}{mean}", returns.len())
 }
 
 #[cfg(test)]

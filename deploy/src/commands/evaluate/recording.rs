@@ -10,7 +10,10 @@ use driml_envs::StepEnd;
 use driml_figure::{FigureError, Film, Picture};
 use driml_launch::evaluate::{Player, Viewer};
 use driml_learner::insight::NetworkOutputs;
-use driml_machine::error::{Usage, usage};
+use driml_machine::{
+    error::{Usage, usage},
+    units::count,
+};
 use driml_protocol::Horizon;
 
 use super::tile::{Layout, Local, Shot};
@@ -196,7 +199,7 @@ impl Recording {
         };
         let path = self.path.display();
         ended.with_context(|| format!("filming to {path}"))?;
-        Ok(format!("filmed {} steps: {path}\n", self.steps))
+        Ok(format!("filmed {}: {path}\n", count(self.steps, "step")))
     }
 }
 

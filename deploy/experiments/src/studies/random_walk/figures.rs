@@ -2,6 +2,7 @@
 //! They show the numbers of `Results`, and compute nothing but means over seeds.
 
 use driml_figure::{Axis, Chart, Figure, GREY, Heat, Mark, Panel, Series};
+use driml_machine::units::count;
 
 use super::{
     chain::Chain,
@@ -27,7 +28,10 @@ pub(super) fn fig1(results: &Results) -> Figure {
         })
     };
     let of_truth = format!("(a) True ratio, \u{3b1} = {}", settings.figure_alpha);
-    let of_learnt = format!("(b) Learnt ratio, mean of {} seeds", settings.seeds);
+    let of_learnt = format!(
+        "(b) Learnt ratio, mean of {}",
+        count(settings.seeds, "seed")
+    );
     let learnt = learnt.iter().map(|it| Some(it.mean));
     Figure {
         title: format!("InfoNCE on a biased random walk over {k} states"),
@@ -110,8 +114,8 @@ pub(super) fn convergence_figure(results: &Results) -> Figure {
     Figure {
         title: "Does InfoNCE converge as the spectral gap says?".into(),
         notes: vec![format!(
-            "Points: means of {} seeds; bars and bands: smallest to largest; samplings stand a little apart. What is near enough from the start, at 0 updates, has no place on a logarithmic axis.",
-            settings.seeds
+            "Points: means of {}; bars and bands: smallest to largest; samplings stand a little apart. What is near enough from the start, at 0 updates, has no place on a logarithmic axis.",
+            count(settings.seeds, "seed")
         )],
         columns: 2,
         panel_size: (430.0, 350.0),
