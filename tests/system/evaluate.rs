@@ -336,7 +336,9 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
         .fails(call, &damaged)
         .expect_stderr("remove the folder it is in");
     fs::write(&path, &whole).unwrap();
-    system.run_ok(call);
+    let one = system.run_ok(call).stdout;
+    let is_told = one.contains("1 episode each") && !one.contains("deviation");
+    assert!(is_told, "{one}");
 
     let text = system.read("run/config.toml");
     let other = text.replace("seed = 1", "seed = 2");

@@ -30,6 +30,14 @@ pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
     (mean, deviation)
 }
 
+/// Describes the standard deviation of `count` values after their mean; empty for a single value, which has none.
+pub fn describe_deviation(deviation: f64, count: usize) -> String {
+    match count {
+        0 | 1 => String::new(),
+        _ => format!(", standard deviation {deviation:.3}"),
+    }
+}
+
 /// A mean and its 95% confidence interval, if the values are normally distributed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Interval {
@@ -92,5 +100,7 @@ mod tests {
     fn the_deviation_is_the_samples() {
         assert_eq!(mean_and_deviation(&[1.0, 3.0]), (2.0, 2.0_f64.sqrt()));
         assert_eq!(mean_and_deviation(&[4.0]), (4.0, 0.0));
+        let texts = [1, 2].map(|count| describe_deviation(0.5, count));
+        assert_eq!(texts, ["", ", standard deviation 0.500"]);
     }
 }

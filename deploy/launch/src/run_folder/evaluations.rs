@@ -16,7 +16,10 @@ use super::{
     folder::RunFolder,
     table::{Table, append, csv_row, open_to_append},
 };
-use crate::metrics::{cell, rounded};
+use crate::{
+    metrics::{cell, rounded},
+    stats::describe_deviation,
+};
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
@@ -88,10 +91,10 @@ impl EvaluationRow {
     /// Describes the evaluation in one line.
     pub fn describe(&self) -> String {
         format!(
-            "evaluated after {}: mean return {:.3}, standard deviation {:.3} over {}",
+            "evaluated after {}: mean return {:.3}{} over {}",
             count(self.updates, "update"),
             self.mean_return,
-            self.deviation,
+            describe_deviation(self.deviation, self.episodes as usize),
             count(self.episodes, "episode")
         )
     }

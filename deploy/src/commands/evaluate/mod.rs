@@ -23,7 +23,7 @@ use driml_launch::{
     metrics::rounded,
     pretrained,
     run_folder::{RunFolder, write_atomically},
-    stats::mean_and_deviation,
+    stats::{describe_deviation, mean_and_deviation},
     view::PROGRESS_TEMPLATE,
 };
 use driml_machine::{
@@ -226,7 +226,8 @@ fn compare_with_best(ranked: &RankedEvaluation) -> String {
 
 fn describe_returns(name: &str, returns: &[f64]) -> String {
     let (mean, deviation) = mean_and_deviation(returns);
-    format!("{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n")
+    let deviation = describe_deviation(deviation, returns.len());
+    format!("{name:12} mean return {mean:8.3}{deviation}\n")
 }
 
 /// The name of a policy, and the returns of its episodes.
@@ -281,7 +282,7 @@ fn progress(policy: &str, returns: &[f64], of: usize) -> String {
         [] => String::new(),
         _ => format!(", mean return {:.3}", mean_and_deviation(returns).0),
     };
-    let of = count(of as u64, "episode");
+    let of = count(of, "episode");
     format!("{policy}: {} of {of}{mean}", returns.len())
 }
 

@@ -81,8 +81,9 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let entries = truth.iter().zip(&learnt).enumerate();
     let entries = entries.map(|(at, (truth, learnt))| {
-        let entry = [*truth, learnt.mean, learnt.sd].map(rounded);
-        (at / k + 1, at % k + 1, entry)
+        let sd = (learnt.count > 1).then(|| rounded(learnt.sd));
+        let means = [*truth, learnt.mean].map(rounded);
+        (at / k + 1, at % k + 1, means, sd)
     });
     let columns = "state,next,true_ratio,learnt_mean,learnt_sd";
     session.write_csv("ratio", columns, entries)?;
