@@ -225,7 +225,9 @@ fn a_folder_that_cannot_be_used_is_said() {
         return;
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
-        .fails("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
+        .wait()
+        .expect_code(64)
+        .expect_stderr("disk/replay cannot be written: Read-only file system (os error 30)");
     drop(disk);
     assert!(system.file_names("replay").len() > 2);
 }

@@ -1,7 +1,7 @@
 //! The experiments from end to end at smoke length: all files exist and are reproducible, and calls resume or are rejected.
 //! The pages in `deploy/experiments/results/` explain the numbers at full length.
 
-use std::{collections::BTreeMap, fs, path::Path};
+use std::{collections::BTreeMap, fs, os::unix::fs::MetadataExt, path::Path};
 
 use driml_tests::{Outcome, check_has};
 
@@ -67,7 +67,17 @@ fn check_experiment(name: &str, files: &str) {
     let mut pieces = system.file_names(&format!("experiments/{name}/pieces"));
     pieces.retain(|it| !["settings.json", "cores.json"].contains(&&**it));
     fs::remove_file(folder.join("pieces").join(pieces.iter().min().unwrap())).unwrap();
+    let inode = |name: &String| fs::metadata(folder.join(name)).unwrap().ino();
+    let before: Vec<_> = first.keys().map(inode).collect();
     system.run_ok(&call);
+    // A file that is replaced whole is another file.
+    assert!(
+        first
+            .keys()
+            .map(inode)
+            .zip(before)
+            .all(|(now, it)| now != it)
+    );
     assert_eq!(data_files(&folder), first);
 
     // More seeds add pieces to the same grid; the full length is another grid.

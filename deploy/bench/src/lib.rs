@@ -37,6 +37,9 @@ mod settings;
 mod subprocess;
 mod system;
 
+use std::path::Path;
+
+use driml_launch::output;
 use driml_learner::DeviceName;
 use driml_machine::{device, resources::MachineInfo, speed_meter::SpeedMeter};
 
@@ -53,6 +56,8 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
         _ => DeviceName::Cpu,
     };
     device::check_device(device_name)?;
+    let json = flags.json.as_deref().filter(|it| *it != Path::new("-"));
+    json.map_or(Ok(()), |it| output::check_file("--json", it))?;
     let starts_processes = matches!(
         command,
         BenchCommand::System { .. } | BenchCommand::Scale { .. } | BenchCommand::Peers(_)

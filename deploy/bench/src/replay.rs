@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_launch::managed_process::ManagedProcess;
+use driml_launch::{managed_process::ManagedProcess, output};
 
 use crate::{
     flags::BenchReplayArgs,
@@ -27,6 +27,8 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     if args.sampling {
         return in_process::time_sampling(args.held, bench);
     }
+    let dir = args.replay_dir.as_deref();
+    dir.map_or(Ok(()), |it| output::check_folder("--replay-dir", it))?;
     let recording = Recording::record()?;
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     let socket = format!("unixsock-stream/{}/s", folder.path().display());
@@ -39,7 +41,7 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     };
     let tcp = wire("tcp", &format!("tcp/{}", free_port()?));
     // This folder is emptied before and after.
-    let dir = args.replay_dir.as_ref().map(|it| it.join("driml-bench"));
+    let dir = dir.map(|it| it.join("driml-bench"));
     let wires = match (&dir, &args.tls_dir) {
         (Some(dir), _) => {
             let mut on_disk = wire("on disk", &socket);

@@ -1,10 +1,13 @@
 //! The input and the figures of a bench, as a table and as JSON, with the machine on which it ran.
 //! This file measures nothing and compares nothing.
 
-use std::{fs, path::Path};
+use std::path::Path;
 
 use anyhow::Context;
-use driml_launch::console::{self, align_columns, print};
+use driml_launch::{
+    console::{self, align_columns, print},
+    output,
+};
 use driml_learner::Precision;
 use driml_machine::{
     resources::MachineInfo,
@@ -115,7 +118,7 @@ pub(super) fn publish(
         Some(path) if path == Path::new("-") => print(&text),
         Some(path) => {
             print(table)?;
-            fs::write(path, text).with_context(|| format!("writing {}", path.display()))
+            Ok(output::write_file("--json", path, text.as_bytes())?)
         }
         None => print(table),
     }
@@ -149,7 +152,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("figures.json");
         publish(&report, "", Some(&file)).unwrap();
-        let read: Report = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+        let read: Report = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
         assert_eq!(read, report);
     }
 }

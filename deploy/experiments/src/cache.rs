@@ -8,10 +8,10 @@ use std::{
 };
 
 use anyhow::{Context, bail, ensure};
-use driml_figure::{Figure, Look};
+use driml_figure::{Figure, Format, Look};
 use driml_launch::{
     console::{self, print},
-    run_folder::write_atomically,
+    output,
 };
 use driml_machine::{
     error::{Interrupted, usage},
@@ -82,7 +82,7 @@ impl Session {
             ));
         }
         let pieces = folder.join(PIECES);
-        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
+        output::make_folder("--out", &pieces)?;
         let settings =
             serde_json::to_string_pretty(settings).context("writing down the settings")?;
         let path = pieces.join(SETTINGS);
@@ -93,7 +93,7 @@ impl Session {
                 folder.display()
             )),
             Err(_) if report_only => {}
-            Err(_) => write_atomically(&path, settings.as_bytes())?,
+            Err(_) => output::write_file("--out", &path, settings.as_bytes())?,
         }
         let shutdown = GracefulShutdown::on_repeated_signals(None);
         let shutdown = shutdown.context("listening for interrupts")?;
@@ -134,7 +134,7 @@ impl Session {
 
     fn write<T: Serialize>(&self, key: &str, piece: &StoredPiece<T>) -> anyhow::Result<()> {
         let text = serde_json::to_vec(piece).context("keeping a piece")?;
-        write_atomically(&self.piece_path(key), &text)
+        Ok(output::write_file("--out", &self.piece_path(key), &text)?)
     }
 
     fn piece_path(&self, key: &str) -> PathBuf {
@@ -241,21 +241,20 @@ impl Session {
         columns: &str,
         rows: impl IntoIterator<Item = R>,
     ) -> anyhow::Result<()> {
-        let path = self.folder.join(format!("{name}.csv"));
-        let doing = || format!("writing {}", path.display());
-        let mut file = csv::Writer::from_path(&path).with_context(doing)?;
-        file.write_record(columns.split(',')).with_context(doing)?;
+        let mut table = csv::Writer::from_writer(Vec::new());
+        table.write_record(columns.split(','))?;
         for row in rows {
-            file.serialize(row).with_context(doing)?;
+            table.serialize(row)?;
         }
-        file.flush().with_context(doing)
+        let path = self.folder.join(format!("{name}.csv"));
+        Ok(output::write_file("--out", &path, &table.into_inner()?)?)
     }
 
     /// Writes the figure as `stem.svg` and `stem.png`.
     pub(crate) fn save_figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
-        for extension in ["svg", "png"] {
+        for (extension, format) in [("svg", Format::Svg), ("png", Format::Png)] {
             let path = self.folder.join(format!("{stem}.{extension}"));
-            figure.save(&path, Look::Card)?;
+            output::write_file("--out", &path, &figure.encode(format, Look::Card)?)?;
         }
         Ok(())
     }
@@ -268,7 +267,7 @@ impl Session {
         let values = context! { missing => self.missing, ..values };
         let text = render_page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
-        write_atomically(&path, text.as_bytes())?;
+        output::write_file("--out", &path, text.as_bytes())?;
         print(&format!("{}{}\n", summary(&text), path.display()))?;
         self.check_none_missing()
     }

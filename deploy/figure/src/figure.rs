@@ -1,4 +1,4 @@
-//! A figure: panels in a grid under a title, and how it is written to a file.
+//! A figure: panels in a grid under a title, and its bytes as a file. The caller writes the file.
 
 use std::path::Path;
 
@@ -80,16 +80,14 @@ pub enum Look {
 }
 
 impl Figure {
-    /// Writes the figure in the format of the file's extension.
-    pub fn save(&self, path: &Path, look: Look) -> Result<(), FigureError> {
-        let format = Format::from_path(path)?;
+    /// Returns the bytes of a file in this format.
+    pub fn encode(&self, format: Format, look: Look) -> Result<Vec<u8>, FigureError> {
         let svg = |letters| self.draw(look, letters).svg();
-        let bytes = match format {
-            Format::Svg => svg(Letters::Text).into_bytes(),
-            Format::Pdf => render::pdf(&svg(Letters::Outlines))?,
-            Format::Png => render::png(&svg(Letters::Outlines), PNG_ZOOM)?,
-        };
-        std::fs::write(path, bytes).map_err(|e| FigureError::write(path, e))
+        match format {
+            Format::Svg => Ok(svg(Letters::Text).into_bytes()),
+            Format::Pdf => render::pdf(&svg(Letters::Outlines)),
+            Format::Png => render::png(&svg(Letters::Outlines), PNG_ZOOM),
+        }
     }
 
     fn draw(&self, look: Look, letters: Letters) -> Canvas {
@@ -175,43 +173,38 @@ mod tests {
     }
 
     #[test]
-    fn every_format_is_written_and_the_same_every_time() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a");
-        for (extension, start, inside) in [
-            ("svg", "<svg ", "one &amp; two"),
+    fn every_format_is_encoded_and_the_same_every_time() {
+        for (name, start, inside) in [
+            ("a.svg", "<svg ", "one &amp; two"),
             // 694 units of 1/96 inch, in points.
-            ("pdf", "%PDF-1.7", "/MediaBox [0 0 520.5 "),
-            ("png", "\u{89}PNG", "IHDR"),
+            ("a.pdf", "%PDF-1.7", "/MediaBox [0 0 520.5 "),
+            ("a.png", "\u{89}PNG", "IHDR"),
         ] {
-            let write = || -> String {
-                let path = path.with_extension(extension);
-                figure().save(&path, Look::Card).unwrap();
-                let bytes = std::fs::read(path).unwrap();
+            let encode = || -> String {
+                let format = Format::from_path(Path::new(name)).unwrap();
+                let bytes = figure().encode(format, Look::Card).unwrap();
                 bytes.into_iter().map(char::from).collect()
             };
-            let text = write();
+            let text = encode();
             let is_whole = text.starts_with(start) && text.contains(inside);
-            assert!(is_whole && !text.contains("NaN"), "{extension}");
-            assert!(text == write(), "{extension}");
+            assert!(is_whole && !text.contains("NaN"), "{name}");
+            assert!(text == encode(), "{name}");
         }
     }
 
     #[test]
     fn a_plain_figure_is_its_panels_and_one_legend() {
-        let folder = tempfile::tempdir().unwrap();
-        let svg = |look, name: &str| {
-            let path = folder.path().join(name);
+        let svg = |look| {
             let chart = |title: &str| {
                 let line = Series::line("driml-ada", 0, vec![(0.0, 1.0), (1.0, 3.0)]);
                 let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
                 Panel::Chart(Chart::new(title, x, y, vec![line]))
             };
             let panels = vec![chart("first"), chart("second")];
-            Figure { panels, ..figure() }.save(&path, look).unwrap();
-            std::fs::read_to_string(path).unwrap()
+            let bytes = Figure { panels, ..figure() }.encode(Format::Svg, look);
+            String::from_utf8(bytes.unwrap()).unwrap()
         };
-        let (card, plain) = (svg(Look::Card, "a.svg"), svg(Look::Plain, "b.svg"));
+        let (card, plain) = (svg(Look::Card), svg(Look::Plain));
         let count = |svg: &str, word: &str| svg.matches(word).count();
         for (word, in_card, in_plain) in [
             ("A figure", 1, 0),
@@ -239,7 +232,7 @@ mod tests {
     #[test]
     fn other_extensions_are_refused() {
         for name in ["a.eps", "a", "svg"] {
-            let said = figure().save(Path::new(name), Look::Card).unwrap_err();
+            let said = Format::from_path(Path::new(name)).unwrap_err();
             assert!(matches!(said, FigureError::Extension(_)), "{name}");
         }
     }

@@ -1,11 +1,11 @@
-//! Draws charts, heat maps and lattices on a light card, and writes them as SVG, PDF or PNG from one description.
+//! Draws charts, heat maps and lattices on a light card, and encodes them as SVG, PDF or PNG from one description.
 //!
 //! Start with [`Figure`]: a title, notes, and panels in a grid. Each panel is a [`Chart`], a [`Heat`] map or a [`Lattice`]. The same
 //! figure gives the same bytes on every machine because the font is built in. A [`Film`] is a sequence of [`Picture`]s, written as a
 //! GIF. The crate knows nothing about runs and experiments.
 //!
 //! ```
-//! use driml_figure::{Axis, Chart, Figure, Look, Panel, Series};
+//! use driml_figure::{Axis, Chart, Figure, Format, Look, Panel, Series};
 //!
 //! let curve = Series::line("driml-ada", 0, vec![(0.0, 1.0), (50_000.0, 4.5), (100_000.0, 9.0)]);
 //! let chart = Chart::new(
@@ -21,10 +21,8 @@
 //!     panel_size: (430.0, 330.0),
 //!     panels: vec![Panel::Chart(chart)],
 //! };
-//! let folder = tempfile::tempdir()?;
-//! let path = folder.path().join("returns.svg");
-//! figure.save(&path, Look::Card)?;
-//! assert!(std::fs::read_to_string(&path)?.starts_with("<svg "));
+//! let svg = figure.encode(Format::Svg, Look::Card)?;
+//! assert!(svg.starts_with(b"<svg "));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 

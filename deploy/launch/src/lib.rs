@@ -32,6 +32,7 @@ pub mod lockstep;
 pub mod managed_process;
 pub mod metrics;
 pub mod open_files;
+pub mod output;
 pub mod panics;
 pub mod plan;
 pub mod pretrained;

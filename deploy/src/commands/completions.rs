@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use clap_complete::{Shell, generate};
-use driml_launch::console::print;
+use driml_launch::{console::print, output};
 
 const NAME: &str = "driml";
 
@@ -32,8 +32,8 @@ pub(crate) fn completions(
 }
 
 pub(crate) fn man(args: &ManArgs, command: clap::Command) -> anyhow::Result<()> {
-    let doing = || format!("writing pages into {}", args.out.display());
-    std::fs::create_dir_all(&args.out).with_context(doing)?;
-    clap_mangen::generate_to(command, &args.out).with_context(doing)?;
+    output::make_folder("the folder", &args.out)?;
+    let written = clap_mangen::generate_to(command, &args.out);
+    written.map_err(|e| output::unwritable("the folder", &args.out, e))?;
     print(&format!("{}\n", args.out.join("driml.1").display()))
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_launch::endpoint::check_connect_endpoints;
+use driml_launch::{endpoint::check_connect_endpoints, output::check_folder};
 use driml_machine::device::{DeviceFlag, check_device};
 use driml_protocol::{Shutdown, tls::Role};
 
@@ -32,6 +32,7 @@ pub(crate) struct LearnerArgs {
 
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
+    check_folder("--run-dir", &args.run_dir)?;
     let credentials = args.tls.credentials(Role::Learner)?;
     check_device(args.on.device)?;
     let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;

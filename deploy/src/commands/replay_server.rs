@@ -6,6 +6,7 @@ use clap::Args;
 use driml_launch::{
     endpoint::{check_connect_endpoints, check_listen_endpoints, check_unused},
     open_files,
+    output::check_folder,
 };
 use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::{GracefulShutdown, tls::Role};
@@ -51,9 +52,12 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         let why = "replay shards behind one router would each store every transition: leave --connect out";
         return Err(usage!("{why}").into());
     }
-    if args.replay_dir.is_none() {
-        let checked = config.replay.check_in_memory("--replay-dir DIR");
-        checked.map_err(|e| usage!("{e}"))?;
+    match &args.replay_dir {
+        Some(dir) => check_folder("--replay-dir", dir)?,
+        None => {
+            let checked = config.replay.check_in_memory("--replay-dir DIR");
+            checked.map_err(|e| usage!("{e}"))?;
+        }
     }
     let shutdown = prepare_join(&args.join, GracefulShutdown::on_signals)?;
     config.notes.iter().for_each(|it| tracing::warn!("{it}"));

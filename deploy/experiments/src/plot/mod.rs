@@ -14,7 +14,7 @@ use driml_launch::{
     checkpoint_choice::read_config,
     console::{self, print},
     evaluate::random_returns,
-    metrics,
+    metrics, output,
     run_folder::RunFolder,
     stats::mean_and_deviation,
     view::loss_title,
@@ -60,13 +60,14 @@ const OVERVIEW: [&str; 7] = [
 /// # Errors
 /// No folder is that of a run, a column does not exist, or the file cannot be written.
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
-    Format::from_path(&args.out).map_err(|e| usage!("{e}"))?;
+    let format = Format::from_path(&args.out).map_err(|e| usage!("--out: {e}"))?;
+    output::check_file("--out", &args.out)?;
     let figure = match args.affinity {
         true => affinity::figure(&run_folders(args)?)?,
         false => charts_figure(args)?,
     };
     let look = if args.plain { Look::Plain } else { Look::Card };
-    figure.save(&args.out, look)?;
+    output::write_file("--out", &args.out, &figure.encode(format, look)?)?;
     print(&format!("{}\n", args.out.display()))
 }
 

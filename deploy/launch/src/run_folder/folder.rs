@@ -14,9 +14,9 @@ use driml_machine::{
 };
 use driml_protocol::lock_file;
 use driml_settings::config::RunConfig;
-use nix::unistd::{AccessFlags, access};
 
 use super::table::{Table, write_atomically};
+use crate::output::check_folder;
 
 pub(super) const EVENTS_PREFIX: &str = "events.out.tfevents.";
 
@@ -106,7 +106,7 @@ impl RunFolder {
         {
             return Err(Usage(e.to_string()));
         }
-        self.check_writable()
+        check_folder("--run-dir", &self.path)
     }
 
     /// Whether the folder is empty, or holds only what a run makes before its first frame.
@@ -136,24 +136,6 @@ impl RunFolder {
                 && self.config().exists()
                 && !tables.iter().any(has_frames)
                 && saved.is_ok_and(|all| all.is_empty())
-    }
-
-    /// Rejects a folder into which nothing could be written, before the folder is made.
-    fn check_writable(&self) -> Result<(), Usage> {
-        let absolute = std::path::absolute(&self.path).unwrap_or_else(|_| self.path.clone());
-        let Some(existing) = absolute.ancestors().find(|it| it.exists()) else {
-            return Ok(());
-        };
-        let why = match access(existing, AccessFlags::W_OK | AccessFlags::X_OK) {
-            _ if !existing.is_dir() => "is not a folder".to_owned(),
-            Err(e) => format!("cannot be written: {}", e.desc()),
-            Ok(()) => return Ok(()),
-        };
-        Err(usage!(
-            "the run folder {} cannot be made: {} {why}; choose another --run-dir",
-            self.display(),
-            existing.display()
-        ))
     }
 
     /// Keeps other launchers out as long as the returned file is held.
@@ -215,10 +197,7 @@ mod tests {
         let mut refused = vec![
             ("used", taken),
             ("used/x", taken),
-            (
-                "used/x/one",
-                "/used/x is not a folder; choose another --run-dir",
-            ),
+            ("used/x/one", "cannot be written: Not a directory"),
         ];
         // Root may write everywhere.
         if !nix::unistd::geteuid().is_root() {

@@ -1,12 +1,8 @@
 //! Writes the files of the run folder during a run: settings, metrics, episodes, events on request, and the summary at the end.
 //! This module asks no process: its caller passes a view of the run.
 
-use std::{
-    fs::{self, File},
-    time::Instant,
-};
+use std::{fs::File, time::Instant};
 
-use anyhow::Context;
 use driml_protocol::{EpisodesReply, ReplayStatus};
 use driml_settings::config::RunConfig;
 
@@ -20,6 +16,7 @@ use super::{
 };
 use crate::{
     metrics::{csv_cells, curve_points},
+    output::make_folder,
     run_view::{Episodes, Plan, RunView, Spread},
 };
 
@@ -55,8 +52,7 @@ impl RunRecorder {
     ) -> anyhow::Result<Self> {
         if resumed.is_none() {
             folder.check_free()?;
-            fs::create_dir_all(folder.path())
-                .with_context(|| format!("making the run folder {}", folder.display()))?;
+            make_folder("--run-dir", folder.path())?;
         }
         let lock = folder.lock()?;
         let header = header(config, &processes);

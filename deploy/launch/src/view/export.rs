@@ -6,12 +6,14 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{LearnerStatus, ProcessStatus, ReplayStatus, atomic_write};
+use driml_machine::error::Usage;
+use driml_protocol::{LearnerStatus, ProcessStatus, ReplayStatus};
 use serde::Serialize;
 
 use super::advice::{actions_needed, limiter_waits};
 use crate::{
     metrics::{self, COLUMNS, Member, Value},
+    output::write_file,
     run_view::{Plan, RunView, ServerAnswer},
 };
 
@@ -62,11 +64,11 @@ impl PrometheusFile {
         }
     }
 
-    /// Writes the file, whole or not at all. Returns a warning the first time that it cannot be written.
-    pub(crate) fn write(&mut self, view: &RunView) -> Option<String> {
-        let failed = atomic_write::write(&self.path, prometheus_text(view).as_bytes()).err()?;
-        (!std::mem::replace(&mut self.has_warned, true))
-            .then(|| format!("{} cannot be written: {failed}", self.path.display()))
+    /// Writes the file, whole or not at all. Returns an error the first time that it cannot be written.
+    pub(crate) fn write(&mut self, view: &RunView) -> Option<Usage> {
+        let text = prometheus_text(view);
+        let failed = write_file("--prometheus", &self.path, text.as_bytes()).err()?;
+        (!std::mem::replace(&mut self.has_warned, true)).then_some(failed)
     }
 }
 

@@ -7,17 +7,16 @@ use std::{path::PathBuf, time::Duration};
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use driml_machine::{
-    error::{Interrupted, usage},
-    units::count,
-};
-use driml_protocol::{LogLimiter, Shutdown, atomic_write, reach};
+use driml_machine::{error::Interrupted, units::count};
+use driml_protocol::{LogLimiter, Shutdown, reach};
 use serde::Serialize;
 
 use self::watched::WatchedRun;
 use crate::{
     checkpoint_choice::read_config,
-    console, resume,
+    console,
+    output::write_file,
+    resume,
     run_folder::{
         Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_progress,
     },
@@ -98,8 +97,8 @@ pub fn run(found: anyhow::Result<OrUnreachable<Poller>>, flags: &WatchFlags) -> 
     if !matches!(found, Ok(Ok(_)))
         && let Some(path) = &flags.prometheus
     {
-        let written = atomic_write::write(path, b"# TYPE driml_up gauge\ndriml_up 0\n");
-        written.with_context(|| format!("writing {}", path.display()))?;
+        let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
+        write_file("--prometheus", path, down)?;
     }
     match found? {
         Ok(poller) if flags.once => check_once(poller, flags),
@@ -121,7 +120,7 @@ fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     if let Some(path) = &flags.prometheus
         && let Some(failed) = PrometheusFile::new(path).write(&poller.view)
     {
-        bail!("{failed}");
+        bail!(failed);
     }
     let needed = actions_needed(&poller.view).join("; ");
     ensure!(needed.is_empty(), "the run needs attention: {needed}");
@@ -162,7 +161,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     poller.poll();
     let mut file = flags.prometheus.as_deref().map(PrometheusFile::new);
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-        bail!(usage!("--prometheus: {failed}"));
+        bail!(failed);
     }
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
@@ -186,7 +185,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
         }
         poller.poll();
         if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-            watched.display.screen.print_line(&failed);
+            watched.display.screen.print_line(&failed.0);
         }
     };
     poller.close();

@@ -5,8 +5,6 @@ mod recording;
 mod tile;
 
 use std::{
-    fs::File,
-    io::{self, Write},
     ops::ControlFlow,
     path::{Path, PathBuf},
 };
@@ -21,8 +19,8 @@ use driml_launch::{
     evaluate::{EPSILON, Levels, Player, PolicyKind, world_with_levels},
     evaluator::{RankedEvaluation, evaluate_and_keep},
     metrics::rounded,
-    pretrained,
-    run_folder::{RunFolder, write_atomically},
+    output, pretrained,
+    run_folder::RunFolder,
     stats::{describe_deviation, mean_and_deviation},
     view::PROGRESS_TEMPLATE,
 };
@@ -128,12 +126,9 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::eprintln)?;
     // Open the file before an hour of playing; its content is replaced only after that.
-    let table = args.returns.as_ref().map(|path| {
-        let file = File::options().create(true).append(true).open(path);
-        let file = file.with_context(|| format!("--returns {}", path.display()))?;
-        anyhow::Ok((path, file))
-    });
-    let table = table.transpose()?;
+    if let Some(path) = &args.returns {
+        output::check_file("--returns", path)?;
+    }
     let world = world_with_levels(&player.config.world, args.levels)?;
     let shutdown = Shutdown::on_signals(None).context("listening for signals")?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
@@ -185,8 +180,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         print_text(&describe_returns(name, &returns))?;
         played.push((name, returns));
     }
-    if let Some((path, file)) = &table {
-        write_returns(file, &played).with_context(|| format!("writing {}", path.display()))?;
+    if let Some(path) = &args.returns {
+        output::write_file("--returns", path, returns_table(&played).as_bytes())?;
     }
     if args.json {
         print(&json_report(&player, args.levels, args.seed, &played)?)?;
@@ -201,8 +196,9 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
             "--export {name}: the file's name ends in .safetensors"
         ));
     }
+    output::check_file("--export", path)?;
     let bytes = pretrained::export(player)?;
-    write_atomically(path, &bytes)?;
+    output::write_file("--export", path, &bytes)?;
     print(&format!(
         "{} weights after {} as f16, {} kB; `driml evaluate {}` plays them\n",
         player.weights_name(),
@@ -233,17 +229,14 @@ fn describe_returns(name: &str, returns: &[f64]) -> String {
 /// The name of a policy, and the returns of its episodes.
 type PolicyReturns<'a> = (&'a str, Vec<f64>);
 
-fn write_returns(mut file: &File, played: &[PolicyReturns<'_>]) -> io::Result<()> {
+fn returns_table(played: &[PolicyReturns<'_>]) -> String {
     let mut text = "policy,episode,return\n".to_owned();
     for (name, returns) in played {
         for (episode, value) in (1..).zip(returns) {
             text += &format!("{name},{episode},{}\n", rounded(*value));
         }
     }
-    if file.metadata()?.is_file() {
-        file.set_len(0)?;
-    }
-    file.write_all(text.as_bytes())
+    text
 }
 
 fn json_report(

@@ -3,12 +3,14 @@
 
 use std::{collections::VecDeque, path::PathBuf};
 
-use anyhow::Context;
 use clap::Args;
 use driml_actor::Step;
 use driml_envs::StepEnd;
 use driml_figure::{FigureError, Film, Picture};
-use driml_launch::evaluate::{Player, Viewer};
+use driml_launch::{
+    evaluate::{Player, Viewer},
+    output::unwritable,
+};
 use driml_learner::insight::NetworkOutputs;
 use driml_machine::{
     error::{Usage, usage},
@@ -184,8 +186,8 @@ impl Recording {
             self.layout.draw(&mut picture, i, shot, matches);
         }
         let ended = matches!(filmed.shots[..], [Shot { is_last: true, .. }]);
-        self.film.add(&picture, if ended { PAUSE } else { 1.0 })?;
-        Ok(())
+        let added = self.film.add(&picture, if ended { PAUSE } else { 1.0 });
+        Ok(added.map_err(film_error)?)
     }
 
     /// Ends the film, and returns a sentence about its content.
@@ -193,12 +195,11 @@ impl Recording {
         while self.error.is_none() && !self.waiting.is_empty() {
             self.error = self.draw_next().err();
         }
-        let ended = match self.error {
-            Some(e) => Err(e),
-            None => self.film.finish().map_err(anyhow::Error::from),
-        };
         let path = self.path.display();
-        ended.with_context(|| format!("filming to {path}"))?;
+        if let Some(e) = self.error {
+            return Err(e.context("making the film"));
+        }
+        self.film.finish().map_err(film_error)?;
         Ok(format!("filmed {}: {path}\n", count(self.steps, "step")))
     }
 }
@@ -223,13 +224,10 @@ impl Shot {
     }
 }
 
-/// Reports a film that cannot be begun as a wrong flag.
+/// Reports a film that cannot be made or written as a wrong flag.
 fn film_error(error: FigureError) -> Usage {
-    match &error {
-        FigureError::Write { path, source } => {
-            let path = path.display();
-            usage!("--record {path}: {source}: choose another place")
-        }
+    match error {
+        FigureError::Write { path, source } => unwritable("--record", &path, source),
         _ => usage!("--record: {error}"),
     }
 }
