@@ -22,7 +22,8 @@ pub use crate::registry::Registry;
 
 use crate::cli::{Cli, Command};
 
-/// Runs the program. The exit code is 0 on success, 64 for a call that cannot work or whose output cannot be written, 130 after an interrupt, and 1 for other errors.
+/// Runs the program. The exit code is 0 on success, 64 for a call that cannot work or whose output cannot be written, 130 after an
+/// interrupt, and 1 for other errors.
 pub fn main() -> ExitCode {
     main_with(Registry::default())
 }

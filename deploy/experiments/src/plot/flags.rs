@@ -27,9 +27,8 @@ pub struct PlotArgs {
     /// Draw each run as a separate line
     #[arg(long)]
     pub(crate) separate: bool,
-    /// Play so many episodes with a random policy, and draw the mean return as a line
-    #[arg(long, value_name = "EPISODES", num_args = 0..=1, default_missing_value = "100",
-          value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    /// Play so many episodes with a random policy, 100 unless given, and draw the mean return as a line
+    #[arg(long, value_name = "EPISODES", num_args = 0..=1, default_missing_value = "100", value_parser = random_episodes)]
     pub(crate) random: Option<u32>,
     /// Plot the action affinity of each run's newest checkpoint as a heat map
     #[arg(long, conflicts_with_all = ["column", "x", "smooth", "band", "separate", "random"])]
@@ -40,6 +39,14 @@ pub struct PlotArgs {
     /// File to write, .svg, .pdf or .png
     #[arg(long, value_name = "FILE", default_value = "plot.svg")]
     pub(crate) out: PathBuf,
+}
+
+/// Reads the number of `--random`. Without one, clap takes a run folder that follows for it.
+fn random_episodes(text: &str) -> Result<u32, String> {
+    let number = text.parse().ok().filter(|it| (1..=1_000_000).contains(it));
+    number.ok_or_else(|| {
+        "give a number of episodes from 1 to 1000000, such as --random 100 RUN".into()
+    })
 }
 
 /// What a curve is drawn over: columns that only grow.
