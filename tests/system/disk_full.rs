@@ -10,7 +10,7 @@ use std::{
 
 use driml_tests::{Outcome, Process, TestSystem, check_has, succeeds, wait_for, wait_until};
 
-use crate::{LONG, SHORT, system};
+use crate::{LONG, SHORT, status::status_text, system};
 
 /// A small disk. Dropping the value unmounts it.
 struct Disk {
@@ -162,24 +162,23 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     fill_disk(&filler);
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay_status().unwrap();
-    let status = system.connect_args("status");
     let words = [
         "replay on disk: ",
-        "REFUSED for",
+        "WRITES FAIL for",
         "No space left on device",
         "If the replay server dies now",
         "to do: the disk of the replay server on",
     ];
     wait_until("a status that says it", || {
-        let text = system.run(&status).stdout;
+        let text = status_text(&system);
         words.iter().all(|it| text.contains(it))
     });
     fs::remove_file(filler).unwrap();
     client.wait_for_transitions(stopped.transitions_inserted + 1_000);
     server.wait_for_stderr("can be written again; nothing was lost");
-    let text = system.run(&status).stdout;
+    let text = status_text(&system);
     check_has(&text, &["replay on disk: "]);
-    assert!(!text.contains("REFUSED"), "{text}");
+    assert!(!text.contains("WRITES FAIL"), "{text}");
     actor.stop_ok();
     learner.stop_ok();
     let before = client.check_nothing_lost();

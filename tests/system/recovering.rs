@@ -13,6 +13,7 @@ use serde_json::Value;
 
 use crate::{
     refusals::{Row, actor_join, batch_request, check_replies, upload},
+    status::status_text,
     system, tiny_replay,
 };
 
@@ -147,14 +148,13 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let slow = slow_down(&mut server);
     let first = recovery_progress(&system).expect("it has a long log");
     check_postponed(&system, &spec);
-    let text = system.run_ok(&system.connect_args("status")).stdout;
     let words = [
         "chain, c51: frames ?/",
-        "replay-server  reads its replay back",
+        "replay-server recovering ",
         "reads its replay back from disk (",
         "no action needed",
     ];
-    check_has(&text, &words);
+    check_has(&status_text(&system), &words);
     let watch_once = system.connect_args("watch --once");
     system.fails(&watch_once, "reads its replay back from disk");
     let mut watched = system.start(&system.connect_args("watch --run-dir seen"));
@@ -256,8 +256,7 @@ fn roles_are_told_too() {
     for role in [&mut actor, &mut learner] {
         role.wait_for_stderr(WAITING_LOG);
     }
-    let text = system.run_ok(&system.connect_args("status")).stdout;
-    assert!(text.contains("reads its replay back"), "{text}");
+    check_has(&status_text(&system), &["reads its replay back"]);
     drop(slow);
     actor.wait_ok();
     learner.stop_ok();

@@ -69,13 +69,15 @@ pub(crate) fn wrap(text: &str, separator: &str, indent: usize) -> String {
     wrap_to(text, separator, indent, width)
 }
 
-fn wrap_to(text: &str, separator: &str, indent: usize, width: usize) -> String {
+/// [`wrap`] to a width in characters. A break leaves no blanks at the end of its line.
+pub(crate) fn wrap_to(text: &str, separator: &str, indent: usize, width: usize) -> String {
     let mut lines = String::new();
     for line in text.split_inclusive('\n') {
         let mut column = 0;
         for (number, word) in line.split(separator).enumerate() {
             let length = word.trim_end_matches('\n').chars().count();
             if number > 0 && column + separator.len() + length > width {
+                lines.truncate(lines.trim_end_matches(' ').len());
                 lines.push('\n');
                 lines.extend(std::iter::repeat_n(' ', indent));
                 column = indent;

@@ -36,7 +36,6 @@ pub fn check_folder(what: &str, path: &Path) -> Result<(), Usage> {
 
 /// Makes a folder and those above it.
 pub fn make_folder(what: &str, path: &Path) -> Result<(), Usage> {
-    check_folder(what, path)?;
     fs::create_dir_all(path).map_err(|e| unwritable(what, path, e))
 }
 

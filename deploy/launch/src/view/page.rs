@@ -1,5 +1,6 @@
-//! A run as a page of text: `driml status` and `driml watch --once`.
+//! A run as a page of text, 80 columns wide: `driml status` and `driml watch --once`.
 
+use driml_machine::units::{count, rough_duration};
 use driml_protocol::{LogStatus, ProcessStatus, Waiting, Warning};
 
 use super::{
@@ -7,7 +8,7 @@ use super::{
     live::progress_text,
 };
 use crate::{
-    console::align_columns,
+    console::{align_columns, wrap_to},
     run_view::{RunView, ServerAnswer},
 };
 
@@ -16,6 +17,13 @@ const ACTORS_MAX: usize = 64;
 
 /// From this age on, in seconds, the page shows how old a process's own report is.
 const REPORT_AGE_MAX: f64 = 10.0;
+
+/// The most characters of a line, except for a path or a command that is longer.
+const LINE_CHARS_MAX: usize = 80;
+/// The most characters of a process's name in the table.
+const NAME_CHARS_MAX: usize = 20;
+/// The blanks before the rest of a line that is broken.
+const INDENT: usize = 4;
 
 pub(crate) fn status_page(view: &RunView) -> String {
     let (replay, plan) = (&view.replay, &view.plan);
@@ -32,18 +40,19 @@ pub(crate) fn status_page(view: &RunView) -> String {
     let counts = [
         ("lost", replay.transitions_lost),
         ("stored twice", replay.transitions_duplicated),
-        ("chunks sent again", replay.chunks_retried),
-        ("batches asked again", replay.batches_retried),
-        ("messages refused", replay.messages_refused),
+        ("chunk retries", replay.chunks_retried),
+        ("batch retries", replay.batches_retried),
+        ("messages rejected", replay.messages_refused),
     ];
     page += &counts.map(|(what, n)| format!("{what} {n}")).join("  ");
+    page = wrap_to(&page, "  ", 0, LINE_CHARS_MAX);
     let mut waits = limiter_waits(view);
     if waits.is_empty() {
         waits.push(Waiting::Neither.to_string());
     }
     page += &format!("\n{}\n\n", waits.join("; "));
 
-    let head = "process,state,activity,last seen,held,weights,lives";
+    let head = "process,state,last seen,held,weights,joins,activity";
     let mut rows = vec![head.split(',').map(str::to_owned).collect()];
     let mut notes = Vec::new();
     for server in &view.servers {
@@ -78,7 +87,26 @@ pub(crate) fn status_page(view: &RunView) -> String {
     for needed in &needed {
         page += &format!("to do: {needed}\n");
     }
-    page
+    page.lines().map(fit).collect()
+}
+
+/// Breaks a line at blanks. A command in backticks stays whole, so that it can be pasted.
+fn fit(line: &str) -> String {
+    let parts = line.split('`').enumerate();
+    let parts = parts.map(|(at, part)| match at % 2 {
+        0 => part.to_owned(),
+        _ => part.replace(' ', "\u{a0}"),
+    });
+    let line = parts.collect::<Vec<_>>().join("`");
+    wrap_to(&line, " ", INDENT, LINE_CHARS_MAX).replace('\u{a0}', " ") + "\n"
+}
+
+/// The end of a long name, which tells the servers of a run apart.
+fn cut_name(name: &str) -> String {
+    match name.chars().count().saturating_sub(NAME_CHARS_MAX) {
+        0 => name.to_owned(),
+        excess => "…".chars().chain(name.chars().skip(excess + 1)).collect(),
+    }
 }
 
 fn warning_note(who: &str, warning: Option<&Warning>) -> Option<String> {
@@ -107,11 +135,11 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, server_count: usize) -> Stri
         let lost = match log.unwritten_bytes {
             0 => "nothing is lost".to_owned(),
             bytes => format!(
-                "it forgets who joined or left and what was drawn since, {bytes} bytes, and no transition"
+                "{bytes} bytes about joined processes and sampled batches are lost, but no transition"
             ),
         };
         line += &format!(
-            "; REFUSED for {since} ({why}): nothing is taken or served. If the replay server dies now, {lost}"
+            "; WRITES FAIL for {since} ({why}): no chunk is stored and no batch is served. If the replay server dies now, {lost}"
         );
     }
     line
@@ -120,54 +148,132 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, server_count: usize) -> Stri
 fn server_row(server: &ServerAnswer, server_count: usize) -> Vec<String> {
     let name = match server_count {
         1 => "replay-server".to_owned(),
-        _ => server.endpoint.clone(),
+        _ => cut_name(&server.endpoint),
+    };
+    let without_status = |state: &str, activity: String| {
+        let blank = String::new;
+        vec![
+            name.clone(),
+            state.into(),
+            blank(),
+            blank(),
+            blank(),
+            blank(),
+            activity,
+        ]
     };
     if let Some(progress) = server.recovering {
-        return vec![name, "reads its replay back".into(), progress.to_string()];
+        return without_status("recovering", format!("replay read: {progress}"));
     }
     let Some(status) = &server.processes else {
         let state = match server.is_gone {
-            true => "has ended",
-            false => "does not answer",
+            true => "exited",
+            false => "no answer",
         };
-        return vec![name, state.into()];
+        return without_status(state, String::new());
     };
-    let does = format!(
-        "{} chunks ({:.1} MiB) and {} requests wait",
-        status.chunks_waiting,
-        status.chunk_bytes_waiting as f64 / f64::from(1 << 20),
-        status.requests_waiting
-    );
-    let weights = status.weights_age_s.map_or("none yet".into(), |age| {
-        format!("{}, {} old", status.weights_version, format_s(age))
+    let weights = status.weights_age_s.map_or(String::new(), |age| {
+        format!("; weights {} old", rough_duration(age))
     });
-    let state = format!("up for {}", format_s(status.up_s));
-    vec![name, state, does, String::new(), String::new(), weights]
+    let activity = format!(
+        "queued: {} ({:.1} MiB), {}{weights}",
+        count(status.chunks_waiting, "chunk"),
+        status.chunk_bytes_waiting as f64 / f64::from(1 << 20),
+        count(status.requests_waiting, "request")
+    );
+    let mut row = without_status(&format!("up {}", rough_duration(status.up_s)), activity);
+    row[4] = status.weights_version.to_string();
+    row
 }
 
 fn process_row(process: &ProcessStatus, is_over: bool) -> Vec<String> {
     let state = match process.connected {
-        true => format!("there for {}", format_s(process.since_s)),
-        false if is_over => format!("left {} ago", format_s(process.since_s)),
-        false => format!("GONE for {}", format_s(process.since_s)),
+        true => "up",
+        false if is_over => "left",
+        false => "DOWN",
     };
-    let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", format_s(age)));
+    let time = |seconds: Option<f64>| seconds.map_or("-".into(), rough_duration);
     let doing = process.doing.as_ref();
-    let doing = doing.map_or("-".into(), |(doing, since, said)| {
-        let since = format_s(*since);
-        match *said > REPORT_AGE_MAX {
-            true => format!("{doing} ({since}, reported {} ago)", format_s(*said)),
+    let doing = doing.map_or("-".into(), |(doing, since, reported)| {
+        let since = rough_duration(*since);
+        match *reported > REPORT_AGE_MAX {
+            true => format!("{doing} ({since}, as of {} ago)", rough_duration(*reported)),
             false => format!("{doing} ({since})"),
         }
     });
     let version = process.weights_version.map(|it| it.to_string());
     vec![
         process.who.to_string(),
-        state,
-        doing,
-        ago(process.last_seen_s),
-        process.held_s.map_or("-".into(), format_s),
+        format!("{state} {}", rough_duration(process.since_s)),
+        time(process.last_seen_s),
+        time(process.held_s),
         version.unwrap_or_else(|| "-".into()),
         process.lives.to_string(),
+        doing,
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::ReplayStatus;
+    use expect_test::expect;
+    use serde_json::json;
+
+    use super::*;
+    use crate::{
+        run_view::Plan,
+        testing::{make, view},
+    };
+
+    /// The page of a run in which all counts, and all times in seconds, are `number`.
+    fn page(endpoints: &[&str], doing: &str, number: u32) -> String {
+        let plan = make(|it: &mut Plan| (it.world, it.agent) = ("chain".into(), "c51".into()));
+        let replay = ReplayStatus {
+            transitions_inserted: number.into(),
+            transitions_lost: number.into(),
+            chunks_retried: number.into(),
+            batches_retried: number.into(),
+            ..ReplayStatus::default()
+        };
+        let process = |who| {
+            json!({
+                "who": who, "connected": number < 9, "since_s": number, "lives": number, "last_seen_s": number, "held_s": null,
+                "weights_version": number, "doing": [doing, number, number], "last_warning": null
+            })
+        };
+        let processes = [
+            json!("Learner"),
+            json!({"Actor": 0}),
+            json!({"Actor": u32::MAX}),
+        ]
+        .map(process);
+        let status = json!({
+            "up_s": number, "waiting": "Neither", "waiting_s": number, "requests_waiting": number, "chunks_waiting": number,
+            "chunk_bytes_waiting": number, "weights_version": number, "weights_age_s": number, "log": null,
+            "last_warning": {"text": "a chunk was rejected: it was cut off or padded", "age_s": number}, "processes": processes
+        });
+        let mut view = view(plan, replay.clone(), None);
+        let answer = |endpoint: &&str| ServerAnswer {
+            endpoint: (*endpoint).into(),
+            replay: Some(replay.clone()),
+            processes: serde_json::from_value(status.clone()).unwrap(),
+            ..ServerAnswer::default()
+        };
+        view.servers = endpoints.iter().map(answer).collect();
+        status_page(&view)
+    }
+
+    #[test]
+    fn a_page_is_80_columns_wide() {
+        expect![[r#""#]].assert_eq(&page(&["tcp/host:1"], "plays", 1));
+        let endpoint = format!("unixsock-stream//{}/replay-server-0.sock", "x".repeat(60));
+        let doing = "waits for the learner's first weights, which another machine is sending to it";
+        let wide = page(&[&endpoint, "tcp/10.0.0.1:7447"], doing, u32::MAX);
+        for line in wide.lines().filter(|line| !line.contains(&endpoint)) {
+            assert!(line.chars().count() <= LINE_CHARS_MAX, "{line}\n{wide}");
+        }
+        for part in ["\n…replay-server-0.sock  up ", "\nactor-4294967295  "] {
+            assert!(wide.contains(part), "{wide}");
+        }
+    }
 }
