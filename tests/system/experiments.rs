@@ -262,6 +262,10 @@ fn tradeoff() {
     call("--dials learner.precision --report");
     assert_eq!(counts()[0], 2);
 
+    // The errors of a level are measured on a batch of its own size, at most 64 rows.
+    call("--dials learner.batch_size");
+    let rows = ["64 (base) | c51 | 16", "32 | c51 | 32", "256 | c51 | 64"];
+    check_has(&system.read("t/README.md"), &rows);
     // If the first seed of a level is missing, the other seeds are reported.
     let names = system.file_names("t/runs").into_iter();
     let first = names.filter(|it| it.contains("bf16") && it.ends_with("-seed1"));
@@ -269,7 +273,7 @@ fn tradeoff() {
         fs::remove_file(folder.join("runs").join(name).join("summary.json")).unwrap();
     }
     call("--dials learner.precision --report");
-    assert_eq!(counts(), [2, 4 + 4 - 1]);
+    assert_eq!(counts(), [2, 4 + 4 - 1 + 2]);
 }
 
 /// Killing an experiment ends its runs; the next call resumes them.

@@ -3,11 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use driml_launch::metrics::rounded;
+use driml_machine::error::Usage;
 use minijinja::{Value, context};
 use serde::Serialize;
 
 use super::{
     figures, measured,
+    menu::Common,
     results::{GREEDY, MEASURES, Results, Row, TRAINING},
 };
 use crate::{
@@ -116,7 +118,7 @@ impl EqualTime {
             })
         };
         let comparison = Self {
-            agent: row.agent.into(),
+            agent: row.point.agent.clone(),
             base: row.dial.agent.clone(),
             seconds,
             end: returns_at(f64::INFINITY),
@@ -143,34 +145,34 @@ fn value_at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
 
 fn page_values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     let common = &results.common;
-    let (rows, states) = measured::sizes(&common.config(&results.levels[0].base)?);
     let dials = results.rows_by_dial().map(|rows| {
-        let all: Vec<_> = rows.iter().map(page_row).collect();
-        context! { dial => rows[0].dial, base => all[0], levels => all[1..] }
+        let all = rows.iter().map(|row| page_row(row, common));
+        let all = all.collect::<Result<Vec<_>, Usage>>()?;
+        Ok(context! { dial => rows[0].dial, base => all[0], levels => all[1..] })
     });
     let (judged, false_positives) = false_positives(results);
     Ok(context! {
         settings => common,
-        dials => dials.collect::<Vec<_>>(),
+        dials => dials.collect::<Result<Vec<_>, Usage>>()?,
         equal,
         random => results.random,
         seeds => seed_counts(results, false),
         base_seeds => seed_counts(results, true),
         judged,
         by_chance => false_positives,
-        rows,
-        states,
         left_out => results.left_out,
         command => results.commands.join("`, then `"),
     })
 }
 
 /// Converts a row for the template: the measured numbers, and for each measure the numbers of the runs.
-fn page_row(row: &Row<'_>) -> Value {
+fn page_row(row: &Row<'_>, common: &Common) -> Result<Value, Usage> {
     let measured = |name: &'static str| (name, Value::from(row.result.measured.get(name).copied()));
     let of_runs = MEASURES.map(|it| (it.name, Value::from_serialize(row.result.values(it))));
     let named: Value = MEASURED.split(',').map(measured).chain(of_runs).collect();
-    context! { level => row.name, agent => row.agent, frames_gain => row.frames_gain(), ..named }
+    let (agent, frames_gain) = (&row.point.agent, row.frames_gain());
+    let (rows, states) = measured::sizes(&common.config(row.point)?);
+    Ok(context! { level => row.name, agent, rows, states, frames_gain, ..named })
 }
 
 /// Returns the numbers of seeds that bases have, or that other points have, in increasing order.

@@ -95,7 +95,7 @@ impl PointResult {
 pub(super) struct Row<'a> {
     pub(super) dial: &'a Dial,
     pub(super) name: &'a str,
-    pub(super) agent: &'a str,
+    pub(super) point: &'a Point,
     pub(super) is_base: bool,
     pub(super) result: &'a PointResult,
     /// The results that this row is compared with.
@@ -129,7 +129,7 @@ impl Results {
             let row = |name: &'a str, point: &'a Point, is_base| Row {
                 dial,
                 name,
-                agent: &point.agent,
+                point,
                 is_base,
                 result: &self.points[&point.key],
                 base: &self.points[&base.key],
