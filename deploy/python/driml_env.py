@@ -30,7 +30,7 @@ def serve(make):
     os.dup2(2, 1)
     request = json.loads(asks.readline())
     if request["driml_env"] != 1:
-        sys.exit(f"this driml speaks version {request['driml_env']} of the protocol, and this file version 1: take the file that came with it")
+        sys.exit(f"this driml uses version {request['driml_env']} of the protocol, and this file version 1: use the file of that driml")
     copies = request["copies"]
     world = make(copies)
     declaration = {"driml_env": 1, "copies": copies, "actions": list(world.actions)}
@@ -62,7 +62,7 @@ def serve(make):
                 world.load_state(file.read())
             answers.write(b".")
         else:
-            sys.exit(f"this driml asks for {asked}, which this file does not know: take the file that came with it")
+            sys.exit(f"this driml asks for {asked}, which this file does not know: use the file of that driml")
 
 
 def save(world, place):
@@ -95,15 +95,15 @@ class Gymnasium:
         mode = AutoresetMode(self.env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.NEXT_STEP:
             # Its step after an end takes no action: as a transition it would lead from one episode into the next.
-            sys.exit("a vector environment has to begin anew in the step that ends: make it with autoreset_mode=AutoresetMode.SAME_STEP or DISABLED")
+            sys.exit("a vector environment must reset in the step that ends an episode: make it with autoreset_mode=AutoresetMode.SAME_STEP or DISABLED")
         self.resets = mode == AutoresetMode.DISABLED
         if self.env.num_envs != copies:
-            sys.exit(f"the vector environment has {self.env.num_envs} copies where {copies} were asked for")
+            sys.exit(f"the vector environment has {self.env.num_envs} copies, and driml asked for {copies}")
         space, choice = self.env.single_observation_space, self.env.single_action_space
         if space.dtype != numpy.uint8 or len(space.shape or ()) not in (2, 3):
-            sys.exit(f"observations are {space}, and driml learns from frames: bytes of height x width (x channels); try --pixels")
+            sys.exit(f"observations are {space}, but driml learns from frames, bytes of height x width (x channels): try --pixels")
         if not isinstance(choice, gymnasium.spaces.Discrete):
-            sys.exit(f"actions are {choice}, and driml chooses one of a few: Discrete")
+            sys.exit(f"actions are {choice}, but driml needs a Discrete space")
         shape = (*space.shape, 1)[:3]
         if len(space.shape) == 2:
             channels = "last"
@@ -170,7 +170,7 @@ class Layers:
     def save(self):
         for layer in self.layers:
             if hasattr(layer, "processes"):
-                raise NotSaved("the copies are processes of their own; without --workers they can be saved")
+                raise NotSaved("the copies run in other processes: leave --workers out to save them")
         file = io.BytesIO()
         try:
             places, cells = self._places()
@@ -189,11 +189,11 @@ class Layers:
         try:
             made, (python, numpy), content, contents = Unpickler(io.BytesIO(state), places).load()
         except KeyError as why:
-            sys.exit(f"the state is of another world: this one has no {why}")
+            sys.exit(f"the state belongs to another world: this one has no {why}")
         if made != made_with():
-            sys.exit(f"the state was saved with {made}, and this is {made_with()}: only the same goes on exactly")
+            sys.exit(f"the state was saved with {made}, and this is {made_with()}: resume with the same versions")
         if len(content) != len(self.layers) or len(contents) != len(cells):
-            sys.exit(f"the state is of another world: of {len(content)} environments and wrappers where this one has {len(self.layers)}")
+            sys.exit(f"the state belongs to another world: it has {len(content)} environments and wrappers, this one {len(self.layers)}")
         for layer, saved in zip(self.layers, content):
             self._take(layer, saved)
         for cell, saved in zip(cells, contents):
@@ -348,7 +348,7 @@ def maker(args):
         module, function = args.env.split(":", 1)
         unused = [flag for flag in ("atari", "clip", "pixels", "size", "grey") if getattr(args, flag)] + ["kwargs"] * (args.kwargs != "{}")
         if unused:
-            sys.exit(f"{args.env} makes its environment itself, and --{unused[0]} is for an id of Gymnasium: leave it out, and wrap the environment in {function}")
+            sys.exit(f"--{unused[0]} is for an id of Gymnasium, and {args.env} makes its environment itself: leave it out, and wrap the environment in {function}")
         return getattr(importlib.import_module(module), function)
     import gymnasium
     from gymnasium import wrappers
@@ -383,14 +383,14 @@ def parser():
     parser = argparse.ArgumentParser(description="A Gymnasium environment as a world of driml.")
     parser.add_argument("env", help="an id such as ALE/Pong-v5, or MODULE:FUNCTION: a function without required arguments that gives an environment, or with one, the number of copies, that gives a vector environment")
     parser.add_argument("--atari", action="store_true", help="Dopamine's preprocessing")
-    parser.add_argument("--clip", action="store_true", help="rewards are cut to -1..1, as Dopamine's agents do; returns are of those then")
-    parser.add_argument("--pixels", action="store_true", help="frames are what the environment renders")
-    parser.add_argument("--size", type=int, metavar="N", help="frames are made N x N")
-    parser.add_argument("--grey", action="store_true", help="frames are made grey")
+    parser.add_argument("--clip", action="store_true", help="clip rewards to -1..1, as Dopamine's agents do; returns are sums of clipped rewards")
+    parser.add_argument("--pixels", action="store_true", help="use the frames that the environment renders")
+    parser.add_argument("--size", type=int, metavar="N", help="resize frames to N x N")
+    parser.add_argument("--grey", action="store_true", help="convert frames to grey")
     parser.add_argument("--channels", choices=("first", "last"), help="where frames have their channels, if they are not fewer than rows and columns")
     parser.add_argument("--kwargs", default="{}", metavar="JSON", help="arguments of gymnasium.make")
-    parser.add_argument("--import", dest="imports", action="append", default=[], metavar="MODULE", help="what registers the environment")
-    parser.add_argument("--workers", action="store_true", help="a process for each copy")
+    parser.add_argument("--import", dest="imports", action="append", default=[], metavar="MODULE", help="module that registers the environment")
+    parser.add_argument("--workers", action="store_true", help="run each copy in its own process")
     return parser
 
 

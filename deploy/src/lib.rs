@@ -47,7 +47,9 @@ pub fn main_with(registry: Registry) -> ExitCode {
     let environment = process_env::ensure_environment(is_replay_server);
     console::log_to_stderr();
     if let Err(e) = environment {
-        tracing::warn!("this process runs without the environment that makes it fast: {e}");
+        tracing::warn!(
+            "this process continues slower, because it cannot restart with the environment that it needs: {e}"
+        );
     }
     let ran = cli.command.run();
     panics::mark_process_ending();

@@ -167,7 +167,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         "WRITES FAIL for",
         "No space left on device",
         "If the replay server dies now",
-        "to do: the disk of the replay server on",
+        "to do: the replay server on",
     ];
     wait_until("a status that says it", || {
         let text = status_text(&system);

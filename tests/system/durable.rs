@@ -100,9 +100,7 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     let (system, ended) = ends_as_planned(8_000, &flags, 3_500, &kills);
     ended
         .expect_stderr("replay-server was killed by signal 9 SIGKILL")
-        .expect_stderr(
-            "replay-server is started again with what it has kept (3 of 8 times in a run)",
-        )
+        .expect_stderr("restarting replay-server with its replay (restart 3 of at most 8)")
         .expect_stdout("of disk, in the run folder");
     let run = system.run_folder("run");
     run.check_finished();
@@ -122,8 +120,8 @@ fn a_dead_actor_is_started_again() {
     let (system, ended) = ends_as_planned(2_560, "--agent c51", 600, &ends);
     ended
         .expect_stderr("was killed by signal 9 SIGKILL (log: ")
-        .expect_stderr("is started again (1 of 16 times in a run)")
-        .expect_stderr("is started again (2 of 16 times in a run)");
+        .expect_stderr("(restart 1 of at most 16)")
+        .expect_stderr("(restart 2 of at most 16)");
     let run = system.run_folder("run");
     run.check_finished();
     system.run_ok("local --resume run --frames 3000");
@@ -143,10 +141,7 @@ fn kill_shards_after_updates(kill_points: impl IntoIterator<Item = u64>) {
     let kills: Vec<_> = kill_points.into_iter().map(kill_server_at).collect();
     let flags = "--durable --agent c51 --replay-shards 2";
     let (system, ended) = ends_as_planned(6_400, flags, SHARDS_PAUSE_AT, &kills);
-    ended.expect_stderr(&format!(
-        "is started again with what it has kept ({} of 8",
-        kills.len()
-    ));
+    ended.expect_stderr(&format!("with its replay (restart {} of at most 8", kills.len()));
     for log in ["shard-0/log.toml", "shard-1/log.toml"] {
         assert!(system.path("run/replay").join(log).exists());
     }
@@ -159,7 +154,7 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     for _ in 0..=8 {
         signal_and_wait(&system, "replay-server", Signal::SIGKILL);
     }
-    process.fails("(8 of 8 times in a run)");
+    process.fails("(restart 8 of at most 8)");
     system.check_outcome(Outcome::Failed);
     assert!(
         !system.run_folder("run").checkpoints().is_empty(),

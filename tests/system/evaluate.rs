@@ -95,7 +95,10 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
         let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
         assert_eq!(json["averaged"], weights == "averaged", "{flags}");
     }
-    system.rejects("evaluate run --checkpoint average", "leave it out");
+    system.rejects(
+        "evaluate run --checkpoint average",
+        "leave --checkpoint out",
+    );
 
     system
         .run_ok("evaluate run --export net.safetensors")
@@ -221,13 +224,12 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &
         "run has no best checkpoint",
     );
     let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
-    keep("--episodes 3").expect_stdout("over 3 episodes, the most so far\n");
+    keep("--episodes 3").expect_stdout("over 3 episodes, the best so far\n");
     system.run_ok("evaluate run --checkpoint best --episodes 1");
     let oldest = system.run_folder("run").checkpoints().remove(0);
     let updates = checkpoint_updates(&oldest);
-    keep(&format!("--episodes 1 --checkpoint {updates}")).expect_stdout(
-        "; the best stays: it was played for 3 episodes, and fewer do not compare\n",
-    );
+    keep(&format!("--episodes 1 --checkpoint {updates}"))
+        .expect_stdout("; the best checkpoint stays, as its mean is over 3 episodes\n");
     // For a comparison over more episodes, the best checkpoint is played again.
     keep(&format!("--episodes 5 --checkpoint {updates}"));
     let table = system.run_folder("run").table("evaluations.csv");

@@ -19,7 +19,7 @@ fn a_second_interrupt_ends_at_once() {
     // After the first interrupt, the launcher would wait for minutes for this unresponsive learner.
     system.find_process("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
-    process.wait_for_stderr("Ctrl-C again ends at once");
+    process.wait_for_stderr("Ctrl-C again exits at once");
     interrupt_until_it_ends(process)
         .expect_error("stopped at once by a second interrupt: what was not saved is lost");
     system.check_outcome(Outcome::Failed);
@@ -101,7 +101,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     system.find_process("actor").signal(Signal::SIGKILL);
     process
         .fails("error: actor-0 was killed by signal 9 SIGKILL (log: ")
-        .expect_stderr("actor-0 is not started again: the ghosts of this run change");
+        .expect_stderr("actor-0 cannot be restarted: the ghosts of this run change");
     system.check_outcome(Outcome::Failed);
 }
 

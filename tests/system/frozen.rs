@@ -39,7 +39,7 @@ fn a_complete_run_is_finished() {
     let system = system();
     complete_but_for_an_actor(&system)
         .wait_ok()
-        .expect_stderr("did not end within 1 min 0 s and was killed")
+        .expect_stderr("did not exit within 1 min 0 s and was killed")
         .expect_stdout("finished: ");
     system.check_outcome(Outcome::Finished);
 }

@@ -73,7 +73,7 @@ fn a_run_continues_when_others_fill_it_up() {
     client.wait_for_updates(then + 200);
     // A process that starts now finds no room.
     system.find_process("actor").signal(Signal::SIGKILL);
-    process.wait_for_stderr("is started again (1 of 16 times in a run)");
+    process.wait_for_stderr("(restart 1 of at most 16)");
     process.wait_for_stderr("no shared memory, so messages go through sockets");
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     let then = client.learner_status().unwrap().updates;

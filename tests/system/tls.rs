@@ -216,7 +216,7 @@ fn the_doctor_looks_at_certificates() {
     };
     for (what, words) in [
         ("tls replay-server", "127.0.0.1"),
-        ("tls learner", "good until"),
+        ("tls learner", "valid until"),
         ("tls observer", "days)"),
         ("tls actors", "from 0 to"),
     ] {

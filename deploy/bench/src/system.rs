@@ -223,7 +223,7 @@ impl Run {
             }
             ensure!(
                 started.elapsed() < WAIT_MAX,
-                "the run has not come as far as is to be measured within {} s",
+                "the run was not ready to be measured within {} s",
                 WAIT_MAX.as_secs()
             );
             thread::sleep(POLL_INTERVAL / 2);

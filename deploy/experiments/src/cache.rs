@@ -78,18 +78,17 @@ impl Session {
         if report_only && !has(PIECES) && !has(RUNS) {
             let folder = folder.display();
             bail!(usage!(
-                "nothing was made in {folder} yet: there is nothing to report"
+                "{folder} has no results yet: there is nothing to report"
             ));
         }
         let pieces = folder.join(PIECES);
         output::make_folder("--out", &pieces)?;
-        let settings =
-            serde_json::to_string_pretty(settings).context("writing down the settings")?;
+        let settings = serde_json::to_string_pretty(settings).context("encoding the settings")?;
         let path = pieces.join(SETTINGS);
         match fs::read(&path) {
             Ok(found) if found == settings.as_bytes() => {}
             Ok(_) => bail!(usage!(
-                "{} holds what was made with other settings: choose another --out, or remove that folder",
+                "{} holds results made with other settings: choose another --out, or remove that folder",
                 folder.display()
             )),
             Err(_) if report_only => {}
@@ -133,7 +132,7 @@ impl Session {
     }
 
     fn write<T: Serialize>(&self, key: &str, piece: &StoredPiece<T>) -> anyhow::Result<()> {
-        let text = serde_json::to_vec(piece).context("keeping a piece")?;
+        let text = serde_json::to_vec(piece).context("encoding a piece")?;
         Ok(output::write_file("--out", &self.piece_path(key), &text)?)
     }
 
@@ -166,7 +165,7 @@ impl Session {
     pub(crate) fn check_none_missing(&self) -> anyhow::Result<()> {
         ensure!(
             self.missing.is_empty() || self.report_only,
-            "these runs failed and are in no number of the page; the same command tries them again: {}",
+            "these runs failed and are not on the page; the same command retries them: {}",
             self.missing.join(", ")
         );
         Ok(())

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 pub enum FigureError {
     /// The extension of the name is not that of a supported format.
-    #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
+    #[error("{} is not the name of a picture: use one that ends in .svg, .pdf or .png", .0.display())]
     Extension(PathBuf),
     /// The name of a film does not end in `.gif`.
     #[error("{} is not the name of a film: use one that ends in .gif", .0.display())]

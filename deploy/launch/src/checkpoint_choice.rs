@@ -40,9 +40,9 @@ impl FromStr for CheckpointChoice {
         match text {
             "best" => Ok(Self::Best),
             "newest" => Ok(Self::Newest),
-            "average" => {
-                Err("averaged weights are played wherever a run has them: leave it out".into())
-            }
+            "average" => Err(
+                "averaged weights play by default if a run has them: leave --checkpoint out".into(),
+            ),
             _ => whole_number::within(1..=u64::MAX)(text)
                 .map(Self::After)
                 .map_err(|e| {

@@ -11,6 +11,7 @@ use std::{
 
 use anyhow::Context as _;
 use console::Term;
+use driml_machine::units::count;
 use driml_protocol::{last_warning, lock};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use tracing::{Event, Level, Subscriber, field::Field};
@@ -310,7 +311,8 @@ impl Screen {
         }
         let more = std::mem::take(&mut lock(&self.full_disk).omitted);
         if more > 0 {
-            eprintln(&format!("and {more} more about the full disk"));
+            let more = count(more, "further line");
+            eprintln(&format!("left out {more} about the full disk"));
         }
     }
 }

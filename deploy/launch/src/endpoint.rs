@@ -73,7 +73,7 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
         let existing = path.and_then(|path| fs::symlink_metadata(path).ok());
         if existing.is_some_and(|it| !it.file_type().is_socket()) {
             return Err(usage!(
-                "cannot listen on {endpoint}: what is there is not a socket. Choose another path, with --listen for this command and \
+                "cannot listen on {endpoint}: that path is not a socket. Choose another path, with --listen for this command and \
                  --connect for all others"
             ));
         }
@@ -234,7 +234,7 @@ mod tests {
         fs::remove_file(&path).unwrap();
         fs::write(&path, "a thesis").unwrap();
         let said = check_unused(&endpoints).unwrap_err().0;
-        assert!(said.contains("what is there is not a socket"), "{said}");
+        assert!(said.contains("that path is not a socket"), "{said}");
     }
 
     #[test]

@@ -152,7 +152,7 @@ impl Evaluator {
                 screen.print_line("playing the last checkpoint (skip it with Ctrl-C)");
             }
             if abort() || Instant::now() > deadline {
-                screen.print_line("the last evaluation was left out");
+                screen.print_line("skipped the last evaluation");
                 return;
             }
             std::thread::sleep(POLL);
@@ -180,7 +180,7 @@ impl Evaluator {
         match ManagedProcess::start("evaluation", &args, 1, &logs, screen, None) {
             Ok(process) => self.process = Some(process),
             Err(e) => screen.print_line(&format!(
-                "the checkpoint after {} is not played: {e:#}",
+                "cannot evaluate the checkpoint after {}: {e:#}",
                 count(updates, "update")
             )),
         }

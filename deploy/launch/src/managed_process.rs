@@ -186,7 +186,7 @@ impl Drop for ManagedProcess {
         // The exit status is missing if the kernel cannot end the process, for example because a driver hangs.
         let end = self.wait_until(Instant::now() + KILLED_MAX, || false);
         if end.is_none() {
-            tracing::warn!("{} (process {}) does not end", self.name, self.child.id());
+            tracing::warn!("{} (process {}) does not exit", self.name, self.child.id());
         }
     }
 }
@@ -230,7 +230,7 @@ pub(crate) fn stop_processes<'a>(
             None => {
                 if !abort() {
                     failures.push(format!(
-                        "{} did not end within {} and was killed",
+                        "{} did not exit within {} and was killed",
                         process.name,
                         duration(drain_max)
                     ));

@@ -69,8 +69,8 @@ fn panic_line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]
     let place = panic.location().map(|it| format!(" at {it}"));
     let place = place.unwrap_or_default();
     let why = match scarce.join("; ") {
-        scarce if scarce.is_empty() => "this is a fault of the program, which ends here".to_owned(),
-        scarce => format!("the program ends here, and the system is short of this: {scarce}"),
+        scarce if scarce.is_empty() => "this is a bug in the program, which aborts".to_owned(),
+        scarce => format!("the program aborts, and the system is short of this: {scarce}"),
     };
     let (thread, message) = (thread.unwrap_or("without a name"), message.join("; "));
     format!("error: the thread {thread} panicked{place}: {message}; {why}")
@@ -153,7 +153,7 @@ mod tests {
         let mut lines = stderr.lines();
         let line = lines.find(|line| line.starts_with("error: ")).unwrap();
         assert!(line.contains("zenoh-shm"), "{line}");
-        let scarce = "; the program ends here, and the system is short of this: 60 of at most 60 files are open: raise the limit";
+        let scarce = "; the program aborts, and the system is short of this: 60 of at most 60 files are open: raise the limit";
         assert!(line.contains(scarce), "{line}");
     }
 

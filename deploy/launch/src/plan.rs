@@ -72,13 +72,13 @@ pub fn describe(
          processes   {processes}\n\
          replay      the newest {held} transitions, up to {bytes} of memory{disk}\n\
          run folder  {run_dir}\n\
-         time        {time} (coarse: from the network's arithmetic)\n{notes}"
+         time        {time} (roughly, from the network's arithmetic)\n{notes}"
     )
 }
 
 fn processes(config: &RunConfig, lockstep: bool) -> String {
     if lockstep {
-        return "one, with everything in lockstep".into();
+        return "one, in lockstep".into();
     }
     let servers = match config.replay.shards {
         1 => "replay server".into(),

@@ -39,7 +39,7 @@ impl Rendezvous {
         remove_unused(&parent);
         Self::create_in(&parent).with_context(|| {
             let parent = parent.display();
-            format!("making a folder for the socket in {parent}: set TMPDIR to a folder that may be written")
+            format!("making a folder for sockets in {parent} (TMPDIR sets another place)")
         })
     }
 

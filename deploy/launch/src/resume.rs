@@ -92,7 +92,7 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
         locked => locked.transpose().map(|_| true),
     };
     let why = format!(
-        "a learner still uses {}, and must be stopped if it was kept alive",
+        "a learner still uses {} (stop it if it runs with --keep-alive)",
         checkpoints.display()
     );
     if !wait_until(is_saved, SAVING_MAX, &why)? {
@@ -104,7 +104,7 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
         let is_used = |place: Vec<u8>| rendezvous::is_used(Path::new(OsStr::from_bytes(&place)));
         Ok(!place.is_ok_and(is_used))
     };
-    let why = format!("processes of the run in {} still end", folder.display());
+    let why = format!("processes of the run in {} are exiting", folder.display());
     wait_until(have_exited, ENDING_MAX, &why).map(drop)
 }
 
@@ -175,7 +175,7 @@ fn check_changes(
     let replay = folder.replay();
     if !lockstep && config.local.durable && !before.local.durable && replay.is_dir() {
         bail!(usage!(
-            "{} lacks what the run did later, without --durable: remove that folder, then resume",
+            "{} lacks what the run stored later, without --durable: remove that folder, then resume",
             replay.display()
         ));
     }
@@ -244,7 +244,7 @@ pub fn prepare(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::
         let frames = count(frames, "frame");
         return Ok(Resumption::Done(format!(
             "nothing is left to do: the run in {run} has done {updates} and {frames}.\n\
-             `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains on, up to N frames"
+             `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains it up to N frames"
         )));
     }
     let replay_is_kept = lockstep || config.local.durable && folder.replay().is_dir();

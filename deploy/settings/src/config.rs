@@ -158,7 +158,7 @@ impl RunConfig {
         let name = self.world.name().to_string();
         if name != self.run.world {
             return Err(usage!(
-                "run.world = {:?}, but the table [world] is of {name:?}: correct the one or the other",
+                "run.world = {:?}, but the table [world] is of {name:?}: correct one of the two",
                 self.run.world
             ));
         }

@@ -211,7 +211,7 @@ pub(crate) fn parse_file(name: &str, text: &str) -> Result<Table, Usage> {
             && is != Some(was)
         {
             return Err(usage!(
-                "{name}: {path} = {}, but it {how} and is {}; correct the one or the other",
+                "{name}: {path} = {}, but it {how} and is {}; correct one of the two",
                 inline_text(was),
                 is.map_or("not there".into(), inline_text)
             ));

@@ -200,7 +200,7 @@ fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> 
     for text in sets {
         let parsed = Override::parse(text)?;
         if let Some((known, how)) = derived::find_derived(&parsed.path) {
-            return Err(usage!("{known} cannot be set by hand: it {how}"));
+            return Err(usage!("{known} cannot be set: it {how}"));
         }
         let mut tried = table.clone();
         let is_new = parsed.apply(&mut tried)?;

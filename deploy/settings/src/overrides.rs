@@ -64,7 +64,7 @@ impl Override {
             }
             (old, new) if old.same_type(new) => Ok(new.clone()),
             (old, new) => Err(usage!(
-                "--set {}={}: the value is {}, and {new} is {}",
+                "--set {}={}: this setting takes {}, and {new} is {}",
                 self.path,
                 inline_text(new),
                 type_name(old),

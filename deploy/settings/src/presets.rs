@@ -108,7 +108,7 @@ macro_rules! agents {
 }
 
 agents! {
-    "c51": "the return alone";
+    "c51": "C51 without an auxiliary loss";
     "rainbow": "c51 with double DQN, rows drawn by priority, a dueling head, and noisy layers in place of epsilon";
     "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
     "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";

@@ -34,15 +34,16 @@ pub(crate) struct ActorArgs {
 fn actor_id(text: &str) -> Result<u32, String> {
     let Some(name) = text.strip_prefix("env:") else {
         return text.parse().map_err(|_| {
-            "give a whole number from 0, or env:NAME for one that the environment holds".into()
+            "give a whole number from 0, or env:NAME for an environment variable that holds one"
+                .into()
         });
     };
     match std::env::var(name) {
         Ok(value) => value.trim().parse().map_err(|_| {
-            format!("the environment variable {name} is {value:?}, not an actor's id")
+            format!("the environment variable {name} is {value:?}: set it to a whole number from 0")
         }),
         Err(_) => Err(format!(
-            "the environment has no {name}: set it before you start this process"
+            "the environment variable {name} is not set: set it to a whole number from 0"
         )),
     }
 }

@@ -28,7 +28,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
     let checkpoints = checkpoint::list(&folder.checkpoints())?;
     let (updates, path) = checkpoints.last().ok_or_else(|| {
         usage!(
-            "{} has no checkpoint, from which A is read: name the folder of a run that has one",
+            "{} has no checkpoint, from which A is read: choose a run that has one",
             folder.display()
         )
     })?;

@@ -101,7 +101,7 @@ fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     }
     for other in others {
         let other = other.display();
-        console::eprintln(&format!("left out {other}: it is not the folder of a run"));
+        console::eprintln(&format!("skipped {other}: it is not the folder of a run"));
     }
     Ok(runs)
 }
@@ -120,7 +120,7 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
     let groups = groups::group_runs(&runs, !args.separate);
     let is_return = |column: &String| column == RETURN || column == EVALUATED;
     if args.random.is_some() && !columns.iter().any(is_return) {
-        return Err(usage!("--random is a line over {RETURN:?}, which is not drawn").into());
+        return Err(usage!("--random draws a line over {RETURN:?}: add --column return").into());
     }
     let random = match args.random {
         Some(episodes) => random_means(&runs, episodes as usize)?,

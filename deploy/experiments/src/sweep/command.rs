@@ -120,7 +120,7 @@ fn parse_axes(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
         let axis = Axis::parse(set)?;
         if axes.iter().any(|known| known.name == axis.name) {
             return Err(usage!(
-                "{} is set twice: give its values in one --set, parted by commas",
+                "{} is set twice: give its values in one --set, separated by commas",
                 axis.name
             )
             .into());

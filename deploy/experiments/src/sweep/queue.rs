@@ -205,14 +205,14 @@ impl Queue {
         let (name, log_tail) = (&plan.name, self.runs.log_tail(plan));
         // Settings that are wrong here are wrong for the other runs too.
         if status.code() == Some(EXIT_USAGE.into()) && ended.job.resumed_at.is_none() {
-            return Err(usage!("the run {name} cannot be made:\n{log_tail}").into());
+            return Err(usage!("the run {name} cannot start:\n{log_tail}").into());
         }
         let (failed, next_step) = match *tries < TRIES_MAX {
-            true => ("failed", "is tried once more"),
+            true => ("failed", "is retried once"),
             false => ("failed again", "is left out"),
         };
         progress.line(&format!(
-            "the run {name} {failed} ({status}) and {next_step}. Its last words:\n{log_tail}"
+            "the run {name} {failed} ({status}) and {next_step}. The end of its log:\n{log_tail}"
         ));
         if *tries < TRIES_MAX {
             progress.add_work(ended.done);
@@ -247,7 +247,7 @@ impl Queue {
         let resumed = resumed_at.is_some();
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
-                "{} was not finished, or is of another call: it is now {}, and the run starts anew",
+                "{} was not finished, or comes from another call: moved it to {}; the run starts from the beginning",
                 folder.display(),
                 aside.display()
             ));
@@ -360,7 +360,7 @@ fn wait_for_log_lock(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
         if !std::mem::replace(&mut has_told, true) {
             let name = &plan.name;
             progress.line(&format!(
-                "an earlier {name} still runs or saves: waiting for it"
+                "an earlier process of {name} still runs: waiting for it"
             ));
         }
         std::thread::sleep(POLL);

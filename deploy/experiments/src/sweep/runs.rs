@@ -76,7 +76,7 @@ impl Runs {
             false if earlier.is_empty() => commit.to_owned(),
             false => format!("{earlier}+{commit}"),
         };
-        let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
+        let call = serde_json::to_vec(&plan.call.args()).context("encoding a call")?;
         write_atomically(&self.path_beside(plan, "call.json"), &call)?;
         write_atomically(&self.path_beside(plan, "commit"), commits.as_bytes())
     }

@@ -93,7 +93,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         tradeoff.session.check_none_missing()?;
         let what = match results.points.is_empty() {
             true => "no run is finished yet",
-            false => "no level has a finished run beside its base's",
+            false => "no level and its base both have a finished run",
         };
         return Err(
             usage!("{what}, and none fits into the budget: there is nothing to report").into(),

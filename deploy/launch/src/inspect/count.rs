@@ -11,8 +11,8 @@ use driml_protocol::{BatchHeader, Horizon, RunSpec, TRANSITION_BYTES};
 use driml_settings::{config::RunConfig, memory::replay_bytes_each};
 use serde::Serialize;
 
-pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
-     a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
+pub(super) const EVERYTHING: &str = "the options of all agents at once: five heads of DIM and a key encoder, \
+     a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged by the actors";
 /// Positives of a row with everything on: those of the agent with the most, cpc.
 const EVERYTHING_POSITIVES: usize = 5;
 pub(super) const BATCH_NAME: &str = "a batch";

@@ -64,8 +64,8 @@ impl Inspection {
         let mut text = format!("{} on {}\n", self.agent, self.world);
         for (heading, lines, is_summed) in [
             ("builds: parameters", &self.parameters, true),
-            ("computes: FLOPs an update", &self.update_flops, true),
-            ("computes: FLOPs a decision", &self.decision_flops, true),
+            ("computes: FLOPs per update", &self.update_flops, true),
+            ("computes: FLOPs per decision", &self.decision_flops, true),
             ("holds and sends: bytes", &self.bytes, false),
         ] {
             text += &format!("\n{}", row(heading, "is", "everything"));
@@ -81,7 +81,7 @@ impl Inspection {
 
 /// A table with one line per world: the sums of an agent's tables, and in brackets the sums with everything on.
 pub fn describe_worlds(inspections: &[Inspection]) -> String {
-    let headings = "world,parameters,FLOPs an update,FLOPs a decision,bytes a batch";
+    let headings = "world,parameters,FLOPs per update,FLOPs per decision,bytes per batch";
     let mut rows = vec![headings.split(',').map(String::from).collect()];
     for it in inspections {
         let batch = it.bytes.iter().find(|it| it.what == count::BATCH_NAME);

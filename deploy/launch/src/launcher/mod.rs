@@ -246,7 +246,7 @@ impl Launch<'_> {
             true => watched.or(Ok(Outcome::Interrupted)),
         };
         if matches!(watched, Ok(Outcome::Interrupted)) {
-            self.display.screen.print_line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
+            self.display.screen.print_line("stopping: actors deliver what they have, the learner saves (Ctrl-C again exits at once)");
         }
         let now = self.shutdown.immediate.clone();
         let abort = move || now.is_set();

@@ -183,7 +183,7 @@ impl Launch<'_> {
             let (name, report) = (&self.names[number], process.exit_report());
             let (restarts, max, with_replay) = match role {
                 ProcessRole::ReplayServer(_) if self.config.local.durable => {
-                    let kept = " with what it has kept";
+                    let kept = " with its replay";
                     (&mut self.server_restarts, RESTARTS_MAX, kept)
                 }
                 ProcessRole::Actor(_) if process.is_restartable() => {
@@ -196,13 +196,13 @@ impl Launch<'_> {
             }
             if is_actor && !self.config.world.is_resumable() {
                 bail!(
-                    "{report}\n{name} is not started again: the ghosts of this run change as episodes pass, and a new process would \
+                    "{report}\n{name} cannot be restarted: the ghosts of this run change as episodes pass, and a new process would \
                      count these from 0"
                 );
             }
             *restarts += 1;
             self.display.screen.print_line(&format!(
-                "{report}\n{name} is started again{with_replay} ({restarts} of {max} times in a run)"
+                "{report}\nrestarting {name}{with_replay} (restart {restarts} of at most {max})"
             ));
             session::remove_orphaned_shared_memory();
             self.processes[number] = self.start(number)?;

@@ -220,7 +220,7 @@ impl Lockstep {
 
     /// [`Lockstep::save`] for a run whose replay has a mark in its log.
     fn save_with_mark(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
-        let doing = "saving the worlds for a checkpoint; at the run's start it could be done";
+        let doing = "saving the worlds for a checkpoint, which worked at the start of the run";
         let saved = SavedState {
             actors: self.actor_states().context(doing)?,
             replay: mark,

@@ -267,9 +267,9 @@ fn next_steps_stand_in_columns() {
     });
     expect![[r#"
         Greedy return (averaged weights): 45.12, 95% interval 41.80 to 48.40, 100 episodes; a random policy earns 3.90 (3.10 to 4.70).
-          driml evaluate runs/x --record play.gif     films it, and plays a random policy beside it
+          driml evaluate runs/x --record play.gif     films the agent, beside a random policy
           driml plot runs/x --out plot.png            return, losses, k and speed
-          driml train --resume runs/x --frames 2560   trains on
+          driml train --resume runs/x --frames 2560   continues training
     "#]]
     .assert_eq(&summary.next_steps(&RunFolder::new("runs/x"), true));
     let repeated_alone = summary.next_steps(&RunFolder::new("runs/x"), false);

@@ -192,13 +192,16 @@ impl Summary {
     pub(crate) fn next_steps(&self, run_dir: &RunFolder, is_resumable: bool) -> String {
         let run = run_dir.quoted();
         let more = self.frames.saturating_mul(2);
-        let film = "films it, and plays a random policy beside it";
+        let film = "films the agent, beside a random policy";
         let mut next = vec![
             (format!("evaluate {run} --record play.gif"), film),
             plot_command(run_dir),
         ];
         if is_resumable {
-            next.push((format!("train --resume {run} --frames {more}"), "trains on"));
+            next.push((
+                format!("train --resume {run} --frames {more}"),
+                "continues training",
+            ));
         }
         self.describe_returns() + &format_commands(&next)
     }

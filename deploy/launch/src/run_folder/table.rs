@@ -107,7 +107,7 @@ impl Table {
                 let of = path.file_stem().unwrap_or_default().display();
                 let row = row.iter().collect::<Vec<_>>().join(",");
                 usage!(
-                    "{}: {row:?} is not a row of {of}: mend or remove it",
+                    "{}: {row:?} is not a row of {of}: correct or remove it",
                     path.display()
                 )
             })?;

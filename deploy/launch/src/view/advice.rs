@@ -76,8 +76,8 @@ fn disk_action((server, status): (&ServerAnswer, &ProcessesStatus)) -> Option<St
     let log = status.log.as_ref()?;
     let (since, why) = log.refused.as_ref()?;
     Some(format!(
-        "the disk of the replay server on {} has rejected its replay for {} ({why}): make room for {}, or make it writable; the run then \
-         continues",
+        "the replay server on {} has not been able to write its replay for {} ({why}): free disk space for {}, or make it writable; \
+         the run then continues",
         server.endpoint,
         format_s(*since),
         log.folder
@@ -113,7 +113,7 @@ fn actor_actions(view: &RunView) -> Vec<String> {
         };
         let flags = tls_flag(endpoint);
         return vec![format!(
-            "{what}: start `driml actor --connect {endpoint}{flags} --id N`, each with another number"
+            "{what}: start `driml actor --connect {endpoint}{flags} --id N`, each with its own id"
         )];
     }
     let actor_action = |(endpoint, process): &(&str, &ProcessStatus)| {
@@ -193,14 +193,14 @@ fn silent_s(process: &ProcessStatus) -> Option<f64> {
     .then_some(silent)
 }
 
-/// Notes on the actors that are gone or unresponsive: the first ones by name, the others as a count.
+/// Notes on the actors that are disconnected or unresponsive: the first ones by name, the others as a count.
 fn unresponsive_actors(view: &RunView) -> Vec<String> {
     let words = |process: &ProcessStatus| {
         let (how, since_s) = match process.connected {
             _ if process.who == ProcessName::Learner => return None,
             true => ("no answer", silent_s(process)?),
             false if view.replay.finished => return None,
-            false => ("gone", process.since_s),
+            false => ("disconnected", process.since_s),
         };
         Some(format!("{}: {how} for {}", process.who, format_s(since_s)))
     };

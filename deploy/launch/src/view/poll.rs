@@ -71,7 +71,7 @@ impl Poller {
             let hash = served.run.hash();
             if config.get_or_insert(served).run.hash() != hash {
                 bail!(usage!(
-                    "{} and {endpoint} are of different runs: name the replay shards of one",
+                    "{} and {endpoint} belong to different runs: give the endpoints of one run",
                     endpoints[0]
                 ));
             }
@@ -201,11 +201,13 @@ fn fetch_settings(
         Ok(run_info) => run_info.config_toml,
         Err(SessionError::Recovering(recovering)) => recovering.config_toml,
         Err(SessionError::Unreadable { why, .. }) => {
-            return Err(why).context(format!("the run info of the replay server on {endpoint}"));
+            return Err(why).context(format!(
+                "reading the run info of the replay server on {endpoint}"
+            ));
         }
         Err(SessionError::NoResponder { .. }) => {
             bail!(usage!(
-                "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}"
+                "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}: check the endpoint and --namespace"
             ));
         }
         Err(other) => {

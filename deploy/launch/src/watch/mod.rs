@@ -259,7 +259,7 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<St
     });
     if is_locked && endpoints.is_empty() {
         state.message = format!(
-            "one process writes {run}, in lockstep or as `driml watch`, and cannot be asked: so far {so_far}, in metrics.csv"
+            "one process writes {run}, in lockstep or as `driml watch`, and answers no requests. metrics.csv has {so_far} so far"
         );
     } else if is_locked {
         let frames = read_progress(folder).map_or(0, |it| it.frames);
@@ -278,7 +278,7 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<St
         };
         state.is_well = false;
         state.message = format!(
-            "no process runs in {run}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT"
+            "no process runs in {run}, which holds {so_far}: {next}. For processes that were started by hand, use --connect ENDPOINT"
         );
     }
     Ok(Err(state))

@@ -100,7 +100,7 @@ impl WatchedRun {
             return;
         }
         self.display.screen.print_line(
-            "the learner's last answer is missing: its updates are those whose batches were served, its losses and weights those before",
+            "the learner's last status is missing: updates are counted by the batches served, losses and weights are older",
         );
         poller.view.learner.updates = updates;
         if let Some(recorder) = &mut self.recorder {

@@ -18,7 +18,9 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(e) => {
-            let text = format!("{dir} cannot be read ({e}): `deploy/certs.sh {dir}` makes them");
+            let text = format!(
+                "{dir} cannot be read ({e}): `deploy/certs.sh {dir}` makes the certificates"
+            );
             return vec![Fact::new("tls folder", (State::Missing, text))];
         }
     };
@@ -40,7 +42,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         }
     }
     if roles.is_empty() {
-        let text = format!("{dir} has none: `deploy/certs.sh {dir}` makes them");
+        let text = format!("{dir} has no certificates: `deploy/certs.sh {dir}` makes them");
         add("tls folder", (State::Missing, text));
     }
     roles.sort_by_key(|role| match role {
@@ -73,7 +75,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let key = tls::authority_path(folder).with_extension("key");
     if key.exists() {
         let text = format!(
-            "{} is here, with which any certificate can be made: leave it on the machine on which it was made, and copy it to no other",
+            "{} can sign any certificate: keep it on the machine that made it alone",
             key.display()
         );
         add("tls authority", (State::Note, text));
@@ -91,13 +93,13 @@ fn advice(credentials: &Credentials) -> Option<String> {
         ))
     } else if left < EXPIRES_SOON {
         Some(format!(
-            "good for {} more, then its process is cut off: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
-             start that process again",
+            "valid for {} more, then its process is disconnected: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
+             restart that process",
             count(left.as_secs() / DAY_S, "day")
         ))
     } else if role == Role::ReplayServer && credentials.hosts.is_empty() {
         Some(format!(
-            "it is for no name or address, so no client can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
+            "it names no host, so no client can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
              NAME_OR_ADDRESS` makes one"
         ))
     } else {
@@ -107,7 +109,7 @@ fn advice(credentials: &Credentials) -> Option<String> {
 
 fn validity(credentials: &Credentials) -> String {
     let days = count(credentials.expires_in().as_secs() / DAY_S, "day");
-    format!("good until {} ({days})", credentials.expires_on)
+    format!("valid until {} ({days})", credentials.expires_on)
 }
 
 /// One text for all actors that have no complaint.
@@ -117,6 +119,6 @@ fn describe_valid_actors(actors: &[(u32, Credentials)]) -> Option<String> {
     let until = validity(soonest);
     Some(match actors.len() {
         1 => format!("{first}: {until}"),
-        count => format!("{count} of them, from {first} to {last}: {until}"),
+        count => format!("{count}, from {first} to {last}: {until}"),
     })
 }

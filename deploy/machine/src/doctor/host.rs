@@ -44,9 +44,12 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
 
 fn cores(machine: &Machine) -> Finding {
     let (cores, actors) = (machine.cores, machine.default_actors());
-    let text = format!("{cores}, all of them for the learner; --actors is {actors} unless given");
+    let text = format!("{cores}, all used by the learner; --actors defaults to {actors}");
     match cores {
-        0 | 1 => (State::Note, format!("{text}; all processes share it")),
+        0 | 1 => (
+            State::Note,
+            format!("{text}; all processes share this core"),
+        ),
         _ => (State::Ok, text),
     }
 }
@@ -71,7 +74,7 @@ fn vectors(lanes: Option<u32>) -> Finding {
     match lanes {
         None => {
             let arch = std::env::consts::ARCH;
-            let text = format!("not x86-64 but {arch}: it was never measured there");
+            let text = format!("{arch}, not x86-64: its speed was never measured");
             (State::Note, text)
         }
         Some(16) => (State::Ok, "AVX-512: 16 float32 at once".into()),
@@ -110,11 +113,11 @@ fn shared_memory(free: Result<u64, String>) -> Finding {
             return (State::Ok, format!("{} free in {folder}", gib(free)));
         }
         Ok(free) => format!(
-            "{} MiB free in {folder}, a run takes up to {}: sockets serve instead, several times slower; a container needs --shm-size=1g",
+            "{} MiB free in {folder}, and a run takes up to {}: sockets are used instead, several times slower; a container needs --shm-size=1g",
             free >> 20,
             SHARED_MEMORY_ENOUGH >> 20
         ),
-        Err(why) => format!("{why}: sockets serve instead, several times slower"),
+        Err(why) => format!("{why}: sockets are used instead, several times slower"),
     };
     (State::Note, why)
 }
@@ -128,7 +131,7 @@ fn locked_memory(limit: Option<u64>) -> Finding {
         }
         Some(limit) => {
             let text = format!(
-                "`ulimit -l` allows {} KiB, a run with one actor locks up to {} MiB of shared memory: sockets serve instead, several times slower; to raise it, add \
+                "`ulimit -l` allows {} KiB, and a run with one actor locks up to {} MiB of shared memory: sockets are used instead, several times slower; to raise it, add \
                  \"USER - memlock unlimited\" to /etc/security/limits.conf and log in again; a service needs LimitMEMLOCK=infinity, a \
                  container --ulimit memlock=-1",
                 limit >> 10,

@@ -97,7 +97,7 @@ fn frames_that_are_whole_stay_whole() {
     assert_eq!(sizes(&again), ((62, 61), (100, 76)));
     let text = cut.to_toml();
     let wrong = text.replace("frame_height = 60", "frame_height = 64");
-    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what the torso reads and is 60; correct the one or the other"]
+    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what the torso reads and is 60; correct one of the two"]
         .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
 }
 
@@ -191,8 +191,8 @@ fn a_file_at_odds_with_itself_is_refused() {
     ]
     .map(|text| resolve_file("x.toml", text, &[]).unwrap_err() + "\n");
     expect![[r#"
-        x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other
-        x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct the one or the other
+        x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct one of the two
+        x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct one of the two
         x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote
         x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`
         x.toml is not TOML: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`

@@ -81,11 +81,8 @@ pub(crate) struct EvaluateArgs {
 }
 
 fn probability(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    match (0.0..=1.0).contains(&value) {
-        true => Ok(value),
-        false => Err("use 0 to 1".into()),
-    }
+    let value = text.parse().ok().filter(|it| (0.0..=1.0).contains(it));
+    value.ok_or_else(|| "give a number from 0 to 1".into())
 }
 
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
@@ -136,7 +133,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let on = match args.levels {
         Levels::Train if !world.is_resumable() => "from the start of world.lethal_schedule",
         Levels::Train => "as trained on",
-        Levels::TrainSingle => "on the levels trained on, one an episode",
+        Levels::TrainSingle => "on the levels trained on, one per episode",
         Levels::Unseen => "on unseen levels",
     };
     let print_text = |text: &str| if args.json { Ok(()) } else { print(text) };
@@ -193,7 +190,7 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     if path.extension().is_none_or(|it| it != "safetensors") {
         let name = path.display();
         bail!(usage!(
-            "--export {name}: the file's name ends in .safetensors"
+            "--export {name}: use a name that ends in .safetensors"
         ));
     }
     output::check_file("--export", path)?;
@@ -211,9 +208,9 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
 /// Returns how the checkpoint compares with the run's best one, as the end of a sentence.
 fn compare_with_best(ranked: &RankedEvaluation) -> String {
     match &ranked.best_before {
-        _ if ranked.is_best => ", the most so far".into(),
+        _ if ranked.is_best => ", the best so far".into(),
         Some(best) if best.episodes > ranked.evaluation.episodes => format!(
-            "; the best stays: it was played for {}, and fewer do not compare",
+            "; the best checkpoint stays, as its mean is over {}",
             count(best.episodes, "episode")
         ),
         _ => String::new(),

@@ -280,7 +280,7 @@ fn world_base(
     own.or_else(|| worlds.remove(world.kind())).ok_or_else(|| {
         let kinds = worlds.into_keys().filter(|name| !name.contains(':'));
         usage!(
-            "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
+            "driml tradeoff has no settings for {world}; it has settings for {}",
             kinds.collect::<Vec<_>>().join(", ")
         )
     })
@@ -423,7 +423,10 @@ coinrun|observation|input.height=64 input.width=64";
                 "--env chain --dials learner.precison",
                 "did you mean \"learner.precision\"?",
             ),
-            ("--env ising", "it has some for chain, mspacman, procgen"),
+            (
+                "--env ising",
+                "it has settings for chain, mspacman, procgen",
+            ),
         ] {
             let said = of(line, None).unwrap_err().to_string();
             assert!(said.contains(expected), "{said}");
