@@ -17,7 +17,6 @@ use crate::cli::Cli;
 const GENERATED: &str =
     "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml --lib reference` rewrites this page. -->";
 
-/// Returns the entry of a flag or argument in the list of its command.
 fn flag_entry(arg: &Arg) -> String {
     let takes_values = arg.get_action().takes_values();
     let value = match arg.get_value_names() {

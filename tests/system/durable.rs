@@ -141,7 +141,10 @@ fn kill_shards_after_updates(kill_points: impl IntoIterator<Item = u64>) {
     let kills: Vec<_> = kill_points.into_iter().map(kill_server_at).collect();
     let flags = "--durable --agent c51 --replay-shards 2";
     let (system, ended) = ends_as_planned(6_400, flags, SHARDS_PAUSE_AT, &kills);
-    ended.expect_stderr(&format!("with its replay (restart {} of at most 8", kills.len()));
+    ended.expect_stderr(&format!(
+        "with its replay (restart {} of at most 8",
+        kills.len()
+    ));
     for log in ["shard-0/log.toml", "shard-1/log.toml"] {
         assert!(system.path("run/replay").join(log).exists());
     }

@@ -10,14 +10,11 @@ use rand_chacha::ChaCha8Rng;
 use crate::{report::Bench, settings};
 
 pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
-/// The number of environments that are stepped together.
 const ENVS: usize = 32;
 /// The numbers of engine threads. With 0 the caller's thread steps every environment.
 pub(super) const ENGINE_THREADS: [usize; 2] = [0, 2];
-/// The number of steps in a timed call.
 const STEPS: usize = 64;
 
-/// Returns the name of the figure of a Procgen game.
 pub(super) fn label(game: &str, threads: usize) -> String {
     format!("{game}, {ENVS} environments, {threads} engine threads")
 }

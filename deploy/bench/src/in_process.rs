@@ -132,7 +132,6 @@ impl FullReplay {
         batch.map_err(|why| anyhow!("no batch: {why:?}"))
     }
 
-    /// Draws a batch and sets random priorities for its rows.
     fn draw_and_update(&mut self) -> anyhow::Result<()> {
         let batch = self.draw()?;
         let priorities: Vec<f32> = (0..self.rows).map(|_| self.rng.random()).collect();

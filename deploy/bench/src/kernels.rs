@@ -15,12 +15,9 @@ use crate::{
 const ROWS: usize = 256;
 /// Side and channels of the maps of each stage, which has as many input channels as output channels.
 const STAGES: [(usize, usize); 3] = [(32, 16), (16, 32), (8, 32)];
-/// The torsos of the C51 updates.
 const TORSOS: [&str; 2] = ["nature", "impala"];
-/// The number of tiles in a call.
 const TILES: usize = 10_000;
 
-/// Measures GFLOP/s in each precision.
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let meter = bench.meter;
     for precision in bench.flags.precisions(DeviceName::Cpu) {

@@ -27,7 +27,6 @@ C51, impala, 64x64x3, 64 rows|c51|paper|model.torso=impala|learner.batch_size=64
 C51 + global-global DIM, impala, 64x64x3|driml-ada|paper|model.torso=impala";
 /// The update that is also computed with candle's own operations, as on a GPU, instead of our kernels.
 pub(super) const GLOBAL_DIM_CASE: &str = "C51 + global-global DIM, 64x64x3";
-/// The end of that figure's name.
 pub(super) const CANDLE_SUFFIX: &str = "candle's own operations";
 /// Shares of s_t and s_{t+k}, and of s_{t+n}, that are copies of another state.
 const REPEATED: [(f64, &str); 3] = [

@@ -20,7 +20,6 @@ const NETWORKS: [(&str, &str, &[&str]); 3] = [
     ("64x64x3, impala", "paper", &["model.torso=impala"]),
 ];
 
-/// Measures frames per second in each precision.
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     for precision in bench.flags.precisions(DeviceName::Cpu) {
         for (network, preset, sets) in NETWORKS {

@@ -28,7 +28,6 @@ pub(super) const CHUNKS: [ChunkShape; 4] = [
     ChunkShape::new(8, 32),
 ];
 
-/// Streams and steps of a chunk.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ChunkShape {
     streams: u32,
@@ -128,7 +127,6 @@ pub(super) struct Chunks<'a> {
 }
 
 impl Chunks<'_> {
-    /// Returns the number of transitions in all chunks so far.
     pub(super) const fn transitions(&self) -> u64 {
         self.recorder.transitions_recorded()
     }

@@ -18,7 +18,6 @@ use crate::{
     server::{REPLAY_DIR, Server, TLS_DIR, Wire},
 };
 
-/// The default number of rounds that compare servers on disk and in memory.
 const ROUNDS_ON_DISK: u32 = 3;
 
 /// Measures what the flags select: batches per second without a wire; or transitions and batches per second over wires, or on disk and in

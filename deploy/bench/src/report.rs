@@ -27,12 +27,10 @@ pub(super) struct Bench<'a> {
     pub(super) table: Option<String>,
 }
 
-/// A measured rate or amount, with its name and unit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Measurement {
     /// What was measured; unique in its bench.
     pub(super) what: String,
-    /// The value in this unit.
     pub(super) value: f64,
     /// The unit, such as `updates/s`.
     pub(super) unit: String,
@@ -50,7 +48,6 @@ impl Figures {
         self.add(Measurement { what, value, unit });
     }
 
-    /// Adds a figure, or its value in another round.
     pub(super) fn add(&mut self, figure: Measurement) {
         match self.0.iter_mut().find(|(it, _)| it.what == figure.what) {
             Some((_, values)) => values.push(figure.value),
@@ -64,7 +61,6 @@ impl Figures {
         Some((&values[..], figure.unit.as_str()))
     }
 
-    /// Returns the median of each figure.
     pub(super) fn medians(self) -> Vec<Measurement> {
         let median_of = |(figure, values): (Measurement, Vec<f64>)| Measurement {
             value: median(&values),
@@ -85,15 +81,11 @@ pub(super) fn with_precision(what: &str, precision: Precision) -> String {
 /// The JSON output of a bench.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Report {
-    /// The name of the bench that measured.
     pub(super) bench: String,
-    /// Whether the bench made only a few iterations.
     pub(super) quick: bool,
-    /// Threads for arithmetic.
     pub(super) threads: u32,
     /// The machine, as it was before the first measurement.
     pub(super) machine: MachineInfo,
-    /// The medians of the figures.
     pub(super) figures: Vec<Measurement>,
 }
 

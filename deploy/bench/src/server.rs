@@ -27,20 +27,16 @@ use crate::{
     settings, subprocess,
 };
 
-/// The number of a bench's learner.
 const LEARNER: u64 = 1;
 /// The time-out of a batch, of an insert and of the server's exit.
 const ANSWER_MAX: Duration = Duration::from_secs(30);
 
-/// The flag for certificates.
 pub(super) const TLS_DIR: &str = "--tls-dir";
-/// The flag for a replay on disk.
 pub(super) const REPLAY_DIR: &str = "--replay-dir";
 
 /// The settings of a server, and how clients reach it.
 #[derive(Clone, Debug)]
 pub(super) struct Wire {
-    /// The name in figures.
     pub(super) name: &'static str,
     pub(super) endpoint: String,
     pub(super) shared_memory: bool,
@@ -50,7 +46,6 @@ pub(super) struct Wire {
     pub(super) folder: Option<(&'static str, String)>,
 }
 
-/// A replay server and its clients.
 pub(super) struct Server {
     process: ManagedProcess,
     pub(super) wire: Wire,

@@ -27,13 +27,10 @@ use crate::{
 const FRAMES: (u64, u64) = (12_000, 5_000);
 /// The number of updates before the measurement: by then all threads run and all memory is allocated.
 const WARMUP_UPDATES: u64 = 10;
-/// The time between two requests for the statuses of a run.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// The time-out of each wait, including that for the end of a run.
 const WAIT_MAX: Duration = Duration::from_secs(300);
-/// Exit code of a run that was interrupted.
 const INTERRUPTED: i32 = 130;
-/// The numbers of actor processes to measure.
 const ACTORS: [u32; 6] = [1, 2, 4, 8, 16, 32];
 /// Replay ratios, and at each how far either side may run ahead, in transitions. At the first ratio the actors wait for the learner, at the
 /// second they limit the run.
@@ -214,7 +211,6 @@ impl Run {
         }))
     }
 
-    /// Waits for the first sample that satisfies `wanted`.
     fn wait_for(&mut self, wanted: impl Fn(&StatusSample) -> bool) -> anyhow::Result<StatusSample> {
         let started = Instant::now();
         loop {
@@ -255,7 +251,6 @@ impl Run {
         }
     }
 
-    /// Waits until the run ends with this exit code, and returns its summary.
     fn finish(mut self, code: i32) -> anyhow::Result<Summary> {
         self.poller.close();
         let deadline = Instant::now() + WAIT_MAX;

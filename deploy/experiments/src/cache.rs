@@ -39,7 +39,6 @@ const CORES: &str = "cores";
 /// The subfolder with the runs of a sweep. Git ignores it.
 pub(crate) const RUNS: &str = "runs";
 
-/// A finished piece as stored on the disk.
 #[derive(Serialize, Deserialize)]
 struct StoredPiece<T> {
     /// What the piece was made from, such as the hash of weights; empty if it depends on the settings alone.
@@ -148,7 +147,6 @@ impl Session {
         &mut self.progress
     }
 
-    /// Whether this session only reports what the folder already has.
     pub(crate) const fn report_only(&self) -> bool {
         self.report_only
     }
@@ -171,7 +169,6 @@ impl Session {
         Ok(())
     }
 
-    /// Returns an error if no run is finished.
     pub(crate) fn check_has_runs<T>(&self, made: &[T]) -> anyhow::Result<()> {
         if made.is_empty() {
             self.check_none_missing()?;
@@ -249,7 +246,6 @@ impl Session {
         Ok(output::write_file("--out", &path, &table.into_inner()?)?)
     }
 
-    /// Writes the figure as `stem.svg` and `stem.png`.
     pub(crate) fn save_figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
         for (extension, format) in [("svg", Format::Svg), ("png", Format::Png)] {
             let path = self.folder.join(format!("{stem}.{extension}"));

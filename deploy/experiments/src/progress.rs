@@ -39,7 +39,6 @@ impl Progress {
         self.task = task.to_owned();
     }
 
-    /// Counts work that an earlier start did.
     pub(crate) fn count_earlier(&mut self, units: u64) {
         self.count(units);
         self.earlier += units;

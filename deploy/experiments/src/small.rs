@@ -37,7 +37,6 @@ pub(crate) fn minimal_config() -> ModelConfig {
     config(2, 1, (-1.0, 1.0))
 }
 
-/// Returns the number of scalars in all parameters together.
 pub(crate) fn scalar_count(config: &ModelConfig) -> usize {
     let shapes = config.parameter_shapes().into_iter();
     let scalars = |(_, shape): (_, Vec<usize>)| shape.iter().product::<usize>();

@@ -152,7 +152,6 @@ impl Canvas {
         }
     }
 
-    /// Draws a filled polygon.
     pub(super) fn polygon(&mut self, points: &[Point], fill: Colour) {
         if points.len() > 2 {
             let (points, brush) = (point_list(points), brush(fill));
@@ -160,7 +159,6 @@ impl Canvas {
         }
     }
 
-    /// Draws a filled disc.
     pub(super) fn dot(&mut self, middle: Point, radius: f64, fill: Colour) {
         self.circle(middle, radius, &brush(fill));
     }
@@ -192,7 +190,6 @@ impl Canvas {
         }
     }
 
-    /// Draws the outline of a rectangle.
     pub(super) fn frame(&mut self, rect: Rect, colour: Colour, width: f64) {
         let (bounds, pen) = (bounds(rect), pen(colour, width));
         self.add(&format!(r#"<rect {bounds} fill="none" {pen}/>"#));

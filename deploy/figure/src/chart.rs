@@ -71,10 +71,7 @@ impl Axis {
 
     /// Maps a value to the scale of the axis: the value itself, or its decimal logarithm.
     fn transform(&self, value: f64) -> f64 {
-        match self.is_log {
-            true => value.log10(),
-            false => value,
-        }
+        if self.is_log { value.log10() } else { value }
     }
 
     /// Returns the axis's range for these values, widened by `slack`; `None` without values.
@@ -183,7 +180,6 @@ impl Series {
         self
     }
 
-    /// Draws the marks of the series at these positions.
     fn draw_marks(&self, canvas: &mut Canvas, points: &[Point]) {
         let (colour, has_length) = (self.colour, points.len() > 1);
         match self.mark {

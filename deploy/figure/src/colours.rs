@@ -34,7 +34,6 @@ pub(super) const CARD_BORDER: Colour = Colour::new(208, 213, 221);
 pub(super) const INK: Colour = Colour::new(26, 30, 36);
 /// Notes and tick labels.
 pub(super) const INK_SOFT: Colour = Colour::new(72, 80, 92);
-/// Grid lines of a chart.
 pub(super) const GRID: Colour = Colour::new(228, 231, 236);
 /// The grey of reference lines, with which a chart compares its series.
 pub const GREY: Colour = Colour::new(120, 126, 135);
@@ -45,7 +44,6 @@ pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
 /// A heat map cell without a value.
 const NO_VALUE: Colour = Colour::new(220, 222, 226);
 
-/// The number of series colours.
 pub(crate) const SERIES_COLOURS: usize = 7;
 /// Colours of series. Source: Okabe and Ito 2008, without the yellow, which is faint on white.
 const SERIES: [Colour; SERIES_COLOURS] = [

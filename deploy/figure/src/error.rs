@@ -33,7 +33,6 @@ pub enum FigureError {
 }
 
 impl FigureError {
-    /// Creates the error for a file that cannot be written.
     pub(super) fn write(path: &Path, source: std::io::Error) -> Self {
         let path = path.to_owned();
         Self::Write { path, source }

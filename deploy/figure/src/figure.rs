@@ -126,7 +126,6 @@ impl Figure {
         canvas
     }
 
-    /// Draws the card, the title and the notes.
     fn draw_header(&self, canvas: &mut Canvas, notes: &[String]) {
         let (width, height) = (canvas.width, canvas.height);
         let whole = Rect::new(0.5, 0.5, width - 1.0, height - 1.0);

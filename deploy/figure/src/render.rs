@@ -32,7 +32,6 @@ pub(super) fn parse_svg(svg: &str) -> Result<Tree, FigureError> {
     tree.map_err(|e| FigureError::Encode(e.to_string()))
 }
 
-/// Creates a buffer of transparent pixels to draw on.
 pub(super) fn new_pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
     let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
     let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));

@@ -225,7 +225,6 @@ const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
 pub struct Screen {
     bar: Option<ProgressBar>,
     full_disk: Arc<Mutex<FullDiskLimiter>>,
-    /// When the next plain line of progress is due.
     next_plain_line: Option<Instant>,
 }
 
@@ -287,7 +286,6 @@ impl Screen {
         }
     }
 
-    /// Writes several lines, each with [`Self::print_line`].
     pub(crate) fn print_lines(&self, lines: impl IntoIterator<Item = String>) {
         lines.into_iter().for_each(|it| self.print_line(&it));
     }

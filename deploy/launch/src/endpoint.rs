@@ -23,7 +23,6 @@ pub(crate) const ADDRESS_ENDS: [char; 2] = ['#', '?'];
 
 /// How long the replay server may take until it listens.
 const LISTEN_MAX: Duration = Duration::from_secs(60);
-/// How often to check whether the replay server listens.
 const LISTEN_POLL: Duration = Duration::from_millis(20);
 
 /// Rejects endpoints to connect to that zenoh cannot open, or that do not fit `--tls-dir`.

@@ -83,7 +83,6 @@ pub fn evaluate_and_keep(
 const LAST_EVALUATION_MAX: Duration = Duration::from_secs(3600);
 const POLL: Duration = Duration::from_millis(100);
 
-/// Decides which checkpoints of a run are evaluated.
 pub(crate) struct EvaluationSchedule {
     config: Option<EvaluationConfig>,
     /// Updates of the newest checkpoint that was evaluated or is being evaluated.

@@ -18,7 +18,6 @@ const BATCH: usize = 20;
 const BATCHES_MAX: u32 = 5;
 /// Time limit for all batches; the first batch may take longer.
 const PLAY_MAX: Duration = Duration::from_secs(30);
-/// Time limit for the first batch.
 const FIRST_BATCH_MAX: Duration = Duration::from_secs(120);
 
 /// Plays the weights of a finished run and adds their returns to its summary, if the settings ask for it. Stops once `is_stopped`.

@@ -173,7 +173,6 @@ impl Column {
         }
     }
 
-    /// The column of `metrics.csv` for a member.
     fn csv_name(&self, member: &str) -> String {
         match self.value {
             Value::Members { prefix, .. } => prefix.to_owned() + &member.replace('-', "_"),
@@ -187,7 +186,6 @@ pub(crate) fn cell(value: Option<impl ToString>) -> String {
     value.map_or(String::new(), |it| it.to_string())
 }
 
-/// The name and the cell of each column of `metrics.csv`, in order.
 pub(crate) fn csv_cells(view: &RunView) -> Vec<(String, String)> {
     let cells = COLUMNS.iter().flat_map(|column| match column.value {
         Value::Words(words) => vec![(column.name.to_owned(), words(view))],

@@ -115,7 +115,6 @@ pub(crate) struct ServerAnswer {
     pub(crate) is_another_run: bool,
 }
 
-/// Frames and updates per second.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Speed {
     pub(crate) frames: f64,
@@ -239,7 +238,6 @@ impl RunView {
         servers.filter_map(|it| Some((it, it.recovering?)))
     }
 
-    /// Whether all replay servers answered the last request.
     pub(crate) fn servers_answered(&self) -> bool {
         self.servers.iter().all(|it| it.replay.is_some())
     }

@@ -42,7 +42,6 @@ pub fn program_path() -> PathBuf {
     file.unwrap_or_else(|| "/proc/self/exe".into())
 }
 
-/// The variables that this process lacks, with their values.
 fn missing_variables(
     is_replay_server: bool,
     is_set: impl Fn(&str) -> bool,

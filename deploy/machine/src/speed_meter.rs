@@ -11,9 +11,7 @@ pub type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
 pub struct SpeedMeter {
     /// Warm-up calls, which are not timed.
     warmup_calls: u32,
-    /// Minimum number of timed calls.
     calls_min: usize,
-    /// Minimum total time of the timed calls.
     time_min: Duration,
 }
 

@@ -245,7 +245,6 @@ pub(crate) fn insert(table: &mut Table, path: &str, value: Value) {
     }
 }
 
-/// Writes a value if there is none at the path.
 pub(crate) fn insert_missing(table: &mut Table, path: &str, value: Value) {
     if find(table, path).is_none() {
         insert(table, path, value);
@@ -277,7 +276,6 @@ fn read_table<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage
     })
 }
 
-/// Reads the value at a dotted path, if there is one.
 fn read_optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
     let read = find(table, path).cloned().map(Value::try_into).transpose();
     read.map_err(|e| usage!("in the settings' [{path}] table: {}", describe(&e)))

@@ -13,7 +13,6 @@ use crate::config::RunConfig;
 
 /// Memory for the replay, all shards together.
 struct ReplayMemory {
-    /// The free memory of this machine, as text.
     free: String,
     /// Bytes for a replay whose size the machine decides.
     bytes: u64,

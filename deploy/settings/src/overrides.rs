@@ -52,7 +52,6 @@ impl Override {
         Ok(inner.insert(key.to_owned(), value).is_none())
     }
 
-    /// Converts the value to the type of `old`, which it replaces.
     fn convert_to_type_of(&self, old: &Value) -> Result<Value, Usage> {
         match (old, &self.value) {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),

@@ -140,7 +140,6 @@ pub fn register(agents: Vec<Agent>) {
     first.expect("a program registers its agents once");
 }
 
-/// Returns every agent, including those that the program added.
 pub(crate) fn agents() -> Vec<&'static Agent> {
     let custom = CUSTOM.get().into_iter().flatten();
     AGENTS.iter().chain(custom).collect()

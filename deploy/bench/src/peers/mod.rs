@@ -44,7 +44,6 @@ struct Sides {
     absent: Option<String>,
 }
 
-/// One line of the comparison.
 #[derive(Clone, Debug, Serialize)]
 struct Row {
     #[serde(rename = "part")]
@@ -53,21 +52,17 @@ struct Row {
     unit: String,
     /// Median over the rounds.
     ours: f64,
-    /// The peer, with its version.
     peer: String,
     /// Median over the rounds; none if skipped.
     theirs: Option<f64>,
     /// The median over the rounds of ours / theirs, taken in each round because the machine's speed drifts from round to round.
     ratio: Option<f64>,
-    /// The ratio in each round.
     ratios: Vec<f64>,
     /// The goal: the lowest ratio that is wanted, if any.
     goal: Option<f64>,
-    /// The reason why the peer has no figure.
     skipped: Option<String>,
 }
 
-/// The comparison as JSON.
 #[derive(Clone, Debug, Serialize)]
 struct Comparison {
     rounds: u32,
@@ -84,10 +79,9 @@ pub(super) fn run(
     flags: &BenchFlags,
     machine: MachineInfo,
 ) -> anyhow::Result<()> {
-    let rounds = args.rounds.unwrap_or(match flags.quick {
-        true => ROUNDS.1,
-        false => ROUNDS.0,
-    });
+    let rounds = args
+        .rounds
+        .unwrap_or(if flags.quick { ROUNDS.1 } else { ROUNDS.0 });
     let components: BTreeSet<_> = match args.only.as_slice() {
         [] => Component::value_variants().iter().copied().collect(),
         only => only.iter().copied().collect(),
@@ -150,7 +144,6 @@ impl Sides {
         }
     }
 
-    /// Continues the measurements without the peer.
     fn skip(&mut self, why: String) {
         console::eprintln(&format!("skipped: {why}"));
         self.absent = Some(why);
@@ -192,7 +185,6 @@ fn compare(pair: &Pair, sides: &Sides) -> Option<Row> {
     })
 }
 
-/// Returns the table, and below it the reasons why rows were skipped.
 fn format_table(comparison: &Comparison) -> String {
     let heads = ["what", "ours", "theirs", "", "", "ratio", "goal", ""];
     let mut cells = vec![heads.map(String::from).to_vec()];

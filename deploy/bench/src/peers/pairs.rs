@@ -10,14 +10,10 @@ use crate::{
     replay::insert_name,
 };
 
-/// A figure of ours and the figure that it is compared with.
 #[derive(Clone, Debug)]
 pub(super) struct Pair {
-    /// The component whose bench has our figure.
     pub(super) component: Component,
-    /// The name of our figure.
     pub(super) ours: String,
-    /// The name of the figure that it is compared with.
     pub(super) theirs: String,
     /// `None` if `theirs` is a figure of the peer. Else it is another figure of ours, and this describes it.
     pub(super) own_figure: Option<&'static str>,
@@ -25,7 +21,6 @@ pub(super) struct Pair {
     pub(super) goal: Option<f64>,
 }
 
-/// All comparisons, in the order of the table.
 pub(super) fn pairs() -> Vec<Pair> {
     let mut pairs = Vec::new();
     let mut add = |component, ours: &str, theirs: &str, goal| {

@@ -39,7 +39,6 @@ pub(super) const SCRIPTS: [(&str, &str); 6] = [
 pub(super) struct Script {
     /// The peer's name in tables and messages.
     pub(super) peer: &'static str,
-    /// The Python module that the script needs.
     module: &'static str,
     /// The peer's short name, in the name of its requirements file and of the flag for its interpreter.
     short_name: &'static str,
@@ -52,9 +51,7 @@ pub(super) struct Script {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Answer {
-    /// The peer's name and version.
     peer: String,
-    /// The figures by their names, which match ours.
     figures: BTreeMap<String, f64>,
 }
 
@@ -140,7 +137,6 @@ pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<V
     Ok(report.figures)
 }
 
-/// Runs a process and returns its standard output.
 fn run_for_stdout(mut command: Command, what: &str) -> anyhow::Result<String> {
     command.stdin(Stdio::null()).stderr(Stdio::inherit());
     let output = command.output();

@@ -18,7 +18,6 @@ const GRID_INTERVALS: usize = 240;
 const POINTS_MAX: usize = 600;
 /// Curves without a common x are still averaged if the gap is at most this share of x: evaluations of seeds are some frames apart.
 const GAP_SHARE_MAX: f64 = 0.05;
-/// The smallest k, in environment steps.
 const K_MIN: f64 = 1.0;
 
 /// The runs that are drawn as one line.
@@ -55,7 +54,6 @@ impl Curve {
         curve
     }
 
-    /// Returns the curve as a series in the colour of this index.
     pub(crate) fn series(self, name: &str, index: usize) -> Series {
         Series::line(name, index, self.points).with_band(self.band)
     }
@@ -80,7 +78,6 @@ pub(super) fn group_runs(runs: &[Run], merge_seeds: bool) -> Vec<Group<'_>> {
 }
 
 impl Group<'_> {
-    /// Returns the group's mean of a column, and its band.
     pub(super) fn curve(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
         let mean = self.combine_seeds(column, args)?;
         let has_spread = self.runs.iter().all(|run| run.has_values(SD_OF_K));

@@ -35,7 +35,6 @@ use self::{
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column of training returns; the chart can show a random policy as a line.
 const RETURN: &str = "mean_return";
-/// The column of the returns of evaluated checkpoints.
 const EVALUATED: &str = "evaluated_return";
 /// Short names of columns, which `--column` accepts.
 const SHORT_NAMES: [(&str, &str); 4] = [
@@ -177,7 +176,6 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
     })
 }
 
-/// Returns the title of a column's chart, and the axis label with its unit.
 fn title_and_label(column: &str) -> (String, String) {
     if column == EVALUATED {
         return (
@@ -194,7 +192,6 @@ fn title_and_label(column: &str) -> (String, String) {
     }
 }
 
-/// Returns the notes that say what was done to the numbers.
 fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<String> {
     let mut notes = Vec::new();
     if groups.iter().any(|group| group.runs.len() > 1) {

@@ -22,11 +22,9 @@ const TEXTS: [&str; 1] = ["waiting"];
 /// Settings as text, by their full dotted names.
 pub(crate) type Settings = BTreeMap<String, String>;
 
-/// The metrics of one run, and its settings.
 #[derive(Debug)]
 pub(crate) struct Run {
     pub(super) folder: RunFolder,
-    /// The name of the folder.
     pub(super) name: String,
     /// World and agent, if the settings can be read.
     pub(super) world_agent: Option<String>,
@@ -131,7 +129,6 @@ impl Run {
         }
     }
 
-    /// Whether the column exists and has a value.
     pub(crate) fn has_values(&self, column: &str) -> bool {
         let (table, _) = self.table_of(column);
         let place = table.column_index(column);
@@ -169,7 +166,6 @@ fn read_settings(path: &Path) -> Option<(Settings, Option<i64>)> {
     Some((all, seed))
 }
 
-/// Returns every setting of a table.
 pub(super) fn flatten(table: &toml::Table) -> Settings {
     let text = |it: &toml::Value| it.as_str().map_or_else(|| it.to_string(), str::to_owned);
     let all = leaves(table).into_iter();

@@ -36,7 +36,6 @@ impl Spread {
     }
 }
 
-/// Returns the mean; `None` without values.
 pub(crate) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| mean_and_deviation(values).0)
 }

@@ -22,10 +22,8 @@ use crate::{
 const NAME: &str = "sweep";
 /// The most letters that describe a cell in the name of a run's folder.
 const NAME_LETTERS_MAX: usize = 80;
-/// The columns of the table after the axes.
 const MEASURED: &str =
     "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
-/// The legend below the table on a terminal.
 const LEGEND: &str = "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds, ci_low and ci_high the mean's 95% \
                       interval (Student's t)\n";
 

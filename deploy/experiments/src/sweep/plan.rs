@@ -99,7 +99,6 @@ pub(crate) struct FinishedRun {
 /// A planned run, with its point on the axes of the sweep.
 pub(crate) type PointPlan<P> = (P, PlannedRun);
 
-/// A finished run at its point in the sweep.
 pub(crate) struct PointRun<P> {
     pub(crate) point: P,
     pub(crate) plan: PlannedRun,

@@ -32,7 +32,6 @@ use crate::{cache::Session, progress::Progress};
 
 /// How often a run is tried in one call. On a machine that is busy with other work, a run may lose contact with its processes.
 const TRIES_MAX: u32 = 2;
-/// The interval between two checks of the running children.
 const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save after they were asked to stop. Then they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
@@ -92,7 +91,6 @@ fn program_commit() -> anyhow::Result<String> {
 struct Queue {
     runs: Runs,
     jobs: u32,
-    /// The bytes of memory for each of the concurrent runs.
     memory_share: u64,
     waiting: VecDeque<Job>,
     running: Vec<RunningJob>,
@@ -101,7 +99,6 @@ struct Queue {
 /// A run to be made, with the history of its tries in this call.
 struct Job {
     plan: PlannedRun,
-    /// How often the run was started.
     tries: u32,
     /// The updates of the checkpoint that the last try resumed from. That checkpoint may cause the failure, so it is not used again.
     resumed_at: Option<u64>,
@@ -127,7 +124,6 @@ struct RunningJob {
 }
 
 impl Queue {
-    /// Starts and watches runs until none is waiting or running.
     fn run_jobs(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
             while self.running.len() < self.jobs as usize

@@ -20,7 +20,6 @@ pub(crate) struct Runs {
 }
 
 impl Runs {
-    /// Opens or creates the subfolder for runs in the sweep's `folder`.
     pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let root = folder.join(RUNS);
         fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
@@ -81,7 +80,6 @@ impl Runs {
         write_atomically(&self.path_beside(plan, "commit"), commits.as_bytes())
     }
 
-    /// Returns the end of the output of the run's process.
     pub(super) fn log_tail(&self, plan: &PlannedRun) -> String {
         let text = fs::read(self.log_path(plan)).unwrap_or_default();
         let start = text.len().saturating_sub(LOG_TAIL_BYTES);
@@ -92,7 +90,6 @@ impl Runs {
         RunFolder::new(self.root.join(&plan.name))
     }
 
-    /// Returns the path of the output of the run's process.
     pub(super) fn log_path(&self, plan: &PlannedRun) -> PathBuf {
         self.path_beside(plan, "log")
     }

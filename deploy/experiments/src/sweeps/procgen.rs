@@ -111,12 +111,10 @@ fn is_clearly_above(greedy: &[f64], random: &[f64]) -> bool {
     greedy.mean - random.mean > STANDARD_ERRORS * (error(greedy) + error(random)).sqrt()
 }
 
-/// Returns the games that have a run, sorted by name.
 fn games(all: &[Row]) -> BTreeSet<&str> {
     all.iter().map(|it| it.point.game.as_str()).collect()
 }
 
-/// Returns the runs of an agent in a game.
 fn runs_of<'a>(all: &'a [Row], game: &str, agent: &str) -> impl Iterator<Item = &'a Row> {
     let all = all.iter();
     all.filter(move |it| it.point.game == game && it.point.agent == agent)
@@ -144,7 +142,6 @@ fn write_data(session: &Session, scored: &[Row]) -> anyhow::Result<()> {
     session.write_csv("table", columns, rows)
 }
 
-/// Draws the training return over frames, with a chart for each game.
 fn figure(settings: &Settings, scored: &[Row]) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
     for game in games(scored) {
@@ -190,7 +187,6 @@ fn has_enough_seeds(settings: &Settings, scored: &[Row]) -> bool {
     })
 }
 
-/// Returns the values for the page template.
 fn page_values(settings: &Settings, scored: &[Row]) -> Value {
     let (agents, games) = (&settings.agents, games(scored));
     let scores = |agent: &String, score: fn(&Row) -> Option<f64>| -> Scores {

@@ -53,7 +53,6 @@ struct Tradeoff<'a> {
     args: &'a TradeoffArgs,
     settings: Settings,
     session: Session,
-    /// The benchmarks of points, by their keys.
     speeds: BTreeMap<String, Numbers>,
 }
 

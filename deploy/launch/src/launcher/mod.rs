@@ -179,7 +179,6 @@ impl Launch<'_> {
         self.watch()
     }
 
-    /// Polls, shows and records the run once a second until it is over.
     fn watch(&mut self) -> anyhow::Result<Outcome> {
         let (mut standstill, mut counts_before) = (Silence::default(), (0, 0));
         loop {

@@ -41,7 +41,6 @@ pub(super) struct TrainingEpisodes {
     table: AppendLog,
     /// The newest returns, oldest first.
     newest_returns: VecDeque<f64>,
-    /// The number of the newest episode.
     pub(super) newest: u64,
     frames: u64,
     frames_at_status: Option<u64>,

@@ -217,7 +217,6 @@ impl Summary {
         played.map(LastPlay::describe).unwrap_or_default()
     }
 
-    /// How the run ended and what it counted, in one line.
     pub(crate) fn describe_counts(&self) -> String {
         let (of, episodes) = (self.mean_return_of, count(self.episodes, "episode"));
         let returns = match self.mean_return {
@@ -249,7 +248,6 @@ pub(crate) fn plot_command(run_dir: &RunFolder) -> (String, &'static str) {
     (command, "return, losses, k and speed")
 }
 
-/// Formats commands, and what each does, in columns.
 pub(crate) fn format_commands(commands: &[(String, &str)]) -> String {
     let row =
         |(command, what): &(String, &str)| vec![format!("  driml {command}"), format!(" {what}")];

@@ -27,7 +27,6 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     atomic_write::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
 
-/// Reads a JSON file.
 pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
     let doing = || format!("reading {}", path.display());
     let text = fs::read(path).with_context(doing)?;
@@ -134,7 +133,6 @@ impl Table {
     }
 }
 
-/// A file to which rows or lines are appended.
 #[derive(Debug)]
 pub(crate) struct AppendLog {
     name: String,
@@ -204,7 +202,6 @@ impl AppendLog {
     }
 }
 
-/// Opens a file to append, and makes it if it does not exist.
 pub(super) fn open_to_append(path: &Path) -> anyhow::Result<File> {
     let file = File::options().create(true).append(true).open(path);
     file.with_context(|| format!("writing {}", path.display()))

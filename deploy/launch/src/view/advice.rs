@@ -16,7 +16,6 @@ const UNRESPONSIVE_S: f64 = 30.0;
 const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
 
-/// Each replay server that answered, with its status.
 fn server_statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
     answered.filter_map(|server| Some((server, server.processes.as_ref()?)))

@@ -93,7 +93,6 @@ impl WatchedRun {
         Ok(false)
     }
 
-    /// Counts the updates that the learner did after its last answer.
     fn count_served_updates(&mut self, poller: &mut Poller) {
         let updates = updates_served(&poller.config, poller.view.replay.rows_sampled);
         if poller.view.learner.updates >= updates {

@@ -63,7 +63,6 @@ impl Report {
         self.cpu.iter().chain(&self.cuda).chain(&self.certificates)
     }
 
-    /// Whether a GPU is usable, so that `--device cuda` works.
     fn is_ready_for_cuda(&self) -> bool {
         self.cuda.iter().any(|fact| fact.state == State::Ok)
     }
@@ -85,7 +84,6 @@ impl Report {
     }
 }
 
-/// The names of the facts whose state is bad, joined by commas.
 fn names_where(facts: &[Fact], is_bad: impl Fn(State) -> bool) -> String {
     let bad = facts.iter().filter(|fact| is_bad(fact.state));
     let names: Vec<_> = bad.map(|fact| fact.what.as_str()).collect();

@@ -58,7 +58,6 @@ pub(crate) struct Recording {
     error: Option<anyhow::Error>,
 }
 
-/// One step of all environments.
 struct FilmedStep {
     shots: Vec<Shot>,
     seen: Option<NetworkOutputs>,

@@ -17,7 +17,6 @@ const PANEL_HEIGHT: f64 = 230.0;
 /// The distance between lines of text, in pixels.
 const LEADING: f64 = 19.0;
 
-/// An environment's newest step.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Shot {
     /// The newest frame [H, W, C] in which the action was taken.

@@ -90,7 +90,6 @@ fn window_means(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
     })
 }
 
-/// Draws lattices and scores of the first measured episodes.
 fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
     let settings = &task.settings;
     let early_t = settings.from_t + 1;

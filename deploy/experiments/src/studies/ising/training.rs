@@ -228,7 +228,6 @@ fn log_softmax(scores: &[f64], rows: usize) -> Vec<f64> {
 /// How the receptive field of a location overlaps the patch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Cover {
-    /// Whether the centre of the field is in the patch.
     centre: bool,
     /// `Some(true)` if the whole field is in the patch, `Some(false)` if no part is, else `None`.
     whole: Option<bool>,

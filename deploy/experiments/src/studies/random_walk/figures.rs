@@ -11,7 +11,6 @@ use super::{
 };
 use crate::plot::{Band, Curve};
 
-/// Draws the four panels of the paper's figure.
 pub(super) fn fig1(results: &Results) -> Figure {
     let settings = &results.settings;
     let k = settings.states;
@@ -95,7 +94,6 @@ fn inverse_gap_panel(results: &Results) -> Panel {
     Panel::Chart(Chart::new(title, alpha_axis(), y, series))
 }
 
-/// Draws the speed of learning against the spectral gap.
 pub(super) fn convergence_figure(results: &Results) -> Figure {
     let settings = &results.settings;
     let times = |title: String, measure: UpdatesTo| {

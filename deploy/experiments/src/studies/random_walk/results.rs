@@ -47,7 +47,6 @@ pub(super) struct Results {
 }
 
 impl Results {
-    /// Returns the trainings of one sampling and one bias, over all seeds.
     pub(super) fn select(&self, sampling: Sampling, alpha: f64) -> impl Iterator<Item = &Trained> {
         let all = self.trained.iter();
         all.filter(move |one| one.sampling == sampling && one.chain.alpha == alpha)

@@ -47,7 +47,6 @@ pub(super) struct Settings {
     pub(super) adam: AdamSettings,
 }
 
-/// How the training pairs are sampled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sampling {
     /// Independent pairs, with the first state from the stationary distribution, so that nothing has to mix.
@@ -61,7 +60,6 @@ pub(super) enum Sampling {
 impl Sampling {
     pub(super) const ALL: [Self; 3] = [Self::Stationary, Self::FromOneEnd, Self::OneWalker];
 
-    /// Returns the name in figures and files.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Stationary => "stationary",
@@ -74,7 +72,6 @@ impl Sampling {
 /// The results of a training, measured without sampling noise from the scores of all K * K pairs.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct Measurements {
-    /// The updates after which the training was measured.
     pub(super) updates: Vec<u64>,
     /// The InfoNCE loss with infinitely many negatives, above its minimum, in nats: E_rho KL(T_i || learnt T_i).
     pub(super) excess: Vec<f64>,
@@ -183,7 +180,6 @@ fn one_hot_features(
     })
 }
 
-/// Draws a batch of pairs.
 type PairSource<'a> = Box<dyn FnMut(&mut ChaCha8Rng) -> Vec<(usize, usize)> + 'a>;
 
 fn pair_source<'a>(

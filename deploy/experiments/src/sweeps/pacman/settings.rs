@@ -135,7 +135,6 @@ impl Settings {
     }
 }
 
-/// Returns the settings of the full or smoke length, overridden by the flags.
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
     let mut settings: Settings = flags::read_settings(NAME, text, args.flags.smoke);

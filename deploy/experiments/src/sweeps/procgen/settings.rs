@@ -98,7 +98,6 @@ impl Settings {
         plans
     }
 
-    /// Returns how a run is played on these levels.
     pub(super) fn play_settings(&self, levels: Levels) -> PlaySettings {
         PlaySettings {
             levels,

@@ -19,7 +19,6 @@ const EPSILON: f64 = 0.1;
 /// The seed of the world and the actions, so that all levels of a dial that does not change the world have the same rows.
 const SEED: u64 = 1_000_003;
 
-/// One step of all environments.
 struct EnvStep {
     /// The states [N, H, W, C] at the size of the network's input; empty if no row needs them.
     states: Vec<u8>,
@@ -77,7 +76,6 @@ pub(super) fn sample(
     Ok(batch)
 }
 
-/// Whether the return ends at this step.
 fn is_end(end: StepEnd) -> bool {
     matches!(end, StepEnd::TimedOut | StepEnd::Terminal)
 }

@@ -21,15 +21,12 @@ const ROWS_MAX: usize = 64;
 /// The number of states for each of these rows whose values and greedy actions are compared.
 const STATES_PER_ROW: usize = 16;
 
-/// The work of a configuration that is timed.
 struct TimedWork {
-    /// An update with `rows` rows.
     update: Work<'static>,
     rows: usize,
     /// Choosing an action for one frame of each of `envs` environments, as an actor does.
     act: Work<'static>,
     envs: usize,
-    /// The bytes of one broadcast of the weights.
     weights_bytes: usize,
 }
 

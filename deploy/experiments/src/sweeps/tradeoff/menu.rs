@@ -16,7 +16,6 @@ use crate::{
 /// A base has this many times the seeds of a level. All levels are compared with it, so chance in the base affects all differences.
 const BASE_SEEDS: u32 = 2;
 
-/// The contents of `tradeoff.toml`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Menu {
@@ -33,9 +32,7 @@ struct Menu {
 #[serde(deny_unknown_fields)]
 struct Length {
     preset: String,
-    /// The number of seeds of each level.
     seeds: u32,
-    /// The number of greedy episodes played with the weights of each run.
     episodes: u32,
     /// The frames of a run; `None` takes those of the world.
     frames: Option<u64>,
@@ -165,19 +162,15 @@ pub(super) struct Common {
     pub(super) env: String,
     pub(super) preset: String,
     pub(super) sets: Vec<String>,
-    /// The number of frames of each run.
     pub(super) frames: u64,
-    /// The number of greedy episodes played with the weights of each run.
     pub(super) episodes: u32,
     /// The number of concurrent runs. It decides the threads of each run, and so what wall-clock time means.
     pub(super) jobs: u32,
 }
 
-/// The settings of a call, with defaults filled in.
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
     pub(super) common: Common,
-    /// All levels that the world has.
     pub(super) levels: Vec<DialLevel>,
     pub(super) seeds: u32,
     /// Whether the number of frames may still be reduced to fit the budget.

@@ -16,7 +16,6 @@ pub(super) struct Budget {
     pub(super) seconds_max: f64,
     /// The seconds of everything taken. Each point counts once.
     pub(super) seconds: f64,
-    /// The keys of the points taken.
     taken: BTreeSet<String>,
 }
 

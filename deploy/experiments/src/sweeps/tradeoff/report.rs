@@ -24,7 +24,6 @@ const MEASURED: &str = "update_seconds,rows_gain,act_seconds,act_gain,weights_by
 const EQUAL_TIME: &str = "agent,base,equal_seconds,\
     minus_base_at_equal_frames,minus_base_at_equal_frames_low,minus_base_at_equal_frames_high,\
     minus_base_at_equal_time,minus_base_at_equal_time_low,minus_base_at_equal_time_high";
-/// The dial that turns DIM on.
 const DIM: &str = "DIM";
 
 pub(super) fn write_report(session: Session, results: &Results) -> anyhow::Result<()> {
@@ -137,7 +136,6 @@ impl EqualTime {
     }
 }
 
-/// Returns the last value of a curve up to this time.
 fn value_at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
     let before = curve.iter().take_while(|(x, _)| *x <= seconds).last();
     before.map(|(_, value)| *value)

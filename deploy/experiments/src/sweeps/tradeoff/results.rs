@@ -18,13 +18,11 @@ pub(super) struct PointResult {
     pub(super) seeds: Vec<SeedResult>,
 }
 
-/// A finished run.
 pub(super) struct SeedResult {
     pub(super) seed: u32,
     pub(super) run: FinishedRun,
     /// Training return over seconds.
     pub(super) curve: Vec<(f64, f64)>,
-    /// The returns of the agent, played greedily.
     pub(super) greedy: Vec<f64>,
 }
 
@@ -32,12 +30,10 @@ pub(super) struct Results {
     pub(super) common: Common,
     /// The levels that have finished runs, and whose bases have.
     pub(super) levels: Vec<DialLevel>,
-    /// The results by the key of the point.
     pub(super) points: BTreeMap<String, PointResult>,
     pub(super) random: Vec<f64>,
     /// The requested levels without a run.
     pub(super) left_out: Vec<String>,
-    /// The command lines that made the runs.
     pub(super) commands: Vec<String>,
 }
 
@@ -52,7 +48,6 @@ const fn measure(name: &'static str, get: fn(&SeedResult) -> Option<f64>) -> Mea
     Measure { name, get }
 }
 
-/// The mean return of the greedily played episodes.
 pub(super) const GREEDY: Measure = measure("greedy_return", |it| mean(&it.greedy));
 /// The mean return of the last 100 training episodes.
 pub(super) const TRAINING: Measure = measure("training_return", |it| it.run.summary.mean_return);
@@ -61,7 +56,6 @@ pub(super) const FRAMES_PER_SECOND: Measure = measure("frames_per_second", |it| 
     let summary = &it.run.summary;
     (summary.resumed_after_updates == 0).then_some(summary.frames_per_second)
 });
-/// All measures, in the order of the data.
 pub(super) const MEASURES: [Measure; 7] = [
     GREEDY,
     TRAINING,
@@ -98,7 +92,6 @@ pub(super) struct Row<'a> {
     pub(super) point: &'a Point,
     pub(super) is_base: bool,
     pub(super) result: &'a PointResult,
-    /// The results that this row is compared with.
     pub(super) base: &'a PointResult,
 }
 
