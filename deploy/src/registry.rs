@@ -39,7 +39,6 @@ impl Registry {
         self
     }
 
-    /// Registers all additions with the crates that look for them.
     pub(crate) fn register(self) {
         driml_envs::register(self.worlds);
         auxiliary::register(self.losses);

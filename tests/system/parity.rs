@@ -25,7 +25,7 @@ fn a_case_with_another_expectation_fails() {
         fs::write(system.path(tensor), bytes).unwrap();
         call += &format!(" {tensor}");
     }
-    let ended = system.fails(&call, "error: 5 of 6 files out of tolerance");
+    let ended = system.fails(&call, "error: files out of tolerance: 5 of 6");
     let stdout = &ended.stdout;
     let failed: Vec<_> = stdout.lines().filter(|it| it.ends_with("FAILED")).collect();
     assert_eq!(failed.len(), CHANGED.len(), "{stdout}");

@@ -149,7 +149,6 @@ pub enum Component {
 }
 
 impl Component {
-    /// Returns the component's name on the command line.
     pub(crate) fn name(self) -> String {
         let value = self.to_possible_value().expect("no component is hidden");
         value.get_name().to_owned()

@@ -11,7 +11,6 @@ use crate::{
     settings,
 };
 
-/// The batch sizes: frames per call of the policy.
 const BATCHES: [usize; 2] = [32, 256];
 /// The name of each network in figures, its preset, and further settings.
 const NETWORKS: [(&str, &str, &[&str]); 3] = [

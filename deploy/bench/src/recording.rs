@@ -122,7 +122,6 @@ impl Recording {
 pub(super) struct Chunks<'a> {
     recorder: ChunkRecorder,
     steps: Cycle<slice::Iter<'a, Step>>,
-    /// The bytes of the frames that a chunk takes from a step.
     step_bytes: usize,
 }
 

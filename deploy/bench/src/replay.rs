@@ -78,7 +78,6 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     Ok(())
 }
 
-/// Returns the name of the figure of chunks of `transitions` transitions over a wire.
 pub(super) fn insert_name(transitions: u32, wire: &str) -> String {
     format!("insert, {transitions} transitions a chunk, {wire}")
 }

@@ -4,10 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_launch::{
-    console::{self, align_columns, print},
-    output,
-};
+use driml_launch::console::{self, align_columns, print};
 use driml_learner::Precision;
 use driml_machine::{
     resources::MachineInfo,
@@ -18,7 +15,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::flags::BenchFlags;
 
-/// The flags of a bench, and its figures so far.
 pub(super) struct Bench<'a> {
     pub(super) flags: &'a BenchFlags,
     pub(super) meter: SpeedMeter,
@@ -110,7 +106,8 @@ pub(super) fn publish(
         Some(path) if path == Path::new("-") => print(&text),
         Some(path) => {
             print(table)?;
-            Ok(output::write_file("--json", path, text.as_bytes())?)
+            let written = driml_launch::output::write_file("--json", path, text.as_bytes());
+            Ok(written?)
         }
         None => print(table),
     }

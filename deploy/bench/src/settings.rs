@@ -4,7 +4,6 @@
 use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{config::RunConfig, flags};
 
-/// The world of figures that do not depend on the world.
 pub(super) const WORLD: &str = "procgen:bigfish";
 
 /// Settings that keep the limiter from affecting the figures, and a replay that is soon full. `bench peers` gives Reverb a table of the

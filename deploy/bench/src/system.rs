@@ -157,13 +157,11 @@ fn measure_columns(
     Ok(columns)
 }
 
-/// Returns the growth of `count` per second from the first sample to the last.
 fn per_second([first, last]: &[StatusSample; 2], count: fn(&StatusSample) -> u64) -> f64 {
     let seconds = (last.at - first.at).as_secs_f64();
     (count(last) - count(first)) as f64 / seconds
 }
 
-/// The statuses of the processes, and when they were read.
 #[derive(Clone)]
 struct StatusSample {
     at: Instant,

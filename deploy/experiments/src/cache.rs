@@ -115,7 +115,6 @@ impl Session {
         self.read(key).map(|piece| piece.result)
     }
 
-    /// Keeps a piece that took no time.
     pub(crate) fn store<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
         let piece = StoredPiece {
             of: String::new(),

@@ -207,7 +207,6 @@ pub(crate) mod tests {
         args: T,
     }
 
-    /// Parses the arguments of a command from these words.
     pub(crate) fn parse<T: Args>(words: &str) -> T {
         let words = ["driml"].into_iter().chain(words.split_whitespace());
         CommandLine::parse_from(words).args

@@ -117,7 +117,6 @@ fn numbers_of(list: &Value) -> Result<Vec<f64>, Error> {
     known.map(f64::try_from).collect()
 }
 
-/// Applies `f` to the numbers of a list; a dash if the result is `None`.
 fn reduce<T: Into<Value>>(list: &Value, f: impl Fn(&[f64]) -> Option<T>) -> Result<Value, Error> {
     Ok(f(&numbers_of(list)?).map_or_else(|| "-".into(), Into::into))
 }

@@ -45,7 +45,6 @@ impl Rect {
     }
 }
 
-/// Which end of a text lies at its point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Anchor {
     Start,
@@ -93,7 +92,6 @@ impl TextStyle {
     }
 }
 
-/// How letters are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Letters {
     /// As text, in a font that the viewer has.
@@ -163,7 +161,6 @@ impl Canvas {
         self.circle(middle, radius, &brush(fill));
     }
 
-    /// Draws a circle that is not filled.
     pub(super) fn ring(&mut self, middle: Point, radius: f64, colour: Colour) {
         let pen = pen(colour, 1.4);
         self.circle(middle, radius, &format!(r#"fill="none" {pen}"#));
@@ -195,7 +192,6 @@ impl Canvas {
         self.add(&format!(r#"<rect {bounds} fill="none" {pen}/>"#));
     }
 
-    /// Draws a filled rectangle with round corners and a border.
     pub(super) fn card(&mut self, rect: Rect, fill: Colour, border: Colour) {
         let pen = pen(border, 1.0);
         let (bounds, brush) = (bounds(rect), brush(fill));

@@ -283,7 +283,6 @@ impl Chart {
     }
 }
 
-/// The rectangle of the plot, and the ranges of its axes.
 struct Plot<'a> {
     rect: Rect,
     x: Scale<'a>,

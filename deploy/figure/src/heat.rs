@@ -12,7 +12,6 @@ const LABEL_SIZE: f64 = 12.5;
 const BAR_WIDTH: f64 = 12.0;
 /// The smallest side of a cell that has its value written inside.
 const CELL_TEXT_MIN: f64 = 25.0;
-/// The number of colour steps in the drawn scale.
 const BAR_STEPS: usize = 64;
 
 /// A square frame that marks part of a map. Lengths are in cells, or in units of the [`Field`] if the map has one.

@@ -113,7 +113,6 @@ impl EvaluationSchedule {
     }
 }
 
-/// Evaluates the checkpoints that are due, one at a time.
 pub(crate) struct Evaluator {
     schedule: EvaluationSchedule,
     run_dir: RunFolder,

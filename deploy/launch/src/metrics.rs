@@ -28,7 +28,6 @@ pub struct Column {
 pub(crate) enum Value {
     /// A number that only rises until the run is started anew; for faults and waits, until it is resumed without its replay.
     Counter(fn(&RunView) -> Option<f64>),
-    /// A number that may fall.
     Gauge(fn(&RunView) -> Option<f64>),
     /// A gauge with several members, such as the auxiliary losses: a column per member, named `prefix` and the member's name.
     Members {

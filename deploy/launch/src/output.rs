@@ -84,9 +84,8 @@ mod tests {
             ("", "Is a directory"),
             ("a.csv/x", "Not a dir"),
         ] {
-            let said = check_file("--out", &folder.path().join(path))
-                .unwrap_err()
-                .0;
+            let path = folder.path().join(path);
+            let said = check_file("--out", &path).unwrap_err().0;
             assert!(said.starts_with("--out /") && said.contains(why), "{said}");
         }
     }

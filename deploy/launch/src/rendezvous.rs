@@ -33,7 +33,6 @@ pub struct Rendezvous {
 }
 
 impl Rendezvous {
-    /// Makes a folder, and removes the folders that are no longer in use.
     pub(crate) fn create() -> anyhow::Result<Self> {
         let parent = parent_folder(std::env::temp_dir());
         remove_unused(&parent);

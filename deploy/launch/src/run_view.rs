@@ -59,7 +59,6 @@ pub(crate) fn updates_served(config: &RunConfig, rows: u64) -> u64 {
     start.updates + rows.saturating_sub(start.rows) / u64::from(config.learner.batch_size)
 }
 
-/// Mean and standard deviation of k over the rows served.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Spread {
     pub(crate) mean: f64,
@@ -102,7 +101,6 @@ pub(crate) struct ServerAnswer {
     #[serde(skip)]
     pub(crate) name: String,
     pub(crate) endpoint: String,
-    /// The server's counts; none if it does not answer, or has not answered yet.
     pub(crate) replay: Option<ReplayStatus>,
     /// The processes that take part in the run; none if the server does not answer, or has not answered yet.
     pub(crate) processes: Option<ProcessesStatus>,

@@ -3,10 +3,7 @@
 
 use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
-use driml_machine::{
-    error::{Usage, usage},
-    units::count,
-};
+use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
 use driml_protocol::{
     Horizon, RunSpec,
@@ -173,7 +170,7 @@ impl RunConfig {
         if frames <= warmup {
             return Err(usage!(
                 "a run of {} ends within the warm-up of {warmup}: ask for more --frames, or --set replay.warmup_transitions={}",
-                count(frames, "frame"),
+                driml_machine::units::count(frames, "frame"),
                 frames / 10
             ));
         }
@@ -198,9 +195,8 @@ impl RunConfig {
             let period = learner.checkpoint_period_updates;
             if every_updates == 0 || !every_updates.is_multiple_of(period) {
                 return Err(usage!(
-                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every {}; \
-                     take a multiple of that, or --set learner.checkpoint_period_updates",
-                    count(period, "update")
+                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one after every \
+                     {period}: take a multiple of that, or --set learner.checkpoint_period_updates"
                 ));
             }
             if !(1..=1_000_000).contains(&episodes) {

@@ -5,10 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::console::print;
 use driml_learner::{Kernels, Precision};
-use driml_machine::{
-    device::{DeviceFlag, check_device},
-    units::count,
-};
+use driml_machine::device::{DeviceFlag, check_device};
 
 #[derive(Debug, Args)]
 pub(crate) struct ParityArgs {
@@ -38,7 +35,7 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }
-    let all = count(args.files.len(), "file");
-    anyhow::ensure!(failed == 0, "{failed} of {all} out of tolerance");
+    let all = args.files.len();
+    anyhow::ensure!(failed == 0, "files out of tolerance: {failed} of {all}");
     Ok(())
 }

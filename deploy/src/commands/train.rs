@@ -13,9 +13,7 @@ use driml_launch::{
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
-use driml_machine::{
-    device::check_device, error::usage, resources::Machine, units::count, whole_number,
-};
+use driml_machine::{device::check_device, error::usage, resources::Machine, units, whole_number};
 use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
     config::RunConfig,
@@ -111,10 +109,8 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
                     "a run in lockstep is one process: leave --listen out"
                 ));
             }
-            let from = format!(
-                "its checkpoint after {}",
-                count(found.point.updates, "update")
-            );
+            let updates = units::count(found.point.updates, "update");
+            let from = format!("its checkpoint after {updates}");
             (found.config, from, Some(found.point))
         }
         None => {
@@ -168,7 +164,7 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
     if shards > actors {
         bail!(usage!(
             "{shards} replay shards for {}: a shard without actors would stay empty; add --actors {shards} or use fewer shards",
-            count(actors, "actor")
+            units::count(actors, "actor")
         ));
     }
     // All actors are started here, so the ladder of epsilons must have exactly one rung for each.
@@ -177,7 +173,7 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
     {
         bail!(usage!(
             "actor.epsilon_ladder is for {}, but --actors is {actors}: --set actor.epsilon_ladder.actors={actors}",
-            count(ladder.actors, "actor")
+            units::count(ladder.actors, "actor")
         ));
     }
     if lockstep && shards > 1 {

@@ -12,11 +12,7 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console::{self, align_columns};
-use driml_machine::{
-    resources::MachineInfo,
-    speed_meter::median,
-    units::{count, format_number},
-};
+use driml_machine::{resources::MachineInfo, speed_meter::median, units};
 use serde::Serialize;
 
 use crate::{
@@ -38,7 +34,6 @@ const ROUNDS: (u32, u32) = (5, 1);
 #[derive(Debug, Default)]
 struct Sides {
     ours: Figures,
-    /// The values of each figure in the order of the rounds.
     theirs: BTreeMap<String, Vec<f64>>,
     peer: String,
     absent: Option<String>,
@@ -211,18 +206,18 @@ fn format_table(comparison: &Comparison) -> String {
     }
     let mut text = align_columns(&cells, &[1, 2, 5, 6]);
     text.extend(skipped);
-    let rounds = count(comparison.rounds, "round");
-    let threads = count(comparison.threads, "thread");
+    let rounds = units::count(comparison.rounds, "round");
+    let threads = units::count(comparison.threads, "thread");
     let machine = &comparison.machine;
     let (processor, load) = (&machine.processor, machine.load);
-    let cores = count(machine.cores, "core");
+    let cores = units::count(machine.cores, "core");
     text.push_str(&format!(
         "ours, theirs: medians of {rounds}; ratio: median of the rounds' ratios. {threads}; {processor}, {cores}.\n"
     ));
     if load > LOAD_MAX {
         text.push_str(&format!(
             "The machine was not idle before: {} tasks wanted a core. These figures are not reliable.\n",
-            format_number(load)
+            units::format_number(load)
         ));
     }
     if comparison.quick {

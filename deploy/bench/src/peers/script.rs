@@ -37,7 +37,6 @@ pub(super) const SCRIPTS: [(&str, &str); 6] = [
 
 /// The script of a component's peer, and its arguments.
 pub(super) struct Script {
-    /// The peer's name in tables and messages.
     pub(super) peer: &'static str,
     module: &'static str,
     /// The peer's short name, in the name of its requirements file and of the flag for its interpreter.

@@ -12,7 +12,6 @@ use super::{
 };
 use crate::stats::{Spread, interval};
 
-/// The number of grid intervals of a curve over several runs.
 const GRID_INTERVALS: usize = 240;
 /// The most points of a single run's curve. Of a longer curve only every second, third, ... point is drawn.
 const POINTS_MAX: usize = 600;
@@ -20,7 +19,6 @@ const POINTS_MAX: usize = 600;
 const GAP_SHARE_MAX: f64 = 0.05;
 const K_MIN: f64 = 1.0;
 
-/// The runs that are drawn as one line.
 #[derive(Debug)]
 pub(super) struct Group<'a> {
     pub(super) name: String,

@@ -15,7 +15,6 @@ impl Runs {
         Self(tempfile::tempdir().unwrap())
     }
 
-    /// Creates a run's folder with settings that differ in `agent` and `seed`.
     fn run(&self, name: &str, agent: &str, seed: u32, metrics: &str) -> PathBuf {
         let folder = self.0.path().join(name);
         std::fs::create_dir(&folder).unwrap();

@@ -40,7 +40,6 @@ pub(crate) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| mean_and_deviation(values).0)
 }
 
-/// The difference between the means of two independent samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Difference {
     /// Welch's 95% interval, with the degrees of freedom rounded down. It has no ends if either side has a single value.

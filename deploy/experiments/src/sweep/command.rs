@@ -152,7 +152,6 @@ fn world_name(world: &str) -> String {
     presets::world(world).map_or_else(|_| world.to_owned(), |it| it.to_string())
 }
 
-/// Describes a cell, such as `agent=c51, learner.batch_size=64`.
 fn describe(cell: &Cell) -> String {
     let words = cell.iter().map(|(name, value)| format!("{name}={value}"));
     words.collect::<Vec<_>>().join(", ")

@@ -117,7 +117,6 @@ impl Job {
 struct RunningJob {
     job: Job,
     child: Child,
-    /// The units of the plan that are done.
     done: u64,
     /// Whether the run is long enough and was asked to stop.
     has_enough: bool,
@@ -144,7 +143,6 @@ impl Queue {
         }
     }
 
-    /// Counts the new work of the children, and handles those that exited.
     fn poll_children(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         let mut at = 0;
         while at < self.running.len() {

@@ -99,7 +99,6 @@ impl Runs {
     }
 }
 
-/// Renames `folder` if it exists, and returns its new path.
 pub(super) fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     if !folder.exists() {
         return Ok(None);
@@ -125,7 +124,6 @@ pub(super) mod tests {
     use super::*;
     use crate::sweep::plan::TrainCall;
 
-    /// Writes what a finished run of the chain world leaves in its folder.
     pub(in crate::sweep) fn write_finished_run(folder: &RunFolder) {
         let call = TrainCall {
             env: Some("chain".into()),

@@ -63,10 +63,10 @@ impl Inspection {
     pub fn describe(&self) -> String {
         let mut text = format!("{} on {}\n", self.agent, self.world);
         for (heading, lines, is_summed) in [
-            ("builds: parameters", &self.parameters, true),
-            ("computes: FLOPs per update", &self.update_flops, true),
-            ("computes: FLOPs per decision", &self.decision_flops, true),
-            ("holds and sends: bytes", &self.bytes, false),
+            ("parameters", &self.parameters, true),
+            ("FLOPs per update", &self.update_flops, true),
+            ("FLOPs per decision", &self.decision_flops, true),
+            ("bytes held and sent", &self.bytes, false),
         ] {
             text += &format!("\n{}", row(heading, "is", "everything"));
             let sum = is_summed.then(|| sum_line("all", lines));

@@ -89,7 +89,6 @@ impl Launch<'_> {
         }
     }
 
-    /// Starts the first `count` processes, except those that are already started.
     pub(super) fn start_up_to(&mut self, count: usize) -> anyhow::Result<()> {
         for number in self.processes.len()..count {
             self.processes.push(self.start(number)?);

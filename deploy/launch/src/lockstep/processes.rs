@@ -88,7 +88,6 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
     }
 }
 
-/// The components of a run, which take turns.
 pub(super) struct Lockstep {
     actors: Vec<Collector>,
     pub(super) replay: Replay,

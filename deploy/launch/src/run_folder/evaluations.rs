@@ -16,10 +16,7 @@ use super::{
     folder::RunFolder,
     table::{Table, append, csv_row, open_to_append},
 };
-use crate::{
-    metrics::{cell, rounded},
-    stats::describe_deviation,
-};
+use crate::metrics::{cell, rounded};
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
@@ -94,7 +91,7 @@ impl EvaluationRow {
             "evaluated after {}: mean return {:.3}{} over {}",
             count(self.updates, "update"),
             self.mean_return,
-            describe_deviation(self.deviation, self.episodes as usize),
+            crate::stats::describe_deviation(self.deviation, self.episodes as usize),
             count(self.episodes, "episode")
         )
     }

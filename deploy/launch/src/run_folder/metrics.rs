@@ -22,7 +22,6 @@ pub struct ResumePoint {
     pub updates: u64,
     /// Rows from which the checkpoint has learned.
     pub(crate) rows: u64,
-    /// Frames of the run at the checkpoint.
     pub(crate) frames: u64,
     /// Whether the replay was kept; it then counts everything that [`BeforeReplay`] does not.
     pub(crate) replay_is_kept: bool,

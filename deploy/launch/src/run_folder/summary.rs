@@ -242,7 +242,6 @@ impl Summary {
     }
 }
 
-/// The command that draws a run's curves, and which curves these are.
 pub(crate) fn plot_command(run_dir: &RunFolder) -> (String, &'static str) {
     let command = format!("plot {} --out plot.png", run_dir.quoted());
     (command, "return, losses, k and speed")

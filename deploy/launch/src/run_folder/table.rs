@@ -146,7 +146,6 @@ pub(crate) struct AppendLog {
 }
 
 impl AppendLog {
-    /// Creates a table anew, which begins with the bytes `first`.
     pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
         write_atomically(path, first)?;
         let name = path.file_name().unwrap_or_default();
@@ -186,7 +185,6 @@ impl AppendLog {
         warning
     }
 
-    /// Writes all waiting rows, or none.
     fn write(&mut self) -> io::Result<()> {
         append(&mut self.file, &self.waiting.make_contiguous().concat())?;
         self.waiting.clear();

@@ -20,7 +20,6 @@ const REPORT_AGE_MAX: f64 = 10.0;
 
 /// The most characters of a line, except for a path or a command that is longer.
 const LINE_CHARS_MAX: usize = 80;
-/// The most characters of a process's name in the table.
 const NAME_CHARS_MAX: usize = 20;
 /// The blanks before the rest of a line that is broken.
 const INDENT: usize = 4;
@@ -216,7 +215,7 @@ fn process_row(process: &ProcessStatus, is_over: bool) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use driml_protocol::ReplayStatus;
-    use expect_test::expect;
+    use expect_test::expect_file;
     use serde_json::json;
 
     use super::*;
@@ -265,7 +264,8 @@ mod tests {
 
     #[test]
     fn a_page_is_80_columns_wide() {
-        expect![[r#""#]].assert_eq(&page(&["tcp/host:1"], "plays", 1));
+        let small = page(&["tcp/host:1"], "plays", 1);
+        expect_file!["../../tests/snapshots/page.txt"].assert_eq(&small);
         let endpoint = format!("unixsock-stream//{}/replay-server-0.sock", "x".repeat(60));
         let doing = "waits for the learner's first weights, which another machine is sending to it";
         let wide = page(&[&endpoint, "tcp/10.0.0.1:7447"], doing, u32::MAX);

@@ -4,10 +4,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use driml_machine::{
-    error::usage,
-    units::{count, duration},
-};
+use driml_machine::{error::usage, units::duration};
 use driml_protocol::{RunSpec, Waiting};
 use driml_settings::config::RunConfig;
 
@@ -177,9 +174,8 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
     let after_updates = view.after_updates.unwrap_or(0);
     if after_updates == 0 && frames > now {
         bail!(usage!(
-            "the run in {} had {}, and the watched run has {now}: it was restarted; choose another --run-dir",
-            folder.display(),
-            count(frames, "frame")
+            "{} holds rows up to frame {frames}, and the watched run is at frame {now}: it was restarted; choose another --run-dir",
+            folder.display()
         ));
     }
     Ok(ResumePoint {

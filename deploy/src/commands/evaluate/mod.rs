@@ -122,7 +122,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::eprintln)?;
-    // Open the file before an hour of playing; its content is replaced only after that.
+    // Check the file before an hour of playing. Its content is replaced only after that.
     if let Some(path) = &args.returns {
         output::check_file("--returns", path)?;
     }

@@ -7,15 +7,9 @@ use clap::Args;
 use driml_actor::Step;
 use driml_envs::StepEnd;
 use driml_figure::{FigureError, Film, Picture};
-use driml_launch::{
-    evaluate::{Player, Viewer},
-    output::unwritable,
-};
+use driml_launch::evaluate::{Player, Viewer};
 use driml_learner::insight::NetworkOutputs;
-use driml_machine::{
-    error::{Usage, usage},
-    units::count,
-};
+use driml_machine::error::{Usage, usage};
 use driml_protocol::Horizon;
 
 use super::tile::{Layout, Local, Shot};
@@ -199,7 +193,8 @@ impl Recording {
             return Err(e.context("making the film"));
         }
         self.film.finish().map_err(film_error)?;
-        Ok(format!("filmed {}: {path}\n", count(self.steps, "step")))
+        let steps = driml_machine::units::count(self.steps, "step");
+        Ok(format!("filmed {steps}: {path}\n"))
     }
 }
 
@@ -226,7 +221,9 @@ impl Shot {
 /// Reports a film that cannot be made or written as a wrong flag.
 fn film_error(error: FigureError) -> Usage {
     match error {
-        FigureError::Write { path, source } => unwritable("--record", &path, source),
+        FigureError::Write { path, source } => {
+            driml_launch::output::unwritable("--record", &path, source)
+        }
         _ => usage!("--record: {error}"),
     }
 }

@@ -8,11 +8,8 @@ use driml_settings::config::RunConfig;
 
 /// The approximate length of an enlarged frame's longer side, in pixels. The zoom is a whole number.
 const FRAME_SIDE: usize = 224;
-/// The margin around and between the elements, in pixels.
 const MARGIN: f64 = 10.0;
-/// The width of the panel of words and bars, in pixels.
 const PANEL_WIDTH: f64 = 216.0;
-/// The least height of the panel of words and bars, in pixels.
 const PANEL_HEIGHT: f64 = 230.0;
 /// The distance between lines of text, in pixels.
 const LEADING: f64 = 19.0;
@@ -70,7 +67,6 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// Makes the layout of `envs` filmed environments.
     pub(super) fn new(
         config: &RunConfig,
         envs: usize,

@@ -23,7 +23,6 @@ pub(super) struct Settings {
     pub(super) updates: u64,
     /// The number of pairs in a batch. For each pair all others are negatives.
     pub(super) batch_size: usize,
-    /// The number of measurements before the end.
     pub(super) checks: u64,
     /// The number of episodes of each measurement before the end.
     pub(super) check_episodes: usize,
@@ -35,7 +34,6 @@ pub(super) struct Settings {
     pub(super) late_t: u32,
 }
 
-/// Everything that a training depends on except its seed.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Task {
     pub(super) world: IsingConfig,

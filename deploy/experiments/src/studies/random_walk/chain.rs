@@ -142,7 +142,6 @@ impl Chain {
     }
 }
 
-/// Returns the entropy -sum p ln p, in nats.
 fn entropy(law: &[f64]) -> f64 {
     let terms = law.iter().filter(|p| **p > 0.0).map(|p| p * p.ln());
     -terms.sum::<f64>()

@@ -89,7 +89,6 @@ impl Results {
         shown.into_iter().map(|at| alphas[at]).collect()
     }
 
-    /// Returns the total variation over updates, averaged over the seeds of stationary sampling.
     pub(super) fn tv_curve(&self, alpha: f64) -> Curve {
         let each: Vec<_> = self.select(Sampling::Stationary, alpha).collect();
         let updates = each.iter().take(1).flat_map(|one| &one.learnt.updates);

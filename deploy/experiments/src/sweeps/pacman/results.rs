@@ -114,7 +114,6 @@ fn mean_from(points: &Points, frames: f64) -> Option<f64> {
     mean(&late.map(|point| point.1).collect::<Vec<_>>())
 }
 
-/// Computes [`Trace::tasks`].
 fn task_returns(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
     let length = continual.episodes_per_task as f64;
     let of_task = |task: u64| {

@@ -68,7 +68,6 @@ impl Continual {
 
 /// The number of parts with tasks: (b) and (c).
 pub(super) const PARTS: usize = 2;
-/// The names of parts (b) and (c) in files.
 pub(super) const PART_NAMES: [&str; PARTS] = ["ghosts", "noise"];
 
 #[derive(Clone, Debug, PartialEq)]

@@ -46,7 +46,6 @@ pub(super) struct Settings {
 
 #[derive(Debug, Serialize)]
 pub(super) struct Point {
-    /// The name of the world in files.
     pub(super) game: String,
     pub(super) agent: String,
 }

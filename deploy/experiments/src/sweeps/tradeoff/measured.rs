@@ -16,7 +16,6 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{fixed_batch, results::Numbers};
 
-/// The most rows of the batch whose loss and gradient are compared.
 const ROWS_MAX: usize = 64;
 /// The number of states for each of these rows whose values and greedy actions are compared.
 const STATES_PER_ROW: usize = 16;

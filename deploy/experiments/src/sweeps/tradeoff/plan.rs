@@ -3,7 +3,6 @@
 
 use std::collections::BTreeSet;
 
-/// The cost of the unfinished runs of a point, over all seeds.
 #[derive(Clone, Debug)]
 pub(super) struct Cost {
     pub(super) key: String,

@@ -126,7 +126,6 @@ impl EqualTime {
         (!comparison.then.iter().any(Vec::is_empty)).then_some(comparison)
     }
 
-    /// Returns the cells of the columns [`EQUAL_TIME`].
     fn cells(&self) -> impl Serialize {
         let minus_base = [&self.end, &self.then].map(|[base, level]| {
             let difference = difference(base, level);

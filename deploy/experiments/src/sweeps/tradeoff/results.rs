@@ -28,7 +28,6 @@ pub(super) struct SeedResult {
 
 pub(super) struct Results {
     pub(super) common: Common,
-    /// The levels that have finished runs, and whose bases have.
     pub(super) levels: Vec<DialLevel>,
     pub(super) points: BTreeMap<String, PointResult>,
     pub(super) random: Vec<f64>,
@@ -37,7 +36,6 @@ pub(super) struct Results {
     pub(super) commands: Vec<String>,
 }
 
-/// A number that is read from a run, with its column name in the data.
 #[derive(Clone, Copy)]
 pub(super) struct Measure {
     pub(super) name: &'static str,
