@@ -191,9 +191,9 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     assert_eq!(status.updates, planned_updates(replay.transitions_inserted));
-    learner.stop_ok();
+    learner.stop(0);
     drop(client);
-    let exit = server.stop_ok();
+    let exit = server.stop(0);
     exit.expect_stderr("continues with the replay in replay");
 }
 

@@ -110,8 +110,8 @@ fn a_frozen_actor_does_not_stop_the_others() {
     let others = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_transitions(others + 500);
     for actor in [healthy, frozen] {
-        actor.stop_ok().expect_stderr("leaves: ");
+        actor.stop(130).expect_stderr("leaves: ");
     }
     client.check_nothing_lost();
-    learner.stop_ok();
+    learner.stop(130);
 }

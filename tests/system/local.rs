@@ -100,7 +100,7 @@ fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
     watched.signal(Signal::SIGINT);
     watched.wait_for_stderr("the run continues without being watched");
     watched.wait().expect_code(130);
-    outside.stop_ok().expect_stderr("actor 2 leaves: ");
+    outside.stop(130).expect_stderr("actor 2 leaves: ");
     drop(client);
     run.interrupt().expect_code(130);
     system.run_folder("run").check(Outcome::Interrupted);

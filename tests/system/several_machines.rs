@@ -116,7 +116,7 @@ impl Run {
         }
         // Stop the learner, then the server.
         for process in self.processes.into_iter().rev() {
-            process.stop_ok();
+            process.stop(0);
         }
         assert_eq!(self.system.running_processes(), []);
     }

@@ -151,8 +151,8 @@ fn strangers_at_a_replay_server() {
     // The strangers do not disturb admitted processes.
     let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
     observer.wait_for_updates(10);
-    actor.stop_ok();
-    learner.stop_ok();
+    actor.stop(130);
+    learner.stop(130);
 }
 
 /// A process does not join a stranger in place of its replay server, and names the endpoint.

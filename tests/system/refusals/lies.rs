@@ -55,7 +55,7 @@ impl AttackedRun {
         let lines = log.lines().filter(|line| line.contains("refused")).count();
         assert!((1..60).contains(&lines), "{lines} lines: {log}");
         drop(self.client);
-        self.process.stop().expect_code(130);
+        self.process.stop(130);
     }
 }
 
@@ -197,7 +197,7 @@ fn lies_of_who_answers_are_not_believed() {
     });
     let log = run.system.read("run/logs/actor-0.log");
     assert!(!log.contains("will be sent again"), "{log}");
-    run.process.stop().expect_code(130);
+    run.process.stop(130);
 }
 
 /// More strangers join than a run can remember; then an actor joins that belongs to the run.
@@ -217,7 +217,7 @@ fn forget_4096_strangers(run: &AttackedRun) {
     let mut actor = run.system.start_actor(7);
     actor.wait_for_stderr("actor 7 steps");
     client.wait_for_replay("two actors", |replay| replay.actors_acting == 2);
-    actor.stop_ok().expect_stderr("leaves: ");
+    actor.stop(130).expect_stderr("leaves: ");
     client.wait_for_replay("one actor", |replay| replay.actors == 1);
     // A forgotten actor leaves with a count that no run reaches.
     let leave = leave(UNUSED_ACTOR, INCARNATION, 1 << 60);

@@ -163,7 +163,7 @@ fn an_actor_declares_nothing_but_its_own(run: &TlsRun) {
     let mut two = run.system.start_actor(2);
     two.wait_for_stderr("actor 2 steps");
     run.observer.wait_for_replay("both", |it| it.actors == 2);
-    two.stop_ok().expect_stderr("leaves: ");
+    two.stop(130).expect_stderr("leaves: ");
     run.observer.wait_for_replay("one", |it| it.actors == 1);
     check_continues(&run.observer);
     assert_eq!(queries.load(Ordering::Relaxed), 0, "queries to an actor");

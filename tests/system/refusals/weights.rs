@@ -95,7 +95,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
 
     let before = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_transitions(before + 1000);
-    let stderr = actor.stop_ok().stderr;
+    let stderr = actor.stop(130).stderr;
     assert!(!stderr.contains("newer ones did not come"), "{stderr}");
     assert_eq!(client.replay_status().unwrap().transitions_lost, 0);
 }
