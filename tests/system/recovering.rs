@@ -54,9 +54,8 @@ fn write_log(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     (config.slack_transitions, config.transitions_max) = (1 << 40, None);
     let args = PersistArgs {
         dir: folder.to_owned(),
-        shard: 0,
         segment_bytes: Some(1 << 18),
-        mark: None,
+        ..PersistArgs::default()
     };
     let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
     tiny_replay::join_actor(&mut replay, 9);

@@ -24,7 +24,7 @@ fn open(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), Persist
         dir: dir.to_owned(),
         shard: 0,
         segment_bytes: Some(4_000),
-        mark: None,
+        ..PersistArgs::default()
     };
     let (replay, recovery) = Replay::open(&args, &RunSpec::smallest(), &config, 4)?;
     Ok((replay, recovery.warnings))

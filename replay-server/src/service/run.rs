@@ -86,8 +86,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         let args = PersistArgs {
             dir: shard_dir(dir, args.shard, config.shards),
             shard: args.shard,
-            segment_bytes: None,
-            mark: None,
+            ..PersistArgs::default()
         };
         ReplayFolder::open(&args, &spec, &config)
     });
