@@ -322,7 +322,7 @@ impl LogReader<'_> {
 
     fn finish(mut self) -> Result<(LogPosition, RecoveryReport), PersistError> {
         let unusable = |why: String| {
-            let why = format!("cannot be used: {why}; to begin a new replay there, remove them");
+            let why = format!("cannot be used: {why}; to begin a new replay, remove its segments");
             Err(PersistError::Unusable(self.folder.path.clone(), why))
         };
         if !self.recovery.found && !self.recovery.warnings.is_empty() {
