@@ -94,9 +94,8 @@ fn nothing_grows() {
     }
     assert!(last.2 <= first.2 + 3 * ACTORS, "{first:?}, then {last:?}");
     drop(client);
-    actors.into_iter().flatten().for_each(|actor| {
-        actor.stop(130);
-    });
+    let left = actors.into_iter().flatten();
+    left.for_each(|actor| drop(actor.stop(130)));
     learner.stop(130);
     server.stop(130);
     assert_eq!(system.running_processes(), []);
