@@ -63,7 +63,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     settings.set_world_code(args.world)?;
     if settings.transport.shared_memory && !run_info.shared_memory {
         tracing::info!(
-            "chunks go through sockets: the replay server takes none through shared memory"
+            "chunks go through sockets: the replay server accepts none through shared memory"
         );
         settings.transport.shared_memory = false;
     }
@@ -145,7 +145,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     activity.begin("delivers its last chunks");
     let delivered = delivery.finish();
     if let (Err(_), Err(e)) = (&result, &delivered) {
-        tracing::warn!("not all that was played before could be delivered: {e}");
+        tracing::warn!("some transitions from before the error were not delivered: {e}");
     }
     result?;
     let stored = produced - delivered?;
@@ -175,7 +175,7 @@ fn produce_chunks(
             && let Err(e) = collector.set_weights(header.version, &safetensors)
         {
             tracing::warn!(
-                "weights {} were refused, the old ones stay: {e:#}",
+                "weights {} were rejected, and the previous ones stay in use: {e:#}",
                 header.version
             );
         }

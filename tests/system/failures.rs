@@ -118,7 +118,7 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
     for (role, words) in [
         ("actor", "actor 0 leaves: "),
         ("learner", "finished after "),
-        ("server", "this process is to end, and 0 processes are left"),
+        ("server", "told to stop; processes still connected: 0"),
     ] {
         let stderr = system.read(role);
         assert!(stderr.contains(words), "{stderr}");

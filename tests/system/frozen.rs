@@ -63,7 +63,7 @@ fn a_replay_server_ends_without_its_actor() {
     let learner = system.start_process(&system.connect_args("learner --run-dir run"));
     system.start_actor(0).wait_ok();
     learner.wait_ok();
-    server.wait_ok().expect_stderr("the run is over, and ");
+    server.wait_ok().expect_stderr("the run is over; processes");
     frozen.kill();
 }
 

@@ -104,7 +104,7 @@ fn of_two_processes_with_one_role_the_second_waits_for_the_first_one_s_end() {
     let client = system.connect();
     client.wait_for_updates(10);
     let mut second = system.start_learner("second");
-    second.wait_for_stderr("another learner takes part in this run, which has one alone");
+    second.wait_for_stderr("another learner takes part in this run, which has only one");
     second.stop(130);
     assert!(system.run_folder("second").checkpoints().is_empty());
 

@@ -143,7 +143,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let learner = system.start_learner("run");
     system
         .start_actor(0)
-        .fails("an actor starts none because a replay server says so")
+        .fails("an actor starts no program that only the replay server names")
         .expect_stderr("--env \"exec:exec python3 ");
     let actor = |flags: &str| system.start_process(&system.connect_args(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");

@@ -200,7 +200,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr(WAITING_LOG);
     let exit = server.stop(130);
-    exit.expect_stderr("it was told to end while it read its replay back");
+    exit.expect_stderr("it was stopped while it read its replay back");
     drop(slow);
     actor.stop(130);
     let server = system.start_replay_server(&serve);

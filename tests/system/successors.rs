@@ -101,10 +101,10 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let server = system.start_replay_server(&format!(
         "--agent c51 {LONG} --set learner.checkpoint_period_updates=1000"
     ));
-    learner.fails("this replay server does not know the learner: it was started again");
+    learner.fails("this replay server does not know the learner: the server has restarted");
     let saved = system.run_folder("run").saved_updates();
     assert!(saved > 75);
-    actor.fails("does not know this life of actor 1: it was started anew");
+    actor.fails("does not know this incarnation of actor 1: the server has restarted");
 
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);

@@ -191,7 +191,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         (name, endpoint, listening, actor)
     });
     for (name, endpoint, listening, actor) in rows {
-        let words = format!("no replay server lets this process in on {endpoint}: ");
+        let words = format!("no replay server accepts this process at {endpoint}: ");
         let ended = actor.wait();
         assert_eq!(ended.code, Some(1), "a certificate that is {name}");
         ended

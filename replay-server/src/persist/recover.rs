@@ -211,7 +211,7 @@ impl LogReader<'_> {
         let is_prioritised = self.replay.config.sampling.is_prioritised();
         if self.mark == Some(Mark(number)) {
             if snapshot.rows.is_prioritised() != is_prioritised {
-                let why = "replay.sampling is another rule than it was".into();
+                let why = "replay.sampling differs from the rule that was used before".into();
                 return Err(unusable(why));
             }
             self.position.mark = Some((Mark(number), snapshot.oldest));
@@ -245,7 +245,7 @@ impl LogReader<'_> {
             )),
             Ok(_) => {}
             Err(_) if !is_last => self.warn(format!(
-                "{name} is damaged at byte {at}: {cut} bytes of it are of no use"
+                "{name} is damaged at byte {at}: {cut} bytes of it cannot be used"
             )),
             // No actor was told that this record is stored.
             Err(RecordError::Torn) => tracing::info!(
@@ -278,7 +278,7 @@ impl LogReader<'_> {
             };
             let applied = match !is_closed && record.ordinal == self.position.next_ordinal {
                 true => self.apply(&record),
-                false => Err("it is not the next one".into()),
+                false => Err("it is not the next record".into()),
             };
             if let Err(why) = applied {
                 tracing::debug!("record {}: {why}", record.ordinal);

@@ -120,7 +120,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     )?;
     let client = RunClient::new(session, keys, spec.hash());
     let declare_error =
-        |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
+        |e: zenoh::Error| anyhow::anyhow!("declaring the replay server's queries: {e}");
     let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
         recovery: RecoveryControl::new(args.drain.clone()),

@@ -102,7 +102,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
         keys.actor_key::<ActorJoin>(1),
         keys.actor_key::<ChunkPoll>(1),
     );
-    let reason = "speaks for actor 0 at the key";
+    let reason = "in the name of actor 0, but came at the key";
     send_in_parallel(
         one,
         [
