@@ -85,8 +85,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     };
     if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {
         tracing::warn!(
-            "actor {} takes the place of one that has ended: the ghosts of this run change as episodes pass, and it counts these from 0, \
-             so they are not what they would have been",
+            "actor {} replaces one that has exited, and counts its episodes from 0: the ghosts of this run change with that count, \
+             so they differ from those of a run without the exit",
             args.actor
         );
     }

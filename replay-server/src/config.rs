@@ -127,7 +127,7 @@ impl Config {
         ] {
             check(set.is_none(), key, set.unwrap_or(0), || {
                 format!(
-                    "this replay is in memory alone; add {keep_flags} to keep it on disk, or leave the setting out"
+                    "this replay is only in memory; add {keep_flags} to keep it on disk, or leave the setting out"
                 )
             })?;
         }

@@ -292,7 +292,7 @@ impl Journal {
         self.rotate_failed_at = Some(Instant::now());
         if let Some(more) = self.log_limiter.admit() {
             tracing::error!(
-                "no new file can be begun in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
+                "no new file can be created in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
                  writable{more}",
                 self.folder.path.display()
             );

@@ -223,7 +223,7 @@ impl LogReader<'_> {
         self.replay.restore(snapshot).map_err(unusable)?;
         if !is_first && first_transition > stored {
             self.warn(format!(
-                "the transitions {stored} to {} are gone: something before {name} is damaged or missing. All others are there, and all \
+                "the transitions {stored} to {} are lost: something before {name} is damaged or missing. All others are there, and all \
                  counts are right",
                 first_transition - 1
             ));
@@ -349,7 +349,7 @@ impl LogReader<'_> {
         let held_from = self.oldest.max(end.saturating_sub(ring.capacity()));
         if self.has_same_capacity && held_from < first {
             self.warn(format!(
-                "the transitions {held_from} to {} are gone: the oldest segments are missing. All others are there, and all counts are right",
+                "the transitions {held_from} to {} are lost: the oldest segments are missing. All others are there, and all counts are right",
                 first - 1
             ));
         }
