@@ -128,7 +128,7 @@ impl ActorSettings {
         self.check_chunk_bytes()?;
         let longest = u64::from(envs) * u64::from(self.actor.chunk_steps(1));
         check(longest <= allowed, "actor.envs", envs, || {
-            "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
+            "its chunks are longer than the replay server accepts in this run, whose settings limit actor.envs * \
              actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)"
         })
     }
@@ -143,8 +143,8 @@ impl ActorSettings {
             Some(world) => self.world = self.world.with_code_of(world)?,
             None if name.foreign_code().is_some() => {
                 return Err(EnvError::Config(format!(
-                    "the run's world is code on this actor's machine, {name}, and an actor starts none because a replay server says so: \
-                     if you trust it, name it with --env {:?}, or as this machine has it",
+                    "the run's world is a program on this actor's machine, {name}, and an actor starts no program that only the replay \
+                     server names: if you trust it, start the actor with --env {:?}, or with its path on this machine",
                     name.to_string()
                 )));
             }

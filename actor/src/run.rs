@@ -63,7 +63,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     settings.set_world_code(args.world)?;
     if settings.transport.shared_memory && !run_info.shared_memory {
         tracing::info!(
-            "chunks go through sockets: the replay server takes none through shared memory"
+            "chunks go through sockets: the replay server accepts none through shared memory"
         );
         settings.transport.shared_memory = false;
     }
@@ -85,8 +85,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     };
     if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {
         tracing::warn!(
-            "actor {} takes the place of one that has ended: the ghosts of this run change as episodes pass, and it counts these from 0, \
-             so they are not what they would have been",
+            "actor {} replaces one that has exited, and counts its episodes from 0: the ghosts of this run change with that count, \
+             so they differ from those of a run without the exit",
             args.actor
         );
     }
@@ -145,7 +145,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     activity.begin("delivers its last chunks");
     let delivered = delivery.finish();
     if let (Err(_), Err(e)) = (&result, &delivered) {
-        tracing::warn!("not all that was played before could be delivered: {e}");
+        tracing::warn!("some transitions from before the error were not delivered: {e}");
     }
     result?;
     let stored = produced - delivered?;
@@ -175,7 +175,7 @@ fn produce_chunks(
             && let Err(e) = collector.set_weights(header.version, &safetensors)
         {
             tracing::warn!(
-                "weights {} were refused, the old ones stay: {e:#}",
+                "weights {} were rejected, and the previous ones stay in use: {e:#}",
                 header.version
             );
         }

@@ -192,7 +192,7 @@ pub(crate) fn start_puller(
                 // The actor is leaving and has closed its session.
                 Err(_) if client.session().is_closed() => return,
                 Err(e) => {
-                    tracing::warn!("keeping weights {version}, newer ones did not come: {e}");
+                    tracing::warn!("keeping weights {version}, newer ones did not arrive: {e}");
                     slot.finish_pull(None);
                 }
             }
@@ -249,7 +249,7 @@ fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
 
 fn send(client: &RunClient, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
     let sent = client.send(client.encode(&request)?, PIECE_TIMEOUT);
-    sent.map_err(|e| anyhow!("asking for weights: {e}"))
+    sent.map_err(|e| anyhow!("requesting weights: {e}"))
 }
 
 #[cfg(test)]

@@ -14,11 +14,11 @@ pub enum UpdateError {
     /// The state does not fit the network, for example because it is from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
     State(String),
-    #[error("{0} is not finite; the update is not taken")]
+    #[error("{0} is not finite; the update was not applied")]
     NonFinite(String),
     /// The optimiser step made a parameter or moment infinite or NaN. This learner can neither continue nor publish nor save.
     #[error(
-        "update {update} took {name} beyond the finite numbers; the learner cannot continue: resume from the newest checkpoint with \
+        "update {update} made {name} infinite or NaN; the learner cannot continue: resume from the newest checkpoint with \
          a learner.update.adam.lr below {lr:e}"
     )]
     Diverged { name: String, update: u64, lr: f64 },

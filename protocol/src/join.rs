@@ -34,7 +34,7 @@ const PAUSE: Duration = Duration::from_millis(200);
 pub enum JoinError {
     #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_WAIT_MAX.as_secs())]
     NoReplayServer { last: SessionError },
-    #[error("the replay server's run info: {0}")]
+    #[error("reading the replay server's run info: {0}")]
     Codec(#[from] CodecError),
     /// Another process has the same role and does not exit, or the replay server rejects this one.
     #[error("{0}")]
@@ -110,7 +110,7 @@ impl ServerWait {
                 other => other.to_string(),
             };
             tracing::info!(
-                "waiting for the replay server since {since} s, for {max} s at most: {why}"
+                "waiting for the replay server for {since} s so far (at most {max} s): {why}"
             );
         }
         Ok(())
@@ -132,20 +132,20 @@ pub fn join(
         match client.ask(request, TRY_TIMEOUT) {
             Ok(JoinReply::Welcome(welcome)) => return Ok(Some(welcome)),
             Ok(JoinReply::Refused { why }) => {
-                let why = format!("the replay server refuses: {why}");
+                let why = format!("the replay server rejects this process: {why}");
                 return Err(JoinError::Refused(why));
             }
             Ok(JoinReply::Taken { why }) => match &mut predecessor {
                 Some(silence) => {
                     if silence.record_failure() > PREDECESSOR_WAIT_MAX {
                         let seconds = PREDECESSOR_WAIT_MAX.as_secs();
-                        let why = format!("{why}, and has not ended within {seconds} s");
+                        let why = format!("{why}; it has not exited within {seconds} s");
                         return Err(JoinError::Refused(why));
                     }
                 }
                 None => {
                     let max = PREDECESSOR_WAIT_MAX.as_secs();
-                    tracing::warn!("{why}; waiting up to {max} s for its end");
+                    tracing::warn!("{why}; waiting up to {max} s until the other process exits");
                     predecessor = Some(Silence::default());
                 }
             },

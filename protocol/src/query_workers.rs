@@ -103,7 +103,7 @@ impl<M: Message> Responder<M> {
     pub fn retry_later(self, recovering: &Recovering) {
         match EncodedMessage::new(recovering, self.spec_hash) {
             Ok(encoded) => session::reply_error(&self.query, encoded.into_bytes()),
-            Err(e) => tracing::error!("that the replay is being read back was not said: {e}"),
+            Err(e) => tracing::error!("a reply about the recovery was not sent: {e}"),
         }
     }
 

@@ -43,7 +43,7 @@ fn send_until_acked(mut send: impl FnMut() -> Result<Ack, SessionError>, shutdow
             silence.record_answer();
         }
         if silence.record_failure() > FINISHED_RETRY_MAX {
-            tracing::warn!("a replay server does not know that the run is finished: {e}; stop it");
+            tracing::warn!("a replay server was not told that the run is over: {e}; stop it");
             return;
         }
         if shutdown.wait_timeout(TICK) {

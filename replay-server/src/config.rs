@@ -55,7 +55,7 @@ pub struct Config {
     pub refill_transitions: u64,
     /// Transitions that inserts may run ahead of sampling, after the warm-up, before they have to wait.
     pub slack_transitions: u64,
-    /// Transitions of the whole run, warm-up included. Once that many are stored, the server accepts no more. `None`: no limit.
+    /// Transitions of the whole run, warm-up included, until [`all_stored`](crate::RateLimiter::all_stored). `None`: no limit.
     pub transitions_max: Option<u64>,
     /// Maximum bytes of all shards on disk, if the replay is kept there (`--replay-dir`, `--durable`). Beyond the limit the oldest
     /// transitions are removed, from memory too, before `capacity_transitions` are held. Default: as many bytes as uncompressed transitions
@@ -127,7 +127,7 @@ impl Config {
         ] {
             check(set.is_none(), key, set.unwrap_or(0), || {
                 format!(
-                    "this replay is in memory alone; add {keep_flags} to keep it on disk, or leave the setting out"
+                    "this replay is only in memory; add {keep_flags} to keep it on disk, or leave the setting out"
                 )
             })?;
         }

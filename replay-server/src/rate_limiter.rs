@@ -112,7 +112,8 @@ impl RateLimiter {
             && f64::from(rows) <= self.credit()
     }
 
-    /// Whether all transitions of the run are stored.
+    /// Whether all transitions of the run are stored, by the last counts of the other shards. N shards store less than N * (slack +
+    /// 2 * batch size / replay ratio + a chunk) too many, as `may_insert` bounds what each stores between reports after the warm-up.
     pub fn all_stored(&self) -> bool {
         let max = self.config.transitions_max;
         self.counts.refill_left == 0 && max.is_some_and(|max| self.inserted_total() >= max)

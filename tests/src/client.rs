@@ -81,14 +81,11 @@ impl Client {
         let run_info = join::fetch_run_info(&session, &keys, &Shutdown::default())
             .unwrap()
             .expect("this client is not told to stop");
-        let spec = Settings::parse(&run_info.config_toml)
-            .unwrap()
-            .table("run")
-            .unwrap();
+        let settings = Settings::parse(&run_info.config_toml).unwrap();
         Self {
             session,
             keys,
-            spec,
+            spec: settings.table("run").unwrap(),
             config_toml: run_info.config_toml,
         }
     }
@@ -98,14 +95,9 @@ impl Client {
     /// # Errors
     /// No process answered.
     pub fn request(&self, key: &str, payload: Vec<u8>) -> Result<Vec<u8>, SessionError> {
-        session::ask(
-            &self.session,
-            key,
-            payload.into(),
-            Priority::Data,
-            REPLY_TIMEOUT,
-        )
-        .map(|reply| reply.to_bytes().into_owned())
+        let (payload, priority) = (payload.into(), Priority::Data);
+        let reply = session::ask(&self.session, key, payload, priority, REPLY_TIMEOUT)?;
+        Ok(reply.to_bytes().into_owned())
     }
 
     /// Returns the session, the keys and the spec's hash, as a process of the run holds them.

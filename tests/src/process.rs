@@ -178,18 +178,11 @@ impl Process {
         self.wait()
     }
 
-    /// Sends SIGTERM and waits until the process ends.
-    pub fn stop(self) -> Exit {
-        self.signal(Signal::SIGTERM);
-        self.wait()
-    }
-
-    /// Sends SIGTERM, waits until the process exits, and checks for code 0 (its run is over) or 130.
+    /// Sends SIGTERM, waits until the process exits, and checks its exit code: 0 if its run is over, else 130.
     #[track_caller]
-    pub fn stop_ok(self) -> Exit {
-        let ended = self.stop();
-        let code = if ended.code == Some(130) { 130 } else { 0 };
-        ended.expect_code(code)
+    pub fn stop(self, code: i32) -> Exit {
+        self.signal(Signal::SIGTERM);
+        self.wait().expect_code(code)
     }
 }
 

@@ -297,22 +297,17 @@ impl TestSystem {
         let processes = fs::read_dir("/proc").unwrap().flatten();
         let carries_mark = |folder: &Path| {
             let variables = fs::read(folder.join("environ")).unwrap_or_default();
-            variables
-                .split(|&byte| byte == 0)
-                .any(|variable| variable == mark.as_bytes())
+            let variables = String::from_utf8_lossy(&variables);
+            variables.split('\0').any(|variable| variable == mark)
         };
         let running = |entry: fs::DirEntry| {
             let pid = entry.file_name().to_str()?.parse().ok()?;
             // A process that has ended but was not waited for (a zombie) has no environment any more.
             carries_mark(&entry.path()).then_some(())?;
             let words = fs::read(entry.path().join("cmdline")).unwrap_or_default();
-            let words = words
-                .split(|&byte| byte == 0)
-                .skip(1)
-                .filter(|word| !word.is_empty());
-            let args = words
-                .map(|word| String::from_utf8_lossy(word).into_owned())
-                .collect();
+            let words = String::from_utf8_lossy(&words);
+            let args = words.split('\0').skip(1).filter(|word| !word.is_empty());
+            let args = args.map(str::to_owned).collect();
             Some(RunningProcess { pid, args })
         };
         processes.filter_map(running).collect()

@@ -31,14 +31,13 @@ fn check_whole_run(system: &TestSystem) {
     let run = system.run_folder("run");
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
-    let exit = learner.stop().expect_code(0);
-    exit.expect_stderr("finished after 540 updates");
+    learner.stop(0).expect_stderr("finished after 540 updates");
     // The learner's run folder can be evaluated like that of a launched run.
     system.run_ok("evaluate --run run --episodes 5");
     // The learner stayed alive after the end of the run, so its stop does not make the run unfinished.
     client.wait_for_replay("the end of the run", |it| it.learner_finished);
     drop(client);
-    let exit = server.stop().expect_code(0);
+    let exit = server.stop(0);
     exit.expect_stderr("stops with 1280 transitions stored");
     assert_eq!(system.running_processes(), []);
 }
@@ -147,7 +146,7 @@ fn an_actor_killed_and_started_again_continues() {
     let replay = client.check_nothing_lost();
     assert!(replay.transitions_inserted >= 4_008 && replay.finished);
     assert_eq!(replay.messages_refused, 0);
-    learner.stop_ok();
+    learner.stop(0);
 }
 
 /// A process started by hand also sets the environment variables that candle and the C library read. Variables set by the user stay.
@@ -162,5 +161,5 @@ fn a_process_by_hand_settles_its_environment() {
     let has = |variable: &str| environ.split('\0').any(|it| it == variable);
     assert!(has("MALLOC_ARENA_MAX=2") && has("MALLOC_TRIM_THRESHOLD_=10000000000"));
     assert!(has("CANDLE_NUM_THREADS=3"));
-    server.stop_ok();
+    server.stop(130);
 }

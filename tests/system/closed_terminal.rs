@@ -173,7 +173,7 @@ fn a_run_that_is_to_ignore_hangups_does() {
         system.find_process(role).signal(Signal::SIGHUP);
     }
     client.wait_for_updates(before.updates + 500);
-    process.stop().expect_code(130);
+    process.stop(130);
     system.run_folder("run").check(Outcome::Interrupted);
 }
 
@@ -198,6 +198,6 @@ fn a_run_that_was_stopped_for_long_resumes() {
         let learner = client.learner_status();
         learner.is_some_and(|it| it.updates > before.updates + 500)
     });
-    process.stop().expect_code(130);
+    process.stop(130);
     system.run_folder("run").check(Outcome::Interrupted);
 }

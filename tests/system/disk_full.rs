@@ -179,8 +179,8 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let text = status_text(&system);
     check_has(&text, &["replay on disk: "]);
     assert!(!text.contains("WRITES FAIL"), "{text}");
-    actor.stop_ok();
-    learner.stop_ok();
+    actor.stop(130);
+    learner.stop(130);
     let before = client.check_nothing_lost();
     server.kill();
     let server = system.start_replay_server(&flags);
@@ -194,9 +194,9 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     });
     assert_eq!(after.updates_relearned, 0, "{after:#?}");
     client.wait_for_learner("the learner", |_| true);
-    learner.stop_ok();
+    learner.stop(130);
     drop(client);
-    server.stop_ok();
+    server.stop(130);
 }
 
 #[test]
@@ -211,7 +211,7 @@ fn a_folder_that_cannot_be_used_is_said() {
     };
     other(&flags)
         .fails("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
-    server.stop_ok();
+    server.stop(130);
     other(&flags.replace("c51", "driml-ada"))
         .fails("replay holds the replay of another run (its run spec has the hash");
 

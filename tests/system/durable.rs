@@ -189,9 +189,9 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     assert_eq!(status.updates, planned_updates(replay.transitions_inserted));
-    learner.stop_ok();
+    learner.stop(0);
     drop(client);
-    let exit = server.stop_ok();
+    let exit = server.stop(0);
     exit.expect_stderr("continues with the replay in replay");
 }
 
@@ -220,7 +220,7 @@ fn a_resumed_run_continues_with_its_replay() {
     let log = run.log("replay-server");
     check_has(&log, &["continues with the replay in run/replay"]);
     // The replay's log may contain updates that no checkpoint holds.
-    let warns = |line: &&str| line.contains("WARN") && !line.contains("to be learned again");
+    let warns = |line: &&str| line.contains("WARN") && !line.contains("repeats the later ones");
     assert_eq!(log.lines().find(warns), None, "{log}");
 }
 

@@ -63,7 +63,7 @@ fn a_replay_server_ends_without_its_actor() {
     let learner = system.start_process(&system.connect_args("learner --run-dir run"));
     system.start_actor(0).wait_ok();
     learner.wait_ok();
-    server.wait_ok().expect_stderr("the run is over, and ");
+    server.wait_ok().expect_stderr("the run is over; processes");
     frozen.kill();
 }
 
@@ -110,8 +110,8 @@ fn a_frozen_actor_does_not_stop_the_others() {
     let others = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_transitions(others + 500);
     for actor in [healthy, frozen] {
-        actor.stop_ok().expect_stderr("leaves: ");
+        actor.stop(130).expect_stderr("leaves: ");
     }
     client.check_nothing_lost();
-    learner.stop_ok();
+    learner.stop(130);
 }

@@ -79,7 +79,7 @@ fn processes_started_by_hand_leave_no_shared_memory() {
     // A client may hold shared memory that it has received.
     drop(client);
     for process in [actor, learner, server] {
-        process.stop_ok();
+        process.stop(130);
     }
     check_removed(&segments);
 }

@@ -32,7 +32,7 @@ fn a_replay_server_warns_if_it_may_not_open_enough_files() {
         "a replay server for 20 actors needs 128 open files, and the system allows 60: ",
     );
     server.wait_for_stderr("replay server listens on ");
-    server.stop_ok();
+    server.stop(130);
 }
 
 #[test]
@@ -44,7 +44,7 @@ fn a_file_that_may_not_grow_is_an_error_and_no_end() {
     server.wait_for_stderr("replay server listens on ");
     let (_learner, _actor) = (system.start_learner("run"), system.start_actor(0));
     server.wait_for_stderr("cannot be written: File too large (os error 27)");
-    server.stop_ok();
+    server.stop(130);
 }
 
 #[test]

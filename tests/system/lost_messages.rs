@@ -39,6 +39,8 @@ const TRANSITIONS: u64 = ACTORS as u64 * CHUNKS * STEPS as u64;
 /// How often each transition is sampled, on average. The probability that a given one is never drawn is exp(-64).
 const SAMPLES_PER_TRANSITION: u64 = 64;
 const ROWS: u32 = 16;
+/// The transitions in a chunk of an actor of a shard.
+const SHARD_STEPS: u32 = 8;
 /// One of this many batches, or parts of batches, is lost.
 const LOSES: u32 = 4;
 
@@ -226,27 +228,45 @@ fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
     deliver_all(arrival_rule, Duration::from_secs(15), true);
 }
 
-fn config(shards: u32) -> Config {
-    Config {
+/// Returns the empty shards of a run of `transitions_max` transitions, each with an actor.
+fn empty_shards(shards: u32, slack: u64, transitions_max: Option<u64>) -> Vec<Replay> {
+    let config = Config {
         shards,
-        transitions_max: Some(TRANSITIONS),
+        transitions_max,
+        slack_transitions: slack,
         ..tiny_replay::config(1_000)
+    };
+    let shard = |shard| {
+        let mut replay = Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap();
+        tiny_replay::join_actor(&mut replay, 0);
+        replay
+    };
+    (0..shards).map(shard).collect()
+}
+
+fn insert(replay: &mut Replay, sequence: u64) -> InsertReply {
+    let chunk = tiny_replay::chunk(&batches_spec(), 0, sequence, SHARD_STEPS);
+    replay.insert(&chunk)
+}
+
+/// Stores the chunks with these sequence numbers.
+fn fill_shard(replay: &mut Replay, sequences: Range<u64>) {
+    for sequence in sequences {
+        let stored = insert(replay, sequence);
+        assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
     }
 }
 
-/// Returns a shard that holds its share of the run.
-fn full_shard(shard: u32, shards: u32) -> Replay {
-    let mut replay = Replay::shard(&batches_spec(), &config(shards), ROWS, shard).unwrap();
-    tiny_replay::join_actor(&mut replay, 0);
-    fill_shard(&mut replay, 0..TRANSITIONS / 8 / u64::from(shards));
-    replay
-}
-
-/// Stores chunks of 8 transitions with these sequence numbers.
-fn fill_shard(replay: &mut Replay, sequences: Range<u64>) {
-    for sequence in sequences {
-        let stored = replay.insert(&tiny_replay::chunk(&batches_spec(), 0, sequence, 8));
-        assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
+/// Stores as many chunks as the rate limiter of each shard allows, until the run is over.
+fn play(replays: &[Arc<Mutex<Replay>>], over: &Shutdown) {
+    while !over.wait_timeout(Duration::from_millis(1)) {
+        for mut replay in replays.iter().map(|it| it.lock().unwrap()) {
+            let is_stored = |replay: &mut Replay| {
+                let sequence = replay.counts().inserted / u64::from(SHARD_STEPS);
+                matches!(insert(replay, sequence), InsertReply::Stored { .. })
+            };
+            while is_stored(&mut replay) {}
+        }
     }
 }
 
@@ -305,25 +325,36 @@ fn serve(shards: Vec<Replay>) -> Shards {
     }
 }
 
-/// Tests a replay of one shard, and a replay of three shards, whose batches have parts.
+/// Tests a replay of one shard, and a replay of three shards, whose batches have parts. Each shard stores all that its limiter allows, by
+/// counts of the others that are as old as the learner's last request, so that the run exceeds its length: by less than the documented bound.
 #[test]
 fn lost_batches_and_lost_parts_of_batches_do_not_count() {
+    let slack = 64;
     for shards in [1, 3] {
-        let mut served = serve((0..shards).map(|shard| full_shard(shard, shards)).collect());
+        let mut served = serve(empty_shards(shards, slack, Some(TRANSITIONS)));
+        let (replays, over) = (served.replays.clone(), Shutdown::default());
+        let ended = over.clone();
+        let actors = std::thread::spawn(move || play(&replays, &ended));
         let mut batches = 0;
         while let Some(ServedBatch { batch, parts }) = served.learner.next() {
             assert_eq!(batch.rows(), ROWS as usize);
             assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
             batches += 1;
         }
-        assert_eq!(batches * u64::from(ROWS), TRANSITIONS);
+        over.set();
+        actors.join().unwrap();
         let statuses = served.replays.iter().map(|replay| {
             let replay = replay.lock().unwrap();
             replay.check_valid();
             replay.status()
         });
         let status = ReplayStatus::merged(&statuses.collect::<Vec<_>>());
-        assert_eq!(status.rows_sampled, TRANSITIONS);
+        assert_eq!(status.rows_sampled, batches * u64::from(ROWS));
+        assert!(batches >= TRANSITIONS / u64::from(ROWS), "{status:#?}");
+        let excess_max = u64::from(shards) * (slack + u64::from(2 * ROWS + SHARD_STEPS));
+        let excess = 0..if shards == 1 { 1 } else { excess_max };
+        let found = status.transitions_inserted - TRANSITIONS;
+        assert!(excess.contains(&found), "{found} of {excess:?}");
         let lost = served.drawn.load(Ordering::Relaxed).div_ceil(LOSES);
         assert!(
             lost >= 5,
@@ -334,25 +365,11 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     }
 }
 
-/// Returns two empty shards of an endless run, each with an actor.
-fn endless_shards() -> Vec<Replay> {
-    let config = Config {
-        transitions_max: None,
-        ..config(2)
-    };
-    let shard = |shard| {
-        let mut replay = Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap();
-        tiny_replay::join_actor(&mut replay, 0);
-        replay
-    };
-    (0..2).map(shard).collect()
-}
-
 /// A shard that is empty at first, because its actors started late, is drawn from once it holds transitions, although the others never make
 /// the learner wait.
 #[test]
 fn a_shard_that_fills_late_is_asked() {
-    let mut shards = endless_shards();
+    let mut shards = empty_shards(2, 1_000, None);
     fill_shard(&mut shards[0], 0..8);
     let mut served = serve(shards);
     for batches in 0..1_000 {
@@ -375,8 +392,8 @@ fn a_shard_that_fills_late_is_asked() {
 /// A shard's inserts wait while its count of the other shard's rows is old. The next draw request to the shard updates the count.
 #[test]
 fn a_shard_that_waits_hears_what_the_other_gave() {
-    let slack = config(2).slack_transitions;
-    let mut shards = endless_shards();
+    let slack = 1_000;
+    let mut shards = empty_shards(2, slack, None);
     // Most batches are drawn from the first shard alone.
     fill_shard(&mut shards[0], 0..slack / 8);
     fill_shard(&mut shards[1], 0..1);
@@ -385,21 +402,21 @@ fn a_shard_that_waits_hears_what_the_other_gave() {
     for _ in 0..held / u64::from(ROWS) {
         served.learner.next().unwrap();
     }
-    let insert = |others| {
+    let insert_second = |others| {
         let mut replay = served.replays[1].lock().unwrap();
         if let Some(others) = others {
             replay.set_other_shards(others).unwrap();
         }
-        replay.insert(&tiny_replay::chunk(&batches_spec(), 0, 1, 8))
+        insert(&mut replay, 1)
     };
     let actors_ahead = ShardCounts {
         inserted: 2 * slack,
         rows_sampled: 0,
     };
-    let reply = insert(Some(actors_ahead));
+    let reply = insert_second(Some(actors_ahead));
     assert!(matches!(reply, InsertReply::Wait { .. }), "{reply:?}");
     wait_until("the shard's inserts wait no more", || {
-        matches!(insert(None), InsertReply::Stored { .. })
+        matches!(insert_second(None), InsertReply::Stored { .. })
     });
     served.learner.end();
 }

@@ -104,8 +104,8 @@ fn of_two_processes_with_one_role_the_second_waits_for_the_first_one_s_end() {
     let client = system.connect();
     client.wait_for_updates(10);
     let mut second = system.start_learner("second");
-    second.wait_for_stderr("another learner takes part in this run, which has one alone");
-    second.stop_ok();
+    second.wait_for_stderr("another learner takes part in this run, which has only one");
+    second.stop(130);
     assert!(system.run_folder("second").checkpoints().is_empty());
 
     let mut second = system.start_actor(3);
@@ -115,10 +115,10 @@ fn of_two_processes_with_one_role_the_second_waits_for_the_first_one_s_end() {
     // The first actor still plays.
     let before = client.replay_status().unwrap();
     client.wait_for_transitions(before.transitions_inserted);
-    actor.stop_ok().expect_stderr("leaves: ");
+    actor.stop(130).expect_stderr("leaves: ");
     second.wait_for_stderr("actor 3 steps 4 environments");
-    second.stop_ok();
+    second.stop(130);
     let status = client.replay_status().unwrap();
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
-    learner.stop_ok();
+    learner.stop(130);
 }

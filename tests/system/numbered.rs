@@ -45,22 +45,16 @@ fn deliver_chunks(run: RunClient, first: ChunkHeader) {
 
 /// Returns the numbers of all transitions in the replay of a server that has ended. Draws rows until each number was seen.
 fn stored_numbers(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
-    let mut config: Config = Settings::parse(config_toml)
-        .unwrap()
-        .table("replay")
-        .unwrap();
+    let settings = Settings::parse(config_toml).unwrap();
+    let mut config: Config = settings.table("replay").unwrap();
     config.replay_ratio = 1e6;
     let args = PersistArgs {
         dir: system.path("replay"),
-        shard: 0,
-        segment_bytes: None,
-        mark: None,
+        ..PersistArgs::default()
     };
     let (mut replay, recovery) = Replay::open(&args, spec, &config, ROWS).unwrap();
-    assert!(
-        recovery.found && recovery.warnings.is_empty(),
-        "{recovery:?}"
-    );
+    let is_whole = recovery.found && recovery.warnings.is_empty();
+    assert!(is_whole, "{recovery:?}");
     replay.check_valid();
     let batches = TRANSITIONS * DRAWS_PER_TRANSITION / u64::from(ROWS);
     tiny_replay::drawn_returns(&mut replay, batches, ROWS)

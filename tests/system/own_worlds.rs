@@ -143,14 +143,14 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let learner = system.start_learner("run");
     system
         .start_actor(0)
-        .fails("an actor starts none because a replay server says so")
+        .fails("an actor starts no program that only the replay server names")
         .expect_stderr("--env \"exec:exec python3 ");
     let actor = |flags: &str| system.start_process(&system.connect_args(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");
     // An actor whose world takes long to start stops at once.
     let mut starting = actor("--id 2 --env 'exec:echo starts >&2; exec sleep 100'");
     starting.wait_for_stderr("starts");
-    starting.stop().expect_code(130);
+    starting.stop(130);
     // The same world by another command, as another machine may have it. This world will hang.
     let mut hanging = actor(&format!("--id 1 --env '{}'", numbered_world("hang 50")));
     let client = system.connect();
@@ -166,8 +166,8 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     hanging.kill();
     wait_until("the world's end", || worlds() == 0);
     drop(client);
-    learner.stop_ok();
-    server.stop_ok();
+    learner.stop(130);
+    server.stop(130);
     system.wait_until_all_have_ended();
 }
 

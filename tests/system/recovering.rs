@@ -55,9 +55,8 @@ fn write_log(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     (config.slack_transitions, config.transitions_max) = (1 << 40, None);
     let args = PersistArgs {
         dir: folder.to_owned(),
-        shard: 0,
         segment_bytes: Some(1 << 18),
-        mark: None,
+        ..PersistArgs::default()
     };
     let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
     tiny_replay::join_actor(&mut replay, 9);
@@ -79,7 +78,7 @@ fn prepare_log(system: &TestSystem, kept: u64) -> (RunSpec, String) {
     let client = system.connect();
     let spec = write_log(kept, &system.path("replay"), &client.config_toml);
     drop(client);
-    server.stop_ok();
+    server.stop(130);
     (spec, format!("{flags} --replay-dir replay"))
 }
 
@@ -185,9 +184,9 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     watched.wait_ok();
     let seen = system.run_folder("seen").summary();
     assert_eq!(seen.updates, planned_updates(LONG));
-    learner.stop_ok();
+    learner.stop(0);
     drop(client);
-    let exit = server.stop_ok();
+    let exit = server.stop(0);
     exit.expect_stderr("continues with the replay in replay");
 }
 
@@ -200,14 +199,14 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     let slow = slow_down(&mut server);
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr(WAITING_LOG);
-    let exit = server.stop_ok();
-    exit.expect_stderr("it was told to end while it read its replay back");
+    let exit = server.stop(130);
+    exit.expect_stderr("it was stopped while it read its replay back");
     drop(slow);
-    actor.stop_ok();
+    actor.stop(130);
     let server = system.start_replay_server(&serve);
     let replay = system.connect().replay_status().unwrap();
     assert_eq!(replay.transitions_inserted, SHORTER);
-    server.stop_ok();
+    server.stop(130);
 
     // A server with an unreadable log exits with an error, and no process waits for it any more.
     for entry in fs::read_dir(system.path("replay")).unwrap() {
@@ -225,7 +224,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
     let mut process = system.start(&system.local_args(&format!("--durable {}", flags(SHORTER))));
     system.connect().wait_for_updates(10);
-    process.stop().expect_code(130);
+    process.stop(130);
     let run = system.run_folder("run");
     let config = system.read("run/config.toml");
     write_log(SHORTER, &run.path().join("replay"), &config);
@@ -259,6 +258,7 @@ fn roles_are_told_too() {
     check_has(&status_text(&system), &["reads its replay back"]);
     drop(slow);
     actor.wait_ok();
-    learner.stop_ok();
-    server.stop_ok();
+    system.connect().wait_for_the_last_update();
+    learner.stop(0);
+    server.stop(0);
 }

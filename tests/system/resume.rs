@@ -129,7 +129,7 @@ fn what_cannot_be_resumed() {
         local --resume run --frames 2000 --set run.n_step=5 => belongs to a run with specification
         local --resume run --frames 2000 --set world.reward_right=2 => world.reward_right cannot change in a run: resume without this --set
         local --resume run --frames 2000 --set model.atoms=31 => was saved with model.atoms = 51
-        local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => in memory alone; add --durable
+        local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => only in memory; add --durable
         local --resume step --frames 2000 --set local.actors=3 => but this run in lockstep has 1
         local --resume rainbow --frames 1280 --set replay.sampling.alpha=0 => replay.sampling.alpha = 0, but the replay that is kept has its priorities to the power of 0.5
         local --resume kept --frames 2000 --durable => lacks what the run did later

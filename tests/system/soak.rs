@@ -59,7 +59,7 @@ fn nothing_grows() {
                 deaths += 1;
             }
             Some(actor) => {
-                actor.stop_ok();
+                actor.stop(130);
                 ends += 1;
             }
         }
@@ -94,10 +94,9 @@ fn nothing_grows() {
     }
     assert!(last.2 <= first.2 + 3 * ACTORS, "{first:?}, then {last:?}");
     drop(client);
-    actors.into_iter().flatten().for_each(|actor| {
-        actor.stop_ok();
-    });
-    learner.stop_ok();
-    server.stop_ok();
+    let left = actors.into_iter().flatten();
+    left.for_each(|actor| drop(actor.stop(130)));
+    learner.stop(130);
+    server.stop(130);
     assert_eq!(system.running_processes(), []);
 }

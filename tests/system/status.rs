@@ -32,12 +32,12 @@ fn missing_processes_are_named_with_what_to_do() {
     let words = ["chain, c51: frames 0/", &learn, &act];
     check_has(&status_text(&system), &words);
     // The server also logs this itself.
-    server.wait_for_stderr("no learner has joined yet, waiting since");
+    server.wait_for_stderr("no learner has joined yet; waiting for");
 
     let mut learner = system.start_learner("run");
     wait_for_status(&system, &["learner up ", "warm-up 0/", &act]);
-    learner.wait_for_stderr("waiting for a batch since 10 s: warm-up 0/");
-    server.wait_for_stderr("no actor has joined yet, waiting since");
+    learner.wait_for_stderr("waiting for a batch for 10 s: warm-up 0/");
+    server.wait_for_stderr("no actor has joined yet; waiting for");
 
     let actors = [system.start_actor(0), system.start_actor(5)];
     let words = ["actor-0 ", "actor-5 ", "learns (", "nothing is missing"];

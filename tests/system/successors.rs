@@ -50,15 +50,15 @@ fn killed_learners_cost_no_update_of_the_plan() {
     assert_eq!(learned.updates, planned, "{replay:#?}");
     assert_eq!(replay.rows_sampled, 16 * planned);
     actor.wait_ok();
-    learner.stop_ok().expect_stderr("resumed after ");
+    learner.stop(0).expect_stderr("resumed after ");
     drop(client);
-    server.stop_ok();
+    server.stop(0);
 
     // A run with other settings cannot resume from the checkpoint in the folder.
     let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let learner = system.start_learner("run");
     learner.fails("resume with the settings it was made with");
-    server.stop_ok();
+    server.stop(130);
 }
 
 /// Starts a run by hand, and waits until the learner has made more than 75 updates; the first checkpoint is due after 1,000.
@@ -70,7 +70,7 @@ fn start_between_checkpoints(system: &TestSystem, flags: &str) -> (Process, Proc
     let client = system.connect();
     let actor = system.start_actor(0);
     client.wait_for_updates(75);
-    actor.stop();
+    actor.stop(130);
     (server, learner, client)
 }
 
@@ -101,10 +101,10 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let server = system.start_replay_server(&format!(
         "--agent c51 {LONG} --set learner.checkpoint_period_updates=1000"
     ));
-    learner.fails("this replay server does not know the learner: it was started again");
+    learner.fails("this replay server does not know the learner: the server has restarted");
     let saved = system.run_folder("run").saved_updates();
     assert!(saved > 75);
-    actor.fails("does not know this life of actor 1: it was started anew");
+    actor.fails("does not know this incarnation of actor 1: the server has restarted");
 
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);
@@ -116,7 +116,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     assert!(replay.rows_sampled >= 16 * saved, "{replay:#?}");
     assert_eq!(replay.updates_relearned, 0, "{replay:#?}");
     for process in [actor, learner, server] {
-        process.stop_ok();
+        process.stop(130);
     }
 }
 
@@ -137,8 +137,8 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
         replay.updates_relearned > 75
     });
     assert!(replay.rows_unlearned >= 16 * 75, "{replay:#?}");
-    restarted.stop_ok();
-    server.stop_ok();
+    restarted.stop(130);
+    server.stop(130);
     drop(client);
 
     let server = system.start_replay_server(&format!("--agent c51 {SHORT}"));
@@ -150,5 +150,5 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     system.fails(&args(""), "the run is finished, with 540 updates");
     learner.wait_ok();
     actor.wait_ok();
-    server.stop_ok();
+    server.stop(0);
 }

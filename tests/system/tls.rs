@@ -151,8 +151,8 @@ fn strangers_at_a_replay_server() {
     // The strangers do not disturb admitted processes.
     let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
     observer.wait_for_updates(10);
-    actor.stop_ok();
-    learner.stop_ok();
+    actor.stop(130);
+    learner.stop(130);
 }
 
 /// A process does not join a stranger in place of its replay server, and names the endpoint.
@@ -191,7 +191,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         (name, endpoint, listening, actor)
     });
     for (name, endpoint, listening, actor) in rows {
-        let words = format!("no replay server lets this process in on {endpoint}: ");
+        let words = format!("no replay server accepts this process at {endpoint}: ");
         let ended = actor.wait();
         assert_eq!(ended.code, Some(1), "a certificate that is {name}");
         ended

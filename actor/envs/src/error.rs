@@ -19,7 +19,7 @@ pub enum EnvError {
     #[error("{0}")]
     NotSaved(String),
     /// Bytes that are not a saved state of this world.
-    #[error("no state of this world: {0}")]
+    #[error("the bytes are not a state of this world: {0}")]
     State(String),
 }
 

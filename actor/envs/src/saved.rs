@@ -43,7 +43,7 @@ pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvEr
 
 /// Returns an error unless `holds`; `what` names the part of the state that does not fit the settings.
 pub(crate) fn ensure_fits(holds: bool, what: &str) -> Result<(), EnvError> {
-    let wrong = || EnvError::State(format!("{what} is none of these settings"));
+    let wrong = || EnvError::State(format!("{what} does not fit these settings"));
     holds.then_some(()).ok_or_else(wrong)
 }
 
@@ -130,7 +130,7 @@ pub(crate) mod tests {
             (ising(9), state(chain(), ENVS)),
         ] {
             let mut world = config.build(ENVS, 3, 0).unwrap();
-            fails(world.load(&state.unwrap()), &["no state of this world"]);
+            fails(world.load(&state.unwrap()), &["not a state of this world"]);
         }
     }
 }

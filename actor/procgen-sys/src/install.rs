@@ -108,7 +108,7 @@ impl Engine {
         let reason = if !root.exists() {
             "it is not installed"
         } else if !engine.library.is_file() || !engine.assets.is_dir() {
-            "it is damaged, libenv.so or its pictures are gone"
+            "it is damaged: libenv.so or its pictures are missing"
         } else {
             for path in [&cache.folder, &root, &engine.library, &engine.assets] {
                 check_private(path)?;

@@ -73,7 +73,7 @@ impl Delivery {
         let progress = self.progress();
         let in_flight = progress.in_flight;
         match progress.is_held {
-            true if in_flight >= 1 => Some("waits until the rate limiter lets its chunk in"),
+            true if in_flight >= 1 => Some("waits until the rate limiter accepts its chunk"),
             false if in_flight >= self.chunks_max => Some("waits for the replay server's answer"),
             _ => None,
         }

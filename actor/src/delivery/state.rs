@@ -65,7 +65,7 @@ impl DeliveryState {
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum DeliveryError {
-    #[error("the replay server was out of reach for {within:?}")]
+    #[error("the replay server was unreachable for {within:?}")]
     Unreachable {
         within: Duration,
         source: SessionError,

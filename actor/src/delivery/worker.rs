@@ -216,7 +216,7 @@ impl DeliveryWorker {
             // The reply is from when an earlier chunk waited; all earlier chunks are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.prepare_resend()),
             Ok(InsertReply::Refused { why }) => Err(DeliveryError::Failed(format!(
-                "the replay server refused a chunk: {why}"
+                "the replay server rejected a chunk: {why}"
             ))),
             Err(SessionError::Recovering(recovering)) => {
                 self.silence.record_answer();
@@ -235,7 +235,7 @@ impl DeliveryWorker {
                     return Err(DeliveryError::Unreachable { within, source: e });
                 }
                 if let Some(suppressed) = self.retry_log.admit() {
-                    tracing::warn!("chunk {sequence} will be sent again: {e}{suppressed}");
+                    tracing::warn!("retrying chunk {sequence}: {e}{suppressed}");
                 }
                 // A chunk without a reply may not have arrived, whatever an earlier reply said.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
@@ -327,7 +327,7 @@ impl DeliveryWorker {
             } else {
                 let chunk = self.client.encode_with(header, it.payload.clone())?;
                 tracing::debug!(
-                    "chunk {} goes out: {} transitions by weights {}",
+                    "chunk {} is sent: {} transitions by weights {}",
                     header.sequence,
                     header.transitions(),
                     header.weights_version

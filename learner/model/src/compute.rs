@@ -146,7 +146,7 @@ pub enum DeviceError {
     Name(String),
     /// Only this project's CPU kernels support another precision than f32.
     #[error(
-        "{device} computes in f32 alone: set learner.precision = \"f32\", or compute {precision} on the CPU"
+        "{device} computes only in f32: set learner.precision = \"f32\", or compute {precision} on the CPU"
     )]
     Precision {
         device: DeviceName,

@@ -89,7 +89,7 @@ impl InputSize {
             return Ok(None);
         }
         Err(ModelError::Config(format!(
-            "the network takes {read:?} of {whole:?}, and frames of {sent:?} travel"
+            "the network takes {read:?} of {whole:?}, but the frames are {sent:?}"
         )))
     }
 }

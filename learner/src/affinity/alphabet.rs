@@ -26,7 +26,7 @@ impl Alphabet {
         for (raw, &visible) in map.iter().enumerate() {
             if map.get(usize::from(visible)) != Some(&visible) {
                 return Err(AffinityError(format!(
-                    "action {raw} amounts to {visible}, which does not stand for itself"
+                    "action {raw} maps to {visible}, which does not map to itself"
                 )));
             }
         }

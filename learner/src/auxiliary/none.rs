@@ -19,7 +19,7 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
     settings.check_no_own_table()?;
     if settings.condition_on_action {
         return Err(UpdateError::AuxiliaryLoss(
-            "auxiliary_loss = none has no Psi that could be given the action: set condition_on_action to false, or take another agent".into(),
+            "auxiliary_loss = none has no Psi to condition on the action: set condition_on_action to false, or take another agent".into(),
         ));
     }
     let active = settings.lambda.active_pairs();

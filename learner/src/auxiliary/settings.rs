@@ -119,7 +119,7 @@ impl AuxiliarySettings<'_> {
             return Ok(());
         }
         Err(UpdateError::AuxiliaryLoss(format!(
-            "auxiliary_loss = {name} has no numbers of its own: take {name} out of learner.update"
+            "auxiliary_loss = {name} has no settings: take {name} out of learner.update"
         )))
     }
 

@@ -51,12 +51,12 @@ pub enum CheckpointError {
         expected: String,
     },
     /// No learner could be restored from the state, for example because a weight is not finite.
-    #[error("nothing is saved, and the newest checkpoint stays the newest: {0}")]
+    #[error("the checkpoint was not saved, and the newest one is still that before it: {0}")]
     Unsound(UpdateError),
     /// The state does not fit the network or the settings.
     #[error("checkpoint: {0}")]
     Update(#[from] UpdateError),
-    #[error("another learner saves in {}: wait until it has ended, or choose another folder", .0.display())]
+    #[error("another learner saves in {}: wait until it has exited, or choose another folder", .0.display())]
     InUse(PathBuf),
     #[error("at least one checkpoint must be kept")]
     KeepNone,

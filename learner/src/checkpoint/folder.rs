@@ -126,7 +126,7 @@ pub(super) fn prune(path: &Path) {
     let temporary = with_suffix(path, ".tmp");
     match fs::rename(path, &temporary) {
         Ok(()) => remove_or_warn(&temporary),
-        Err(e) => tracing::warn!("an old checkpoint stays: {}", io_error("move", path)(e)),
+        Err(e) => tracing::warn!("an old checkpoint is left: {}", io_error("move", path)(e)),
     }
 }
 
@@ -141,7 +141,7 @@ pub(super) fn remove_or_warn(folder: &Path) {
     match fs::remove_dir_all(folder) {
         Err(why) if why.kind() != io::ErrorKind::NotFound => {
             let why = io_error("remove", folder)(why);
-            tracing::warn!("a checkpoint that is not needed stays: {why}");
+            tracing::warn!("a checkpoint that is not needed was not removed: {why}");
         }
         _ => {}
     }

@@ -14,7 +14,7 @@ pub enum BatchError {
         source: Box<Self>,
     },
     /// The replay server rejects the request, and would reject a retry.
-    #[error("the replay server refuses: {0}")]
+    #[error("the replay server rejects the learner: {0}")]
     Refused(String),
     /// A request could not be sent, or its reply did not arrive.
     #[error(transparent)]

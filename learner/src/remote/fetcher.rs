@@ -179,7 +179,7 @@ impl Fetcher {
                         if !self.shared.shutdown.is_set()
                             && let Some(more) = self.log_limiter.admit()
                         {
-                            tracing::warn!("asking for a batch again: {e}{more}");
+                            tracing::warn!("retrying the request for a batch: {e}{more}");
                         }
                         self.shared.shutdown.wait_timeout(RETRY_PAUSE);
                         continue;
@@ -316,7 +316,7 @@ impl Fetcher {
                 .map(|(shard, state)| format!("{} rows of shard {shard}", state.pending_rows))
                 .collect();
             tracing::warn!(
-                "all transitions are in, and the last batch lacks {} since {} s: it is left out",
+                "all transitions are stored, and the last batch has lacked {} for {} s: it is skipped",
                 left.join(" and "),
                 LAST_BATCH_MAX.as_secs()
             );

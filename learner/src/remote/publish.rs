@@ -239,7 +239,7 @@ impl OutboxSender {
                     break;
                 }
                 if let Some(more) = self.log_limiter.admit() {
-                    tracing::warn!("the {} did not arrive, trying again: {e}{more}", self.what);
+                    tracing::warn!("the {} did not arrive, retrying: {e}{more}", self.what);
                 }
             }
         }

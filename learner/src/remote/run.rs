@@ -57,7 +57,7 @@ pub struct RunArgs {
 /// error, it saves what it has learned.
 ///
 /// # Errors
-/// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that refuses.
+/// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that rejects writes.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let credentials = args.credentials.as_ref();
@@ -147,7 +147,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         shutdown,
     );
     if learned.is_err() {
-        tracing::info!("ends early, after {} updates", learner.updates());
+        tracing::info!("stops early, after {} updates", learner.updates());
     }
     activity.begin("saves its last checkpoint");
     // Transitions stored since the last batch count too.
@@ -205,7 +205,7 @@ fn learn(
                 let since = waiting_since.elapsed();
                 if since > log_after {
                     let since = since.as_secs();
-                    tracing::info!("waiting for a batch since {since} s: {waiting}");
+                    tracing::info!("waiting for a batch for {since} s: {waiting}");
                     log_after *= 2;
                 }
                 continue;

@@ -91,7 +91,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
             let said = try_save(&run, folder.path(), 1, DESCRIPTION);
             let said = said.unwrap_err().to_string();
             assert!(
-                said.starts_with("nothing is saved") && said.contains(name),
+                said.starts_with("the checkpoint was not saved") && said.contains(name),
                 "{said}"
             );
             let left: Vec<_> = fs::read_dir(folder.path()).unwrap().collect();

@@ -134,7 +134,7 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
         let (agent, said) = diverged_agent(&Compute::CPU, name);
         let said = said.unwrap_err();
         assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
-        let beyond = format!("update 1 took {name} beyond");
+        let beyond = format!("update 1 made {name} infinite or NaN");
         check_says(said, &[&beyond, "newest checkpoint"]);
         check_says(agent.weights().unwrap_err(), &[name, "inf"]);
         // With candle's operations, the error shows only when the weights are exported.

@@ -102,7 +102,7 @@ impl BatchHeader {
             }
             if let Some(number) = stacked.first_unknown(self.state_columns(payload)) {
                 return Err(CodecError::Header(format!(
-                    "a state of frame {number}, of {} that travel",
+                    "a state has frame {number}, but the batch has {} frames",
                     stacked.frames
                 )));
             }
@@ -119,7 +119,7 @@ impl BatchHeader {
         let mut chances = self.f32s(Column::Probability, payload);
         if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
             return Err(CodecError::Header(format!(
-                "a row that was drawn with the probability {chance}"
+                "a row has the probability {chance}, which is not above 0 and at most 1"
             )));
         }
         Ok(())

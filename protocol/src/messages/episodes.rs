@@ -59,7 +59,7 @@ impl EpisodesReply {
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.next_since() > self.ended || self.episodes.len() > EPISODES_MAX {
             return Err(CodecError::Header(format!(
-                "{} episodes after {}, where {} ended",
+                "{} episodes after {}, but only {} have ended",
                 self.episodes.len(),
                 self.before,
                 self.ended

@@ -54,7 +54,7 @@ impl PriorityUpdate {
             let good = |priority: &f32| priority.is_finite() && *priority >= 0.0;
             if let Some(at) = part.priorities.iter().position(|it| !good(it)) {
                 return Err(CodecError::Header(format!(
-                    "transition {} has the priority {}, which is not a number from 0 on",
+                    "transition {} has the priority {}, which is not a number of at least 0",
                     part.transitions[at], part.priorities[at]
                 )));
             }

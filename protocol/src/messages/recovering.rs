@@ -56,7 +56,7 @@ impl Recovering {
         let since_s = self.progress.since_s;
         if !since_s.is_finite() || since_s < 0.0 {
             return Err(CodecError::Header(format!(
-                "a recovery that began {since_s} s ago"
+                "the recovery began {since_s} s ago, which is not possible"
             )));
         }
         check_no_payload(payload)

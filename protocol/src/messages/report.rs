@@ -100,7 +100,7 @@ impl Report {
         let times = [self.since_s, warning.map_or(0.0, |warning| warning.age_s)];
         if times.iter().any(|it| !it.is_finite() || *it < 0.0) {
             return Err(CodecError::Header(format!(
-                "a report of {times:?} seconds ago"
+                "the report gives {times:?} s, which are not possible times"
             )));
         }
         check_no_payload(payload)

@@ -158,7 +158,7 @@ impl WeightsAssembly {
             || piece.len() != left.min(PIECE_BYTES)
         {
             return Err(CodecError::Header(format!(
-                "{} bytes at {offset} of weights {} came where {} at {} of weights {} are due",
+                "received {} bytes at {offset} of weights {}, expected {} at {} of weights {}",
                 piece.len(),
                 weights.version,
                 left.min(PIECE_BYTES),

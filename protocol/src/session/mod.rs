@@ -177,7 +177,7 @@ fn open_with_settings(
             if why.contains(NO_LISTENER_TEXT) {
                 return Err(why);
             }
-            tracing::debug!("trying again without shared memory: {why}");
+            tracing::debug!("retrying without shared memory: {why}");
             open_once("false", connect_ms)
         })
     };
@@ -190,7 +190,7 @@ fn open_with_settings(
         SessionError::Failed(match endpoints.connect.iter().any(|it| is_quic(it)) {
             // zenoh does not tell a missing listener from a rejected certificate; its log on the rejecting side does.
             true => format!(
-                "no replay server lets this process in on {connect}: is it running, with --tls-dir, and is the endpoint right (its port is \
+                "no replay server accepts this process at {connect}: is it running, with --tls-dir, and is the endpoint right (its port is \
                  one of UDP)? If so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay \
                  server's log say why"
             ),
@@ -207,12 +207,12 @@ fn open_with_settings(
     // A process of the run that is slow on a busy machine sends nothing; a foreign server may introduce itself.
     let mut listening = endpoints.connect.iter();
     if let Some(words) = listening.find_map(|it| reach::read_greeting(it)) {
-        return Err(foreign_server_error(&format!("it says {words:?}")));
+        return Err(foreign_server_error(&format!("it sent {words:?}")));
     }
-    tracing::debug!("trying again: {why}");
+    tracing::debug!("retrying: {why}");
     open(&milliseconds(CONNECT_MAX.saturating_sub(FIRST_CONNECT_MAX))).map_err(|why| {
         match why.contains(NO_LISTENER_TEXT) {
-            true => foreign_server_error("it says nothing that could be understood"),
+            true => foreign_server_error("it sent nothing that driml can read"),
             false => fail(why),
         }
     })

@@ -159,13 +159,13 @@ pub fn ask(
 /// Answers `query` with `payload`. If the requester has gone away, this is logged and ignored.
 pub fn answer(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply(query.key_expr().clone(), payload).wait() {
-        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
+        tracing::debug!("{}: the requesting process is gone: {e}", query.key_expr());
     }
 }
 
 /// Answers `query` with the error `payload`, because it cannot be handled now. The requester retries.
 pub(crate) fn reply_error(query: &Query, payload: ZBytes) {
     if let Err(e) = query.reply_err(payload).wait() {
-        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
+        tracing::debug!("{}: the requesting process is gone: {e}", query.key_expr());
     }
 }

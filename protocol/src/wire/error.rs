@@ -24,13 +24,13 @@ pub enum CodecError {
     )]
     RunSpec { theirs: u64, ours: u64 },
     #[error(
-        "the message speaks for {} at the key {key:?}: each process speaks for itself alone",
+        "the message is in the name of {}, but came at the key {key:?}: a process sends only in its own name",
         .actor.map_or("the learner".into(), |actor| format!("actor {actor}"))
     )]
     Actor { actor: Option<u32>, key: String },
     #[error("the message's checksum is wrong: it was damaged on the way")]
     Checksum,
-    #[error("the message's header makes no sense: {0}")]
+    #[error("the message's header is invalid: {0}")]
     Header(String),
     #[error(
         "the message has {have} bytes, more than the {max} allowed: use smaller chunks or batches"

@@ -140,11 +140,11 @@ fn stacks_that_cannot_be_are_refused() {
         let mut wrong = stacked_batch(None);
         wrong.states_mut().set_stack(5, &[0, number]);
         let (header, payload) = wrong.into_payload();
-        let (said, why) = (
-            said(header, payload),
-            format!("a state of frame {number}, of 5"),
+        let (said, why) = (said(header, payload), format!("a state has frame {number}"));
+        assert!(
+            said.contains(&format!("{why}, but the batch has 5")),
+            "{said}"
         );
-        assert!(said.contains(&format!("{why} that travel")), "{said}");
     }
     let (header, payload) = stacked_batch(None).into_payload();
     let changes: [fn(&mut StackedFrames); 10] = [

@@ -235,7 +235,7 @@ fn what_no_world_gives_is_refused() {
         let said = decode(change).unwrap_err().to_string();
         assert!(said.contains(words), "{said}");
     };
-    refused(&|it| it[36 + 5] = 4, "end 4");
+    refused(&|it| it[36 + 5] = 4, "no end 4");
     for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let reward = reward.to_le_bytes();
         refused(&|it| it[42 + 4..42 + 8].copy_from_slice(&reward), "row 1");
@@ -274,7 +274,7 @@ fn what_no_process_says_is_refused() {
     let mut fewer = priority_update();
     fewer.parts[0].priorities.pop();
     let mut refused = vec![
-        (refusal(&episodes, &[]), "2 episodes after 7, where 8"),
+        (refusal(&episodes, &[]), "2 episodes after 7, but only 8"),
         (refusal(&upload, b"those"), "not the one announced"),
         (refusal(&good, &[1]), "1 bytes of payload follow"),
         (refusal(&recovering(1.0), &[1]), "1 bytes of payload follow"),
@@ -285,21 +285,21 @@ fn what_no_process_says_is_refused() {
     }
     for time in [f64::NAN, f64::INFINITY, -1.0] {
         for report in [report("", time, "", 0.0), report("", 0.0, "", time)] {
-            refused.push((refusal(&report, &[]), "seconds ago"));
+            refused.push((refusal(&report, &[]), "which are not possible times"));
         }
-        refused.push((refusal(&recovering(time), &[]), "a recovery that began"));
+        refused.push((refusal(&recovering(time), &[]), "the recovery began"));
     }
     for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut update = priority_update();
         update.parts[0].priorities[1] = priority;
-        refused.push((refusal(&update, &[]), "not a number from 0 on"));
+        refused.push((refusal(&update, &[]), "not a number of at least 0"));
     }
     for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
         let mut batch = prioritised_batch();
         batch.set_draws(&[(1, 0.5), (2, chance), (3, 0.5)]);
         let (header, payload) = batch.into_payload();
         let said = refusal(&BatchReply::Batch(header), &payload);
-        refused.push((said, "was drawn with the probability"));
+        refused.push((said, "which is not above 0 and at most 1"));
     }
     for (said, words) in refused {
         assert!(said.contains(words), "{said}");

@@ -104,7 +104,7 @@ impl Actors {
         };
         if !self.actors.contains_key(&actor) && self.actors.len() >= ACTORS_MAX {
             return Err(format!(
-                "actor {actor} is one more than the {ACTORS_MAX} that a run may have: use the numbers of actors that have ended"
+                "actor {actor} is one too many, as a run has at most {ACTORS_MAX}: use the number (--id) of an actor that has exited"
             ));
         }
         let known = self.actors.entry(actor).or_insert_with(|| Actor {
@@ -138,8 +138,8 @@ impl Actors {
             Some(known) if known.current.incarnation == incarnation => Ok(known),
             Some(known) if known.is_past(incarnation) => Err(replaced_error(actor)),
             _ => Err(format!(
-                "this replay server does not know this life of actor {actor}: it was started anew since the actor joined, \
-                 and what it held is gone; start the actor again"
+                "this replay server does not know this incarnation of actor {actor}: the server has restarted since \
+                 the actor joined, and has lost its transitions; start the actor again"
             )),
         }
     }
@@ -165,7 +165,7 @@ impl Actors {
         }
         if header.sequence > 0 && !actor.fits_streams(header) {
             return Err(format!(
-                "actor {number} sends {streams} streams after {}; their number must not change before it starts anew",
+                "actor {number} sends {streams} streams after {}; their number changes only when the actor restarts",
                 actor.streams.len()
             ));
         }
@@ -207,7 +207,7 @@ impl Actors {
             it.streams.len() > STREAMS_MAX as usize || it.past.len() > PAST_INCARNATIONS_MAX
         };
         if self.actors.len() > ACTORS_MAX || self.actors.values().any(too_many) {
-            return Err("a state with more actors, lives or streams than a run may have");
+            return Err("the state has more actors, incarnations or streams than a run may have");
         }
         // A transition has at most one successor.
         let mut followed = BTreeSet::new();
@@ -215,7 +215,7 @@ impl Actors {
         let mut after = streams.filter_map(|it| it.link.previous());
         match after.all(|after| after < inserted && followed.insert(after)) {
             true => Ok(()),
-            false => Err("a state with streams that follow on nothing"),
+            false => Err("the state has streams without the transition that they follow"),
         }
     }
 
@@ -265,7 +265,7 @@ impl Actors {
         let known = self.actors.get_mut(&actor).into_iter();
         let mut states = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let state = states.find(|it| it.incarnation == leave.incarnation);
-        let state = state.ok_or_else(|| format!("no such life of actor {actor} has joined"))?;
+        let state = state.ok_or_else(|| format!("no such process joined as actor {actor}"))?;
         if std::mem::replace(&mut state.has_left, true) {
             return Ok(None);
         }

@@ -139,7 +139,7 @@ impl Statistics {
             && returns.known <= ended;
         match fits {
             true => Ok(()),
-            false => Err("a state with more episodes than have ended"),
+            false => Err("the state has more episodes than have ended"),
         }
     }
 

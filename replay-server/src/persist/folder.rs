@@ -37,9 +37,9 @@ pub enum PersistError {
     #[error("{path} {1}", path = .0.display())]
     Unusable(PathBuf, String),
     /// The log cannot be rolled back to a mark: this file, its segment, is missing or damaged.
-    #[error("{} is missing or damaged: the replay cannot go back to where the checkpoint was made", .0.display())]
+    #[error("{} is missing or damaged: the replay cannot be rolled back to the checkpoint", .0.display())]
     NoMark(PathBuf),
-    #[error("it was told to end while it read its replay back; what is kept was not changed")]
+    #[error("it was stopped while it read its replay back; its files are unchanged")]
     Stopped,
     #[error(transparent)]
     Config(#[from] driml_protocol::config::ConfigError),

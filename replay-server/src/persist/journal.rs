@@ -292,7 +292,7 @@ impl Journal {
         self.rotate_failed_at = Some(Instant::now());
         if let Some(more) = self.log_limiter.admit() {
             tracing::error!(
-                "no new file can be begun in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
+                "no new file can be created in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
                  writable{more}",
                 self.folder.path.display()
             );
@@ -305,7 +305,7 @@ impl Journal {
         self.rotate(snapshot);
         let mark = Mark(self.newest_segment().number);
         if mark.0 == before {
-            let full = io::Error::other("it refuses to be written, as the log says");
+            let full = io::Error::other("its log cannot be written; the process's log says why");
             return Err(io_error("marking", &self.folder.path)(full));
         }
         let flushed = self.syncer.try_flush();

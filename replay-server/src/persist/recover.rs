@@ -211,7 +211,7 @@ impl LogReader<'_> {
         let is_prioritised = self.replay.config.sampling.is_prioritised();
         if self.mark == Some(Mark(number)) {
             if snapshot.rows.is_prioritised() != is_prioritised {
-                let why = "replay.sampling is another rule than it was".into();
+                let why = "replay.sampling differs from the rule that was used before".into();
                 return Err(unusable(why));
             }
             self.position.mark = Some((Mark(number), snapshot.oldest));
@@ -223,7 +223,7 @@ impl LogReader<'_> {
         self.replay.restore(snapshot).map_err(unusable)?;
         if !is_first && first_transition > stored {
             self.warn(format!(
-                "the transitions {stored} to {} are gone: something before {name} is damaged or missing. All others are there, and all \
+                "the transitions {stored} to {} are lost: something before {name} is damaged or missing. All others are there, and all \
                  counts are right",
                 first_transition - 1
             ));
@@ -245,7 +245,7 @@ impl LogReader<'_> {
             )),
             Ok(_) => {}
             Err(_) if !is_last => self.warn(format!(
-                "{name} is damaged at byte {at}: {cut} bytes of it are of no use"
+                "{name} is damaged at byte {at}: {cut} bytes of it cannot be used"
             )),
             // No actor was told that this record is stored.
             Err(RecordError::Torn) => tracing::info!(
@@ -278,7 +278,7 @@ impl LogReader<'_> {
             };
             let applied = match !is_closed && record.ordinal == self.position.next_ordinal {
                 true => self.apply(&record),
-                false => Err("it is not the next one".into()),
+                false => Err("it is not the next record".into()),
             };
             if let Err(why) = applied {
                 tracing::debug!("record {}: {why}", record.ordinal);
@@ -322,7 +322,7 @@ impl LogReader<'_> {
 
     fn finish(mut self) -> Result<(LogPosition, RecoveryReport), PersistError> {
         let unusable = |why: String| {
-            let why = format!("cannot be used: {why}; to begin a new replay there, remove them");
+            let why = format!("cannot be used: {why}; to begin a new replay, remove its segments");
             Err(PersistError::Unusable(self.folder.path.clone(), why))
         };
         if !self.recovery.found && !self.recovery.warnings.is_empty() {
@@ -349,7 +349,7 @@ impl LogReader<'_> {
         let held_from = self.oldest.max(end.saturating_sub(ring.capacity()));
         if self.has_same_capacity && held_from < first {
             self.warn(format!(
-                "the transitions {held_from} to {} are gone: the oldest segments are missing. All others are there, and all counts are right",
+                "the transitions {held_from} to {} are lost: the oldest segments are missing. All others are there, and all counts are right",
                 first - 1
             ));
         }

@@ -22,9 +22,8 @@ fn open(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), Persist
     };
     let args = PersistArgs {
         dir: dir.to_owned(),
-        shard: 0,
         segment_bytes: Some(4_000),
-        mark: None,
+        ..PersistArgs::default()
     };
     let (replay, recovery) = Replay::open(&args, &RunSpec::smallest(), &config, 4)?;
     Ok((replay, recovery.warnings))
@@ -122,18 +121,29 @@ fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
 }
 
 #[test]
-fn what_cannot_be_read_is_refused_until_it_is_removed() {
-    let (folder, replay) = begin(Sampling::default());
+fn what_cannot_be_read_is_rejected_until_it_is_removed() {
+    let (folder, mut replay) = begin(Sampling::default());
+    store(&mut replay, 0);
     drop(replay);
     let segment = folder.path().join("segment-000000000000.log");
     let mut bytes = fs::read(&segment).unwrap();
     bytes[40] ^= 1;
     fs::write(&segment, &bytes).unwrap();
+    let open = || open(folder.path(), Sampling::default());
     for _ in 0..2 {
-        let refused = open(folder.path(), Sampling::default());
-        assert!(matches!(refused, Err(PersistError::Unusable(..))));
+        let Err(PersistError::Unusable(unusable, why)) = open() else {
+            panic!("a damaged segment")
+        };
+        assert_eq!(unusable, folder.path());
+        assert!(why.contains("remove its segments"), "{why}");
         assert_eq!(fs::read(&segment).unwrap(), bytes);
     }
+    fs::remove_file(&segment).unwrap();
+    let (mut replay, warnings) = open().unwrap();
+    assert_eq!((replay.inserted_total(), warnings), (0, vec![]));
+    replay.join_actor(join(0, 1)).unwrap();
+    store(&mut replay, 0);
+    check_comes_back(replay, folder.path());
 }
 
 #[test]

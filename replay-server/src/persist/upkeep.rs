@@ -31,7 +31,7 @@ const SEGMENT_BYTES_MAX: u64 = 1 << 26;
 const SEGMENTS_MIN: u64 = 16;
 
 /// Where a replay is kept on disk, and which shard of the run it is.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct PersistArgs {
     /// The folder, for this replay alone.
     pub dir: PathBuf,

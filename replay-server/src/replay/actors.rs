@@ -248,7 +248,7 @@ impl Replay {
         let result = match leave.produced {
             0..=PRODUCED_MAX => self.state.actors.leave(leave),
             produced => Err(format!(
-                "actor {} says it produced {produced} transitions, a count that no run reaches",
+                "actor {} reports {produced} transitions, a count that no run reaches",
                 leave.actor
             )),
         };

@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    BatchReply, BatchRequest, BufferPool, Incoming, NotReady, Peer, Responder, fail_point,
+    BatchReply, BatchRequest, BufferPool, Incoming, Message, NotReady, Peer, Responder, fail_point,
 };
 
 use super::{
@@ -26,8 +26,7 @@ impl Service {
         };
         let mut state = self.state();
         if let Err(why) = self.update_from_request(&mut state, &request) {
-            let line = format!("a request for a batch was refused: {why}");
-            state.reject("batch", &line);
+            state.reject(BatchRequest::NAME, &why);
             drop(state);
             return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         }
@@ -59,7 +58,7 @@ impl Service {
                 "a whole batch of one of {shards} shards: the learner must be connected to all of them"
             )),
             Some(_) if shards == 1 => {
-                Err("a part of a batch; this replay has one shard alone".into())
+                Err("a part of a batch; this replay has only one shard".into())
             }
             Some(other_shards) => state.replay.set_other_shards(other_shards),
             None => Ok(()),

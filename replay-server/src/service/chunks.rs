@@ -31,7 +31,7 @@ impl Service {
         let chunk = match chunk {
             Ok(chunk) => chunk,
             Err(e) => {
-                self.reject_unreadable("a chunk", &e);
+                self.reject_unreadable::<ChunkHeader>(&e);
                 return responder.reply(&InsertReply::Refused { why: e.to_string() });
             }
         };
@@ -120,7 +120,7 @@ impl State {
                 replies.extend(older.map(|query| (query, reply.clone())));
             }
             InsertReply::Refused { why } => {
-                let line = format!("a chunk of actor {} was refused: {why}", header.actor);
+                let line = format!("a chunk of actor {} was rejected: {why}", header.actor);
                 self.warn_limited("chunk", &line);
             }
             InsertReply::OutOfOrder { .. } | InsertReply::Finished { .. } => {}
@@ -133,7 +133,7 @@ impl State {
     fn handle_poll(&mut self, poll: &ChunkPoll, query: PendingQuery) -> Replies {
         if let Some(reply) = self.replay.answer_poll(poll) {
             if let InsertReply::Refused { why } = &reply {
-                self.warn_limited("poll", &format!("a poll was refused: {why}"));
+                self.warn_limited("poll", &format!("a poll was rejected: {why}"));
             }
             return vec![(query, reply)];
         }

@@ -73,7 +73,7 @@ impl Service {
                 return None;
             }
             if let JoinReply::Refused { why } = &reply {
-                state.reject("join", &format!("a process was not admitted: {why}"));
+                state.reject(J::NAME, why);
             }
             self.changed.notify_all();
             Some(reply)
@@ -95,8 +95,8 @@ impl State {
         match self.replay.learner_id() {
             Some(served) if served == learner => Ok(()),
             Some(_) => Err("another learner has joined the run since this one did: a run has one learner".into()),
-            None => Err("this replay server does not know the learner: it was started again since the learner joined, and what it held \
-                         is gone. Start the learner and the actors again: the learner resumes from its newest checkpoint"
+            None => Err("this replay server does not know the learner: the server has restarted since the learner joined, and has lost \
+                         its transitions. Start the learner and the actors again: the learner resumes from its newest checkpoint"
                 .into()),
         }
     }
@@ -133,17 +133,17 @@ impl State {
         if other.is_some() && self.participants.is_run_over() {
             let done = self.replay.status().updates;
             return Err(refused_reply(format!(
-                "the run is finished, with {done} updates; to train on, resume it with more --frames"
+                "the run is finished, with {done} updates; to continue the training, resume it with more --frames"
             )));
         }
         if other.is_some_and(|other| self.participants.is_connected(Peer::learner(other))) {
-            let why = "another learner takes part in this run, which has one alone".into();
+            let why = "another learner takes part in this run, which has only one".into();
             return Err(JoinReply::Taken { why });
         }
         let repeated = self.replay.join_learner(join).map_err(refused_reply)?;
         if repeated > 0 {
             tracing::warn!(
-                "the learner resumes from its checkpoint after {updates} updates; updates since then, to be learned again: {repeated}"
+                "the learner resumes from its checkpoint after {updates} updates, and repeats the later ones: {repeated}"
             );
         }
         if served != Some(learner) {

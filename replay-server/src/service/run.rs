@@ -86,8 +86,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         let args = PersistArgs {
             dir: shard_dir(dir, args.shard, config.shards),
             shard: args.shard,
-            segment_bytes: None,
-            mark: None,
+            ..PersistArgs::default()
         };
         ReplayFolder::open(&args, &spec, &config)
     });
@@ -121,7 +120,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     )?;
     let client = RunClient::new(session, keys, spec.hash());
     let declare_error =
-        |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
+        |e: zenoh::Error| anyhow::anyhow!("declaring the replay server's queries: {e}");
     let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
         recovery: RecoveryControl::new(args.drain.clone()),

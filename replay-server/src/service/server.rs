@@ -3,6 +3,7 @@
 
 use std::{
     collections::{HashMap, VecDeque},
+    fmt::Display,
     sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError},
     time::{Duration, Instant},
 };
@@ -66,26 +67,20 @@ impl Service {
         lock(&self.state)
     }
 
-    /// Counts and logs a message that cannot be read.
-    pub(super) fn reject_unreadable(&self, what: &'static str, e: &CodecError) {
-        let line = format!("{what} was refused: {e}");
-        self.state().reject(what, &line);
+    /// Counts and logs a message of kind `R` that cannot be read.
+    pub(super) fn reject_unreadable<R: Request>(&self, e: &CodecError) {
+        self.state().reject(R::NAME, e);
     }
 
     /// Counts and logs a message that is longer than any valid message of its kind.
     pub(super) fn reject_too_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
-        let line = format!(
-            "a message of {bytes} bytes to {kind:?} was refused: it has more than a message of this kind can have in this run, {bytes_max}"
-        );
-        self.state().reject(kind, &line);
+        let why = format!("it has {bytes} bytes, and in this run at most {bytes_max}");
+        self.state().reject(kind, &why);
     }
 
     /// Reads a request without payload. If that fails, counts and logs the message as rejected.
     pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
-        let reject = |e: &CodecError| {
-            let line = format!("a message of kind {} was refused: {e}", R::NAME);
-            self.state().reject(R::NAME, &line);
-        };
+        let reject = |e: &CodecError| self.reject_unreadable::<R>(e);
         incoming.read().inspect_err(reject).ok()
     }
 
@@ -125,10 +120,11 @@ impl State {
         !self.chunks.queue.is_empty() || !self.requests.is_empty()
     }
 
-    /// Counts a rejected message, and logs a line of this kind.
-    pub(super) fn reject(&mut self, kind: &'static str, line: &str) {
+    /// Counts a rejected message of this kind, and logs the reason.
+    pub(super) fn reject(&mut self, kind: &'static str, why: &impl Display) {
         self.replay.counters_mut().messages_refused += 1;
-        self.warn_limited(kind, line);
+        let line = format!("a message of kind {kind} was rejected: {why}");
+        self.warn_limited(kind, &line);
     }
 
     /// Logs a line of this kind, or only counts it if one was logged recently.

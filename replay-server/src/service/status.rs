@@ -26,7 +26,7 @@ impl Service {
     pub(super) fn leave(&self, incoming: Incoming<Leave>) {
         self.answer(incoming, |state, leave| {
             if let Some(why) = state.replay.leave(&leave) {
-                state.warn_limited("leave", &format!("a `Leave` was refused: {why}"));
+                state.warn_limited("leave", &format!("a `Leave` was rejected: {why}"));
             }
             // A rejected `Leave` is acknowledged too, as the actor exits anyway.
             state.replay.write_pending().then_some(Ack)
@@ -34,7 +34,7 @@ impl Service {
     }
 
     pub(super) fn affinity(&self, incoming: Incoming<AffinityUpdate>) {
-        self.update_from_learner(incoming, "an affinity matrix was", |state, update| {
+        self.update_from_learner(incoming, |state, update| {
             state.check_learner(update.learner)?;
             state.replay.set_affinity(&update)
         });
@@ -42,12 +42,12 @@ impl Service {
 
     pub(super) fn priorities(&self, incoming: Incoming<PriorityUpdate>) {
         let rows_max = self.limits.batch_rows_max as usize;
-        self.update_from_learner(incoming, "priorities were", |state, update| {
+        self.update_from_learner(incoming, |state, update| {
             state.check_learner(update.learner)?;
             // One priority per row of a batch.
             if update.rows() > rows_max {
                 return Err(format!(
-                    "of {} rows; a batch of this run has {rows_max} (learner.batch_size)",
+                    "priorities of {} rows; a batch of this run has {rows_max} (learner.batch_size)",
                     update.rows()
                 ));
             }
@@ -59,13 +59,12 @@ impl Service {
     fn update_from_learner<R: Request<Reply = Ack>>(
         &self,
         incoming: Incoming<R>,
-        what: &'static str,
         take: impl FnOnce(&mut State, R) -> Result<(), String>,
     ) {
         self.answer(incoming, |state, update| {
             let taken = take(state, update);
             if let Err(why) = &taken {
-                state.reject(what, &format!("{what} refused: {why}"));
+                state.reject(R::NAME, why);
             }
             taken.ok().map(|()| Ack)
         });
@@ -129,7 +128,7 @@ impl Service {
                 && since.elapsed() > *due
             {
                 let since = since.elapsed().as_secs();
-                tracing::info!("{missing}, waiting since {since} s: `driml status` says more");
+                tracing::info!("{missing}; waiting for {since} s so far. See `driml status`");
                 *due *= 2;
             }
         }
@@ -151,7 +150,7 @@ impl Service {
                 continue;
             }
             let (why, wait_max) = match is_draining {
-                true => ("this process is to end", ORPHANED_WAIT_MAX),
+                true => ("this process was told to stop", ORPHANED_WAIT_MAX),
                 false => ("the run is over", LEAVE_WAIT_MAX),
             };
             let since = match waits {
@@ -160,7 +159,7 @@ impl Service {
             };
             waits = Some((is_draining, since));
             if connected == 0 || since.elapsed() > wait_max {
-                return tracing::info!("{why}, and {connected} processes are left");
+                return tracing::info!("{why}; processes still connected: {connected}");
             }
         }
     }

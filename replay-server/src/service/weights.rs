@@ -3,7 +3,7 @@
 use std::{sync::MutexGuard, time::Instant};
 
 use driml_protocol::{
-    Ack, BufferPool, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
+    Ack, BufferPool, Incoming, Message, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
     WeightsVersion, lock,
 };
 
@@ -18,7 +18,7 @@ impl Service {
         // Weights are kept for long, so they do not use the memory of the pool.
         let (upload, safetensors) = match incoming.receive(&BufferPool::new(0)) {
             Ok(read) => read,
-            Err(e) => return self.reject_unreadable("an upload of weights", &e),
+            Err(e) => return self.reject_unreadable::<WeightsUpload>(&e),
         };
         let WeightsUpload { learner, weights } = upload;
         let allowed = self.state().check_learner(learner);
@@ -37,10 +37,7 @@ impl Service {
             }
             // A repeated upload.
             Ok(false) => {}
-            Err(why) => {
-                let line = format!("weights were refused: {why}");
-                return self.state().reject("weights", &line);
-            }
+            Err(why) => return self.state().reject(WeightsUpload::NAME, &why),
         }
         incoming.into_responder().reply(&Ack);
     }

@@ -54,9 +54,8 @@ pub(crate) fn open(
 pub(crate) fn args(dir: &Path, segment_bytes: u64) -> PersistArgs {
     PersistArgs {
         dir: dir.to_owned(),
-        shard: 0,
         segment_bytes: Some(segment_bytes),
-        mark: None,
+        ..PersistArgs::default()
     }
 }
 

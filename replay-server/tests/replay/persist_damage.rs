@@ -188,7 +188,7 @@ use Left::{All, Beginning, Counts};
 fn damage_costs_what_it_hits_and_is_said() {
     type Spoil = fn(&Path);
     let last = usize::MAX;
-    let gone = "are gone";
+    let gone = "are lost";
     let next = "is missing: the replay is what it was";
     let misplaced = "not the segment that belongs here";
     let flip_late: Spoil = |it| flip(it, |length| length * 2 / 3);
@@ -366,7 +366,7 @@ fn a_run_may_go_on_with_another_capacity() {
         .iter()
         .for_each(|it| remove(it));
     let (replay, recovery) = open(&kept.args, &Config::unlimited(60)).unwrap();
-    assert!(recovery.warnings[0].contains("are gone"), "{recovery:?}");
+    assert!(recovery.warnings[0].contains("are lost"), "{recovery:?}");
     replay.check_valid();
     let status = replay.status();
     assert_eq!(status.transitions_inserted, kept.history.inserted);

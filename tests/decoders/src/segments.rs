@@ -52,9 +52,8 @@ fn spec() -> RunSpec {
 fn open_replay(dir: &Path) -> Result<Replay, String> {
     let args = PersistArgs {
         dir: dir.to_owned(),
-        shard: 0,
         segment_bytes: Some(SEGMENT_BYTES),
-        mark: None,
+        ..PersistArgs::default()
     };
     let config = Config {
         // 0 starts no thread that flushes.

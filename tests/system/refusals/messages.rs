@@ -43,7 +43,7 @@ const INVALID_CHUNKS: [InvalidChunk; 4] = [
     ("action 3; this run has 3", |it| {
         it.set(4, 3, 0.0, End::Running)
     }),
-    ("does not know this life of actor 0", |it| {
+    ("does not know this incarnation of actor 0", |it| {
         it.header.incarnation = 10
     }),
 ];

@@ -116,16 +116,12 @@ fn newer(mut bytes: Vec<u8>) -> Vec<u8> {
 /// Sends each row's message and checks the reply.
 pub(crate) fn check_replies(client: &Client, rows: impl IntoIterator<Item = Row>) {
     for (i, row) in rows.into_iter().enumerate() {
-        let Row {
-            key,
-            bytes,
-            expected,
-        } = row;
+        let (key, expected) = (row.key, row.expected);
         let wait_max = match expected {
             NO_REPLY => NO_REPLY_WAIT,
             _ => REPLY_TIMEOUT,
         };
-        let bytes = bytes.into();
+        let bytes = row.bytes.into();
         let reply = match session::ask(&client.session, &key, bytes, Priority::Data, wait_max) {
             Ok(answer) => describe(&answer.to_bytes()),
             Err(e @ SessionError::Recovering(_)) => e.to_string(),

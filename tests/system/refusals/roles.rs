@@ -102,7 +102,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
         keys.actor_key::<ActorJoin>(1),
         keys.actor_key::<ChunkPoll>(1),
     );
-    let reason = "speaks for actor 0 at the key";
+    let reason = "in the name of actor 0, but came at the key";
     send_in_parallel(
         one,
         [
@@ -163,7 +163,7 @@ fn an_actor_declares_nothing_but_its_own(run: &TlsRun) {
     let mut two = run.system.start_actor(2);
     two.wait_for_stderr("actor 2 steps");
     run.observer.wait_for_replay("both", |it| it.actors == 2);
-    two.stop_ok().expect_stderr("leaves: ");
+    two.stop(130).expect_stderr("leaves: ");
     run.observer.wait_for_replay("one", |it| it.actors == 1);
     check_continues(&run.observer);
     assert_eq!(queries.load(Ordering::Relaxed), 0, "queries to an actor");

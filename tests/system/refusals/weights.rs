@@ -90,13 +90,13 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     announce(1 << 60, hash);
     // These weights come from the right learner but do not fit the network, which shows only when the actor loads them.
     accept(6, &good[..good.len() / 2]);
-    actor.wait_for_stderr("weights 6 were refused, the old ones stay");
+    actor.wait_for_stderr("weights 6 were rejected, and the previous ones stay in use");
     accept(7, &good);
 
     let before = client.replay_status().unwrap().transitions_inserted;
     client.wait_for_transitions(before + 1000);
-    let stderr = actor.stop_ok().stderr;
-    assert!(!stderr.contains("newer ones did not come"), "{stderr}");
+    let stderr = actor.stop(130).stderr;
+    assert!(!stderr.contains("newer ones did not arrive"), "{stderr}");
     assert_eq!(client.replay_status().unwrap().transitions_lost, 0);
 }
 

@@ -149,7 +149,7 @@ fn what_cannot_go_on_says_why() {
     let config = config("chain", "c51", 800, &[]);
     let (_folder, run_dir, _) = begun(&config, 9);
     let said = refused(&prioritised, &run_dir);
-    let why = "replay.sampling is another rule than it was";
+    let why = "replay.sampling differs from the rule that was used before";
     assert!(said.contains(why), "{said}");
     // The newest segment begins with the mark, the one before it has the transitions.
     for (is_newest, why) in [

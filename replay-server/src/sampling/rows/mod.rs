@@ -104,7 +104,7 @@ impl RowsState {
         let is_alpha = (0.0..=1.0).contains(alpha);
         match masses.len() as u64 == held && are_masses && is_alpha {
             true => Ok(()),
-            false => Err("a state with priorities of other transitions, or none that a run has"),
+            false => Err("the state has priorities of other transitions, or impossible ones"),
         }
     }
 }

@@ -201,7 +201,7 @@ impl WorldProcess {
         let doing = self.exchange.doing;
         let how = match self.wait_for_exit(EXIT_WAIT_MAX) {
             Some(status) => format!("ended {doing} ({})", describe_status(status)),
-            None => format!("closed its stdout {doing} without ending, and was killed"),
+            None => format!("closed its stdout {doing} without exiting, and was killed"),
         };
         self.kill();
         self.dead_error(&how)
@@ -221,7 +221,7 @@ impl WorldProcess {
         let tail: String = tail.iter().map(|line| format!("\n  {line}")).collect();
         let tail = match tail.is_empty() {
             true => tail,
-            false => format!(". Its last words:{tail}"),
+            false => format!(". Its last output:{tail}"),
         };
         EnvError::Exec(format!("the world `{}` {how}{tail}", self.command))
     }

@@ -185,7 +185,7 @@ fn each_way_a_start_can_fail_has_its_sentence() {
         says(command, &sentences);
     }
     // The error quotes the command, too.
-    let said = "Its last words:\n  the ROM is missing";
+    let said = "Its last output:\n  the ROM is missing";
     says("echo the ROM is missing >&2; exit 4", &[said]);
     let refused = |line: &str, sentence| says(&declares(line), &[sentence]);
     refused("{}", "\"driml_env\" is missing");
@@ -210,7 +210,7 @@ fn a_world_that_is_another_than_the_settings_say_is_refused() {
     );
     refused("settings say", |config| config.actions.swap(0, 1));
     refused("without a command", |config| config.command.clear());
-    refused("has 1 copies where 2 were asked for", |config| {
+    refused("has 1 copies, and 2 were requested", |config| {
         config.command = declares(ONE);
     });
 }
@@ -285,7 +285,7 @@ fn a_state_of_another_world_is_refused_by_name() {
         &[state.clone(), vec![0]].concat(),
         &[],
     ] {
-        refused("saves", 2, wrong, &["no state of this world"]);
+        refused("saves", 2, wrong, &["not a state of this world"]);
     }
     // The same command, but the settings of another world.
     let config = ExecConfig {

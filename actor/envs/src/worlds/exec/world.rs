@@ -69,14 +69,14 @@ impl ExecWorld {
         let found = declared.applied_to(config);
         if found != *config {
             return Err(process.error(&format!(
-                "declares {}, but the run's settings say {}: start the run anew, or the command as it was",
+                "declares {}, but the run's settings say {}: start a new run, or use the run's command",
                 found.describe(),
                 config.describe()
             )));
         }
         if copies != num_envs {
             return Err(process.error(&format!(
-                "has {copies} copies where {num_envs} were asked for: it has to make as many as \"copies\" says"
+                "has {copies} copies, and {num_envs} were requested: it must make as many as \"copies\" says"
             )));
         }
         process.exchange = config.start_wait("making the memory that it shares");
@@ -136,7 +136,7 @@ impl ExecWorld {
         let bytes = written.len();
         if bytes == 0 {
             return Err(self.process.error(&format!(
-                "wrote no state: where it says `.` {}, the bytes have to lie in \"state\"",
+                "wrote no state: before it answers `.` {}, it must write the bytes to \"state\"",
                 self.process.exchange.doing
             )));
         }

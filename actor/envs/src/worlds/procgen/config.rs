@@ -73,7 +73,7 @@ impl ProcgenConfig {
             Levels::Train => return Ok(changed),
             Levels::TrainSingle => {}
             Levels::Unseen if self.num_levels == 0 => {
-                let why = "this run trained on all levels there are: none is unseen";
+                let why = "this run trained on all levels, so none is unseen";
                 return Err(EnvError::Config(why.into()));
             }
             Levels::Unseen => {
