@@ -56,8 +56,8 @@ pub use messages::{
     status::{LearnerStatus, Quantiles, RETURNS_MAX, ReplayStatus, Returns, Waiting},
     table::{Ack, Kind},
     weights::{
-        PIECE_BYTES, Weights, WeightsAssembly, WeightsHeader, WeightsReply, WeightsRequest,
-        WeightsUpload, WeightsVersion,
+        PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
+        WeightsVersion,
     },
 };
 pub use process::{
