@@ -306,7 +306,14 @@ impl Batch {
 
     /// Borrows the places of all states that the rows have, for writing.
     pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
-        BatchStatesMut::new(self.header, &mut self.payload)
+        let (count, frame_bytes) = self.header.frames();
+        let (frames, rest) = self.payload.split_at_mut(count * frame_bytes);
+        let stack_bytes = self.header.stacked.map_or(0, |it| it.stack_bytes());
+        BatchStatesMut {
+            frame_bytes,
+            frames,
+            stacks: &mut rest[..self.header.states() as usize * stack_bytes],
+        }
     }
 
     /// Header and payload, to be sent as a [`BatchReply`](super::batch_header::BatchReply).
@@ -352,66 +359,25 @@ impl RowScalars {
 
 /// The places of a batch's states and their frames, borrowed for writing.
 ///
-/// States are numbered: first all s_t, then all s_{t+k}, then all s_{t+n}. If a state is one frame, the frame has the state's number.
+/// States are numbered: first all s_t, then s_{t+k} in the order of [P, B], then s_{t+n}, without those that rows lack. If a state is one
+/// frame, the frame has the state's number.
 #[derive(Debug)]
 pub struct BatchStatesMut<'a> {
-    rows: usize,
     frame_bytes: usize,
     /// The frames in the payload.
     frames: &'a mut [u8],
     /// The numbers of each state's frames; empty if a state is one frame.
     stacks: &'a mut [u8],
-    stack_bytes: usize,
-    /// The number of the state of each positive [P, B].
-    numbers_k: Vec<Option<usize>>,
-    /// The number of each row's s_{t+n} [B].
-    numbers_n: Vec<Option<usize>>,
 }
 
-impl<'a> BatchStatesMut<'a> {
-    /// Borrows the places in a payload whose scalars are written.
-    fn new(header: BatchHeader, payload: &'a mut [u8]) -> Self {
-        let rows = header.rows as usize;
-        let first_n = rows + header.states_k as usize;
-        let numbers_k = number_present(&header.positives_present(payload), rows);
-        let numbers_n = number_present(&header.bootstraps(payload), first_n);
-        let (count, frame_bytes) = header.frames();
-        let (frames, rest) = payload.split_at_mut(count * frame_bytes);
-        let stack_bytes = header.stacked.map_or(0, |it| it.stack_bytes());
-        let states = first_n + header.states_n as usize;
-        Self {
-            rows,
-            frame_bytes,
-            frames,
-            stacks: &mut rest[..states * stack_bytes],
-            stack_bytes,
-            numbers_k,
-            numbers_n,
-        }
-    }
-
-    /// The numbers of the states that `row` has: of s_t, of s_{t+n}, and of s_{t+k} of each positive, in this order.
-    pub fn row_states(&self, row: usize) -> impl Iterator<Item = usize> {
-        let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
-        let first = [Some(row), self.numbers_n[row]];
-        first.into_iter().chain(of_positives.copied()).flatten()
-    }
-
+impl BatchStatesMut<'_> {
     /// The place of frame `number`, for writing.
     pub fn frame(&mut self, number: usize) -> &mut [u8] {
         &mut self.frames[number * self.frame_bytes..][..self.frame_bytes]
     }
 
-    /// Writes the numbers of the frames of state `number`, oldest first.
-    pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
-        let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
-        StackedFrames::write_numbers(stack, frames);
+    /// Writes the numbers of the frames of all states, one state after the other, each oldest first.
+    pub fn set_stacks(&mut self, frames: &[u32]) {
+        StackedFrames::write_numbers(self.stacks, frames);
     }
-}
-
-/// Numbers the entries of `present` that are true, from `first` on.
-fn number_present(present: &[bool], first: usize) -> Vec<Option<usize>> {
-    let mut numbers = first..;
-    let number = |&is_present: &bool| is_present.then(|| numbers.next()).flatten();
-    present.iter().map(number).collect()
 }

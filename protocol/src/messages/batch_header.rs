@@ -107,9 +107,12 @@ impl BatchHeader {
                 )));
             }
         }
-        let rows = (self.positives_present(payload), self.bootstraps(payload));
-        let count = |present: &[bool]| present.iter().filter(|it| **it).count();
-        let counted = (count(&rows.0), count(&rows.1));
+        let valid = payload[self.range(Column::PositiveValid)].iter();
+        let discounts = self.f32s(Column::BootstrapDiscount, payload);
+        let counted = (
+            valid.filter(|valid| **valid != 0).count(),
+            discounts.filter(|discount| *discount != 0.0).count(),
+        );
         if counted != (self.states_k as usize, self.states_n as usize) {
             return Err(CodecError::Header(format!(
                 "rows with {} positives and {} bootstraps come with {} and {} states",
@@ -206,7 +209,7 @@ impl BatchHeader {
         fits.then(bytes).and_then(|it| it.try_into().ok())
     }
 
-    fn states(&self) -> u64 {
+    pub(super) fn states(&self) -> u64 {
         u64::from(self.rows) + u64::from(self.states_k) + u64::from(self.states_n)
     }
 
@@ -214,18 +217,6 @@ impl BatchHeader {
     pub(super) fn f32s(&self, column: Column, payload: &[u8]) -> impl Iterator<Item = f32> {
         let (values, _) = payload[self.range(column)].as_chunks();
         values.iter().copied().map(f32::from_le_bytes)
-    }
-
-    /// Whether each row [B] bootstraps, from a payload whose scalars are written.
-    pub(super) fn bootstraps(&self, payload: &[u8]) -> Vec<bool> {
-        let discounts = self.f32s(Column::BootstrapDiscount, payload);
-        discounts.map(|discount| discount != 0.0).collect()
-    }
-
-    /// Whether each positive [P, B] exists, from a payload whose scalars are written.
-    pub(super) fn positives_present(&self, payload: &[u8]) -> Vec<bool> {
-        let valid = payload[self.range(Column::PositiveValid)].iter();
-        valid.map(|&valid| valid != 0).collect()
     }
 
     fn state_columns<'a>(&self, payload: &'a [u8]) -> &'a [u8] {

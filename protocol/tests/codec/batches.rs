@@ -6,7 +6,7 @@ use driml_protocol::{
 };
 
 use crate::samples::{
-    ORIGIN, SPEC, STACKED, batch, batch_from, encoded, prioritised_batch, refusal, rows,
+    ORIGIN, SPEC, STACKED, STACKS, batch, batch_from, encoded, prioritised_batch, refusal, rows,
     stacked_batch,
 };
 
@@ -138,7 +138,9 @@ fn stacks_that_cannot_be_are_refused() {
     let said = |header, payload: Buffer| refusal(&BatchReply::Batch(header), &payload);
     for number in [5, 6, u32::MAX] {
         let mut wrong = stacked_batch(None);
-        wrong.states_mut().set_stack(5, &[0, number]);
+        let [stacks @ .., _] = STACKS;
+        let stacks = [&stacks[..], &[number]].concat();
+        wrong.states_mut().set_stacks(&stacks);
         let (header, payload) = wrong.into_payload();
         let (said, why) = (
             said(header, payload),
@@ -237,15 +239,16 @@ fn parts_are_merged_row_by_row() {
         };
         let rows: Vec<_> = values.clone().map(scalars).collect();
         let mut batch = Batch::from_rows(header, &rows, Buffer::zeroed);
+        // s_t is the value; s_{t+n} is 20 more, s_{t+k} of the positives 40, 60 and 80.
+        let k = (0..3).flat_map(|p| {
+            let with_positive = rows.iter().filter(move |row| row.positives > p);
+            with_positive.map(move |row| row.action + 40 + 20 * p as u8)
+        });
+        let n = rows.iter().filter(|row| row.bootstraps());
+        let n = n.map(|row| row.action + 20);
         let mut places = batch.states_mut();
-        for (row, value) in values.enumerate() {
-            let numbers: Vec<_> = places.row_states(row).collect();
-            let n = value.is_multiple_of(2).then_some(value + 20);
-            let k = [40, 60, 80].map(|more| value + more);
-            let bytes = [value].into_iter().chain(n).chain(k);
-            for (number, byte) in numbers.into_iter().zip(bytes) {
-                places.frame(number).fill(byte);
-            }
+        for (number, byte) in values.chain(k).chain(n).enumerate() {
+            places.frame(number).fill(byte);
         }
         batch
     };

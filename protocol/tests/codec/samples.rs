@@ -142,8 +142,6 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
     let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
     let mut places = batch.states_mut();
-    let numbers = |row| places.row_states(row).collect::<Vec<_>>();
-    assert_eq!([0, 1, 2].map(numbers), [vec![0, 3], vec![1], vec![2, 5, 4]]);
     for (number, byte) in [10, 11, 12, 30, 32, 22].into_iter().enumerate() {
         places.frame(number).fill(byte);
     }
@@ -155,6 +153,9 @@ pub(crate) const STACKED: StackedFrames = StackedFrames {
     frame_stack: 2,
     frame_channels: 1,
 };
+
+/// The numbers of the frames of each state: s_t of all rows; s_{t+k} of the first and the last; s_{t+n} of the last.
+pub(crate) const STACKS: [u32; 12] = [0, 0, 0, 1, 1, 2, 0, 1, 3, 4, 4, 4];
 
 /// The same rows with states that are stacks of two of five frames.
 pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
@@ -168,11 +169,7 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     for frame in 0..5 {
         places.frame(frame).fill(50 + frame as u8);
     }
-    // s_t of all rows; s_{t+k} of the first and the last; s_{t+n} of the last.
-    let stacks = [[0, 0], [0, 1], [1, 2], [0, 1], [3, 4], [4, 4]];
-    for (state, stack) in stacks.iter().enumerate() {
-        places.set_stack(state, stack);
-    }
+    places.set_stacks(&STACKS);
     if origin.is_some() {
         batch.set_draws(&[(1, 0.5), (2, 0.5), (3, 0.5)]);
     }
