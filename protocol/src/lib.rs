@@ -38,7 +38,7 @@ mod run_spec;
 mod sampling;
 mod wire;
 
-pub use client::{Announcer, EncodedMessage, PendingReply, RunClient};
+pub use client::{EncodedMessage, PendingReply, RunClient};
 pub use messages::{
     affinity::AffinityUpdate,
     batch::{Batch, BatchStatesMut, NO_ACTION, RowScalars},

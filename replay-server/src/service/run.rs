@@ -120,15 +120,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         limits.largest_bytes(),
     )?;
     let client = RunClient::new(session, keys, spec.hash());
-    let declare_error =
-        |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
     let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
         recovery: RecoveryControl::new(args.drain.clone()),
         config_toml: args.config_toml.clone(),
     });
     let declared = Queries::declare(&client, &gate, limits, &config.sampling);
-    let (queryables, mut threads) = declared.map_err(declare_error)?;
+    let (queryables, mut threads) =
+        declared.map_err(|e| anyhow::anyhow!("declaring what the replay server answers: {e}"))?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
@@ -172,7 +171,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
-        announcements: client.declare_announcer().map_err(declare_error)?,
+        client: client.clone(),
         shutdown: shutdown.clone(),
     });
     let (subscriber, members) = watch_members(&client, &service)
