@@ -41,7 +41,7 @@ mod wire;
 pub use client::{EncodedMessage, PendingReply, RunClient};
 pub use messages::{
     affinity::AffinityUpdate,
-    batch::{Batch, BatchStatesMut, NO_ACTION, RowScalars},
+    batch::{Batch, NO_ACTION, RowScalars},
     batch_frames::StackedFrames,
     batch_header::{BatchHeader, BatchReply, NotReady, POOL_BATCHES},
     batch_request::{BatchRequest, LearnerProgress, RequestId, ShardCounts},

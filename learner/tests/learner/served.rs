@@ -105,9 +105,8 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
     };
     let mut batch = WireBatch::from_rows(header, &rows, Buffer::zeroed);
     let states = batch.header.rows + batch.header.states_k + batch.header.states_n;
-    let mut places = batch.states_mut();
     for number in 0..states as usize {
-        rng.fill(places.frame(number));
+        rng.fill(batch.frame_mut(number));
     }
     batch
 }

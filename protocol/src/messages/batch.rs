@@ -31,7 +31,7 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Creates a batch of `rows`, whose states the caller then writes with [`Batch::states_mut`]. The counts of rows and states come from
+    /// Creates a batch of `rows`, whose frames the caller then writes with [`Batch::frame_mut`]. The counts of rows and states come from
     /// `rows`, the count of frames from `header`. `allocate` returns a buffer of the given bytes, with arbitrary content.
     ///
     /// # Panics
@@ -304,16 +304,21 @@ impl Batch {
         })
     }
 
-    /// Borrows the places of all states that the rows have, for writing.
-    pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
-        let (count, frame_bytes) = self.header.frames();
-        let (frames, rest) = self.payload.split_at_mut(count * frame_bytes);
-        let stack_bytes = self.header.stacked.map_or(0, |it| it.stack_bytes());
-        BatchStatesMut {
-            frame_bytes,
-            frames,
-            stacks: &mut rest[..self.header.states() as usize * stack_bytes],
-        }
+    /// The place of frame `number`, for writing. If a state is one frame, the frame has the state's number: first all s_t, then s_{t+k} in
+    /// the order of [P, B], then s_{t+n}, without those that rows lack.
+    pub fn frame_mut(&mut self, number: usize) -> &mut [u8] {
+        let bytes = self.header.frame_bytes();
+        &mut self.payload[number * bytes..][..bytes]
+    }
+
+    /// Writes the numbers of the frames of all states, one state after the other, each oldest first.
+    ///
+    /// # Panics
+    /// If a state is one frame, or the numbers are not those of all states.
+    pub fn set_stacks(&mut self, frames: &[u32]) {
+        assert!(self.header.stacked.is_some(), "states that are stacks");
+        let stacks = self.header.state_range();
+        StackedFrames::write_numbers(&mut self.payload[stacks], frames);
     }
 
     /// Header and payload, to be sent as a [`BatchReply`](super::batch_header::BatchReply).
@@ -354,30 +359,5 @@ impl RowScalars {
     /// k of each positive that the row has.
     pub const fn ks(&self) -> Range<u32> {
         self.k_first..self.k_first + self.positives
-    }
-}
-
-/// The places of a batch's states and their frames, borrowed for writing.
-///
-/// States are numbered: first all s_t, then s_{t+k} in the order of [P, B], then s_{t+n}, without those that rows lack. If a state is one
-/// frame, the frame has the state's number.
-#[derive(Debug)]
-pub struct BatchStatesMut<'a> {
-    frame_bytes: usize,
-    /// The frames in the payload.
-    frames: &'a mut [u8],
-    /// The numbers of each state's frames; empty if a state is one frame.
-    stacks: &'a mut [u8],
-}
-
-impl BatchStatesMut<'_> {
-    /// The place of frame `number`, for writing.
-    pub fn frame(&mut self, number: usize) -> &mut [u8] {
-        &mut self.frames[number * self.frame_bytes..][..self.frame_bytes]
-    }
-
-    /// Writes the numbers of the frames of all states, one state after the other, each oldest first.
-    pub fn set_stacks(&mut self, frames: &[u32]) {
-        StackedFrames::write_numbers(self.stacks, frames);
     }
 }

@@ -100,7 +100,7 @@ impl BatchHeader {
                     self.rows
                 )));
             }
-            if let Some(number) = stacked.first_unknown(self.state_columns(payload)) {
+            if let Some(number) = stacked.first_unknown(&payload[self.state_range()]) {
                 return Err(CodecError::Header(format!(
                     "a state of frame {number}, of {} that travel",
                     stacked.frames
@@ -162,9 +162,7 @@ impl BatchHeader {
         let rows = u128::from(self.rows);
         let positives = rows * u128::from(self.positives);
         let by_priority = self.origin.map_or(0, |_| rows);
-        let frames = |it: StackedFrames| {
-            u128::from(it.frames) * it.frame_bytes(self.state_bytes as usize) as u128
-        };
+        let frames = |it: StackedFrames| u128::from(it.frames) * self.frame_bytes() as u128;
         let states = |count: u32| u128::from(count) * self.value_bytes() as u128;
         [
             (Column::Frames, self.stacked.map_or(0, frames)),
@@ -209,7 +207,7 @@ impl BatchHeader {
         fits.then(bytes).and_then(|it| it.try_into().ok())
     }
 
-    pub(super) fn states(&self) -> u64 {
+    fn states(&self) -> u64 {
         u64::from(self.rows) + u64::from(self.states_k) + u64::from(self.states_n)
     }
 
@@ -219,8 +217,9 @@ impl BatchHeader {
         values.iter().copied().map(f32::from_le_bytes)
     }
 
-    fn state_columns<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
-        &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
+    /// The range of all columns of states.
+    pub(super) fn state_range(&self) -> Range<usize> {
+        self.range(Column::StatesT).start..self.range(Column::StatesN).end
     }
 
     /// Bytes of a value in a column of states: a whole state, or the numbers of its frames.
@@ -229,13 +228,11 @@ impl BatchHeader {
         stacked.map_or(self.state_bytes as usize, StackedFrames::stack_bytes)
     }
 
-    /// The number of frames in the payload, and the bytes of each. Without stacks, each state is a frame.
-    pub(super) fn frames(&self) -> (usize, usize) {
+    /// Bytes of one frame. Without stacks, each state is a frame.
+    pub(super) fn frame_bytes(&self) -> usize {
         let state_bytes = self.state_bytes as usize;
-        match self.stacked {
-            None => (self.states() as usize, state_bytes),
-            Some(stacked) => (stacked.frames as usize, stacked.frame_bytes(state_bytes)),
-        }
+        self.stacked
+            .map_or(state_bytes, |it| it.frame_bytes(state_bytes))
     }
 }
 

@@ -102,7 +102,7 @@ fn parts_of_stacks_are_merged() {
     let first = stacked_batch(None);
     let mut second = stacked_batch(None);
     for frame in 0..5 {
-        second.states_mut().frame(frame).fill(150 + frame as u8);
+        second.frame_mut(frame).fill(150 + frame as u8);
     }
     let parts = [first, second, stacked_batch(None)];
     let whole = Batch::merged_header(&parts).unwrap();
@@ -140,7 +140,7 @@ fn stacks_that_cannot_be_are_refused() {
         let mut wrong = stacked_batch(None);
         let [stacks @ .., _] = STACKS;
         let stacks = [&stacks[..], &[number]].concat();
-        wrong.states_mut().set_stacks(&stacks);
+        wrong.set_stacks(&stacks);
         let (header, payload) = wrong.into_payload();
         let (said, why) = (
             said(header, payload),
@@ -246,9 +246,8 @@ fn parts_are_merged_row_by_row() {
         });
         let n = rows.iter().filter(|row| row.bootstraps());
         let n = n.map(|row| row.action + 20);
-        let mut places = batch.states_mut();
         for (number, byte) in values.chain(k).chain(n).enumerate() {
-            places.frame(number).fill(byte);
+            batch.frame_mut(number).fill(byte);
         }
         batch
     };

@@ -141,9 +141,8 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
     };
     let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
-    let mut places = batch.states_mut();
     for (number, byte) in [10, 11, 12, 30, 32, 22].into_iter().enumerate() {
-        places.frame(number).fill(byte);
+        batch.frame_mut(number).fill(byte);
     }
     batch
 }
@@ -165,11 +164,10 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     };
     let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
-    let mut places = batch.states_mut();
     for frame in 0..5 {
-        places.frame(frame).fill(50 + frame as u8);
+        batch.frame_mut(frame).fill(50 + frame as u8);
     }
-    places.set_stacks(&STACKS);
+    batch.set_stacks(&STACKS);
     if origin.is_some() {
         batch.set_draws(&[(1, 0.5), (2, 0.5), (3, 0.5)]);
     }

@@ -4,7 +4,7 @@
 
 use std::{collections::HashMap, ops::Range, sync::Arc};
 
-use driml_protocol::{Batch, BatchHeader, BatchStatesMut, Buffer, RunSpec, Sampling};
+use driml_protocol::{Batch, BatchHeader, Buffer, RunSpec, Sampling};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
@@ -100,9 +100,10 @@ impl BatchSampler {
         if let Some(draws) = draws {
             batch.set_draws(&draws);
         }
-        let mut target = batch.states_mut();
-        target.set_stacks(&stacks);
-        let packed_frames = write_or_defer(ring, &frames, &mut target);
+        if header.stacked.is_some() {
+            batch.set_stacks(&stacks);
+        }
+        let packed_frames = write_or_defer(ring, &frames, &mut batch);
         let ks = scalars.iter().map(|row| row.ks().max().unwrap_or(0));
         Some(PackedBatch {
             batch,
@@ -157,16 +158,12 @@ struct PackedFrame {
 }
 
 /// Writes plain frames to the batch, in the order of `needed`. Of compressed frames returns what is needed to write them later.
-fn write_or_defer(
-    ring: &Ring,
-    needed: &[NeededFrame],
-    target: &mut BatchStatesMut<'_>,
-) -> Vec<PackedFrame> {
+fn write_or_defer(ring: &Ring, needed: &[NeededFrame], batch: &mut Batch) -> Vec<PackedFrame> {
     match ring.frames() {
         FrameStore::Plain(frames) => {
             for (place, needed) in needed.iter().enumerate() {
                 let frame = frames.frame(ring.slot(needed.index));
-                target.frame(place).copy_from_slice(frame);
+                batch.frame_mut(place).copy_from_slice(frame);
             }
             Vec::new()
         }
@@ -194,7 +191,6 @@ impl PackedBatch {
             mut packed_frames,
             ..
         } = self;
-        let mut target = batch.states_mut();
         let mut cache = UnpackCache {
             layout,
             parts: Vec::new(),
@@ -210,7 +206,7 @@ impl PackedBatch {
                 let at = cache.part_offset(&frame.block, part);
                 let at = at + (frame.position - first) * layout.frame_bytes;
                 let bytes = &cache.bytes[at..at + layout.frame_bytes];
-                target.frame(frame.place).copy_from_slice(bytes);
+                batch.frame_mut(frame.place).copy_from_slice(bytes);
             }
         }
         batch
