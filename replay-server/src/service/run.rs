@@ -220,7 +220,7 @@ fn recover_replay(
     control: &RecoveryControl,
     spec_hash: u64,
 ) -> Result<(Replay, WeightsStore), PersistError> {
-    let (started, folder) = (Instant::now(), kept.dir().to_owned());
+    let (started, folder) = (Instant::now(), kept.path.clone());
     let (replay, recovery) = kept.recover(empty, control)?;
     let dir = folder.display();
     for warning in &recovery.warnings {
