@@ -90,14 +90,11 @@ impl Batch {
         }
     }
 
-    /// Merges the rows of all `parts`, one part after the other. `memory` may have arbitrary content, and has the payload bytes of
-    /// [`Batch::merged_header`].
-    ///
-    /// # Panics
-    /// If the parts have no common header, or the memory is of another size.
-    pub fn merge(parts: &[Self], memory: Buffer) -> Self {
-        let header = Self::merged_header(parts).expect("parts of one batch");
-        let mut merged = Self::with_buffer(header, memory);
+    /// Merges the rows of all `parts`, one part after the other; `None` if `parts` is empty or the parts differ in shape. `allocate` returns a
+    /// buffer of the given bytes, with arbitrary content.
+    pub fn merge(parts: &[Self], allocate: impl FnOnce(usize) -> Buffer) -> Option<Self> {
+        let header = Self::merged_header(parts)?;
+        let mut merged = Self::with_buffer(header, allocate(header.payload_bytes()));
         for (column, _) in header.columns() {
             let mut to = &mut merged.payload[header.range(column)];
             let pieces: Vec<_> = parts.iter().map(|part| part.split_column(column)).collect();
@@ -119,7 +116,7 @@ impl Batch {
             }
         }
         merged.origins = parts.iter().flat_map(|it| it.origins.clone()).collect();
-        merged
+        Some(merged)
     }
 
     /// The values of a column, split by positive; a column without positives is one piece.
@@ -142,8 +139,8 @@ impl Batch {
         }
     }
 
-    /// The header of [`Batch::merge`]; `None` if `parts` is empty or the parts differ in shape.
-    pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
+    /// The header of [`Batch::merge`].
+    fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
         // The fields that all parts must share.
         let shape = |it: &BatchHeader| {
             let frames = it.stacked.map(|it| StackedFrames { frames: 0, ..it });

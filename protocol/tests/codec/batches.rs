@@ -7,7 +7,7 @@ use driml_protocol::{
 
 use crate::samples::{
     ORIGIN, SPEC, STACKED, STACKS, batch, batch_from, encoded, prioritised_batch, refusal, rows,
-    stacked_batch,
+    stacked_batch, used_memory,
 };
 
 fn received(bytes: &[u8]) -> Batch {
@@ -59,9 +59,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     second.set_draws(&[(10, 0.5), (11, 0.25), (12, 0.25)]);
     back.scale_probabilities(0.25);
     second.scale_probabilities(0.75);
-    let parts = [back, second];
-    let whole = Batch::merged_header(&parts).unwrap();
-    let merged = Batch::merge(&parts, Buffer::zeroed(whole.payload_bytes()));
+    let merged = Batch::merge(&[back, second], Buffer::zeroed).unwrap();
     let scaled = [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875];
     assert_eq!(merged.probabilities().unwrap(), scaled);
     let found = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0];
@@ -71,8 +69,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
         part(other, &[10, 11, 12], &found[3..]),
     ];
     assert_eq!(update.parts, expected);
-    let mixed = [merged, plain];
-    assert_eq!(Batch::merged_header(&mixed), None);
+    assert_eq!(Batch::merge(&[merged, plain], Buffer::zeroed), None);
 }
 
 /// A run with stacks sends each frame once.
@@ -105,9 +102,8 @@ fn parts_of_stacks_are_merged() {
         second.frame_mut(frame).fill(150 + frame as u8);
     }
     let parts = [first, second, stacked_batch(None)];
-    let whole = Batch::merged_header(&parts).unwrap();
-    assert_eq!(whole.stacked.unwrap().frames, 15);
-    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let merged = Batch::merge(&parts, used_memory).unwrap();
+    assert_eq!(merged.header.stacked.unwrap().frames, 15);
     let planes = |batch: &Batch| {
         [batch.states_t(), batch.states_k(), batch.states_n()].map(|plane| plane.to_vec())
     };
@@ -129,7 +125,8 @@ fn parts_of_stacks_are_merged() {
     ] {
         let mut other_part = part.clone();
         other_part.header.stacked = other;
-        assert_eq!(Batch::merged_header(&[part.clone(), other_part]), None);
+        let parts = [part.clone(), other_part];
+        assert_eq!(Batch::merge(&parts, Buffer::zeroed), None);
     }
 }
 
@@ -256,8 +253,8 @@ fn parts_are_merged_row_by_row() {
         part(header(4.0, (9, 5)), 4..6),
         part(header(1.0, (8, 4)), 6..8),
     ];
-    let whole = Batch::merged_header(&parts).unwrap();
-    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let merged = Batch::merge(&parts, used_memory).unwrap();
+    let whole = merged.header;
     let expected = part(whole, 0..8);
     assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
     assert_eq!((whole.counts.inserted, whole.held), (30, 15));
@@ -271,6 +268,7 @@ fn parts_are_merged_row_by_row() {
         ..header(0.0, (1, 1))
     };
     let other = part(other, 0..1);
-    assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
-    assert_eq!(Batch::merged_header(&[]), None);
+    let parts = [parts[0].clone(), other];
+    assert_eq!(Batch::merge(&parts, Buffer::zeroed), None);
+    assert_eq!(Batch::merge(&[], Buffer::zeroed), None);
 }

@@ -122,6 +122,11 @@ pub(crate) fn rows() -> Vec<RowScalars> {
     (0..).zip(rows).map(scalars).collect()
 }
 
+/// Memory for a batch, with arbitrary content.
+pub(crate) fn used_memory(bytes: usize) -> Buffer {
+    Buffer::from(vec![0xAB; bytes])
+}
+
 pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
     let header = BatchHeader {
         rows: 3,
@@ -139,7 +144,7 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
         origin,
         stacked: None,
     };
-    let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::from_rows(header, &rows(), used_memory);
     assert_eq!(batch.header, header);
     for (number, byte) in [10, 11, 12, 30, 32, 22].into_iter().enumerate() {
         batch.frame_mut(number).fill(byte);
@@ -162,7 +167,7 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
         stacked: Some(STACKED),
         ..batch_from(origin).header
     };
-    let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::from_rows(header, &rows(), used_memory);
     assert_eq!(batch.header, header);
     for frame in 0..5 {
         batch.frame_mut(frame).fill(50 + frame as u8);
