@@ -9,7 +9,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Ack, BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
+    BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
     RunClient, Shutdown, Silence, fail_point, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
@@ -339,19 +339,14 @@ impl DeliveryWorker {
     }
 
     fn send_leave(&self, leave: Leave) {
-        let began = Instant::now();
-        let mut silent_since = began;
-        loop {
-            let e = match self.client.ask(&leave, LEAVE_TIMEOUT) {
-                Ok(Ack) => return,
-                Err(e) => e,
-            };
+        let (began, mut silence) = (Instant::now(), Silence::default());
+        while let Err(e) = self.client.ask(&leave, LEAVE_TIMEOUT) {
             // The process that told the actor to stop does not wait for long.
             let may_wait = !self.shutdown.is_set() || began.elapsed() <= DRAIN_MAX;
             if may_wait && matches!(e, SessionError::Recovering(_)) {
-                silent_since = Instant::now();
+                silence.record_answer();
             }
-            if silent_since.elapsed() > LEAVE_RETRY_MAX {
+            if silence.record_failure() > LEAVE_RETRY_MAX {
                 tracing::warn!("the replay server did not receive this actor's `Leave`: {e}");
                 return;
             }
