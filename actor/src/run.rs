@@ -72,10 +72,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         actor: args.actor,
         incarnation: rand::random(),
     };
-    let participant = Participant::Actor {
-        actor: join.actor,
-        incarnation: join.incarnation,
-    };
+    let participant = Participant::Actor(join);
     // Declared before joining, so that no other process can join as this actor from then on.
     let client = RunClient::new(session, keys, spec_hash);
     let alive = client.declare_alive(participant.peer());

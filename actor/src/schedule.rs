@@ -6,55 +6,42 @@ use crate::{
     error::ActError,
 };
 
-/// One actor's epsilon over the run.
+/// One actor's epsilon: linear over the frames of the whole run, then constant. Source: table of parameters in the paper's appendix.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Schedule {
-    /// Linear over the frames of the whole run, then constant. Source: table of parameters in the paper's appendix.
-    Linear {
-        /// Epsilon at the run's first frame.
-        start: f64,
-        /// Epsilon from `decay_frames` on.
-        end: f64,
-        /// Frames over which epsilon falls, of all actors together.
-        decay_frames: u64,
-    },
-    /// The same epsilon for the whole run. Source: Horgan et al. 2018.
-    Fixed(f64),
+pub struct Schedule {
+    /// Epsilon at the run's first frame.
+    pub start: f64,
+    /// Epsilon from `decay_frames` on.
+    pub end: f64,
+    /// Frames over which epsilon falls, of all actors together.
+    pub decay_frames: u64,
 }
 
 impl Schedule {
     /// The largest absolute error of [`Schedule::epsilon`], for any number of frames.
     pub const ERROR: f64 = 1e-15;
 
-    /// Returns the schedule of actor number `actor`.
+    /// Returns the schedule of actor number `actor`. On a ladder, its epsilon never changes. Source: Horgan et al. 2018.
     pub fn new(config: &Config, actor: u32) -> Result<Self, ActError> {
-        match &config.epsilon_ladder {
-            Some(ladder) => ladder_epsilon(ladder, actor).map(Self::Fixed),
-            None => Ok(Self::Linear {
-                start: config.epsilon_start,
-                end: config.epsilon_end,
-                decay_frames: config.epsilon_decay_frames,
-            }),
-        }
+        let fixed = config.epsilon_ladder.as_ref();
+        let fixed = fixed.map(|ladder| ladder_epsilon(ladder, actor));
+        let fixed = fixed.transpose()?;
+        Ok(Self {
+            start: fixed.unwrap_or(config.epsilon_start),
+            end: fixed.unwrap_or(config.epsilon_end),
+            decay_frames: config.epsilon_decay_frames,
+        })
     }
 
     /// Returns epsilon after `frames` frames of the run, to within [`Schedule::ERROR`]: between start and end, and monotonic in `frames`.
     pub fn epsilon(&self, frames: u64) -> f64 {
-        match *self {
-            Self::Fixed(epsilon) => epsilon,
-            Self::Linear {
-                end, decay_frames, ..
-            } if frames >= decay_frames => end,
-            Self::Linear {
-                start,
-                end,
-                decay_frames,
-            } => {
-                let epsilon = start + (end - start) * (frames as f64 / decay_frames as f64);
-                // Just before `decay_frames`, rounding may carry epsilon past `end`.
-                epsilon.clamp(start.min(end), start.max(end))
-            }
+        let (start, end) = (self.start, self.end);
+        if frames >= self.decay_frames {
+            return end;
         }
+        let epsilon = start + (end - start) * (frames as f64 / self.decay_frames as f64);
+        // Just before `decay_frames`, rounding may carry epsilon past `end`.
+        epsilon.clamp(start.min(end), start.max(end))
     }
 }
 

@@ -9,8 +9,8 @@ use std::{
 
 use anyhow::anyhow;
 use driml_protocol::{
-    BufferPool, CodecError, LogLimiter, PIECE_BYTES, PendingReply, RunClient, Shutdown, Silence,
-    Weights, WeightsAssembly, WeightsReply, WeightsRequest, WeightsVersion, fail_point, lock,
+    Buffer, BufferPool, CodecError, LogLimiter, PIECE_BYTES, RunClient, Shutdown, Silence, Weights,
+    WeightsReply, WeightsRequest, WeightsVersion, codec::PAYLOAD_BYTES_MAX, fail_point, lock,
     session::SessionError,
 };
 
@@ -124,8 +124,9 @@ pub(crate) fn wait_for_first(
 ) -> anyhow::Result<Option<Weights>> {
     let mut silence = Silence::with_try_timeout(PIECE_TIMEOUT);
     let mut log_limiter = LogLimiter::default();
+    let pool = BufferPool::new(PIECES_IN_FLIGHT_MAX);
     loop {
-        let pulled = pull(client, 0);
+        let pulled = pull(0, |request| send(client, &pool, request));
         let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
         if let Some(SessionError::Recovering(recovering)) = error {
             silence.record_answer();
@@ -176,6 +177,7 @@ pub(crate) fn start_puller(
         // The subscription lasts as long as the thread.
         let _announcements = announcements;
         let mut last_pull = Instant::now();
+        let pool = BufferPool::new(PIECES_IN_FLIGHT_MAX);
         while !shutdown.is_set() {
             fail_point::reach("weights-watch");
             let wanted = slot.wait_until_wanted(SHUTDOWN_CHECK_INTERVAL);
@@ -187,7 +189,7 @@ pub(crate) fn start_puller(
                 continue;
             };
             last_pull = Instant::now();
-            match pull(&client, version) {
+            match pull(version, |request| send(&client, &pool, request)) {
                 Ok(weights) => slot.finish_pull(weights),
                 // The actor is leaving and has closed its session.
                 Err(_) if client.session().is_closed() => return,
@@ -204,52 +206,69 @@ pub(crate) fn start_puller(
     Ok(newest)
 }
 
-/// Pulls the newest weights, piece by piece. Returns `None` if they are not newer than `version`.
-fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
-    let pool = BufferPool::new(PIECES_IN_FLIGHT_MAX);
-    let first = send(client, WeightsRequest::NewerThan(version))?;
-    let (reply, piece) = first.receive(&pool)?;
+/// Pulls the newest weights, piece by piece. `send` requests a piece and returns a function that waits for the reply. Returns `None` if the
+/// weights are not newer than `version`.
+fn pull<R>(
+    version: u64,
+    send: impl Fn(WeightsRequest) -> anyhow::Result<R>,
+) -> anyhow::Result<Option<Weights>>
+where
+    R: FnOnce() -> Result<(WeightsReply, Buffer), SessionError>,
+{
+    let (reply, first) = send(WeightsRequest::NewerThan(version))?()?;
     let WeightsReply::Piece {
-        weights,
+        weights: header,
         bytes,
-        offset,
+        ..
     } = reply
     else {
         return Ok(None);
     };
-    let mut assembly = WeightsAssembly::new(weights, bytes)?;
-    assembly.push(weights, offset, &piece)?;
-    let offsets = (assembly.next_offset()..assembly.bytes()).step_by(PIECE_BYTES);
-    let mut requests = offsets.map(|offset| WeightsRequest::Piece {
-        version: weights.version,
-        offset,
-    });
-    let mut pending = VecDeque::new();
-    while !assembly.is_complete() {
+    let version = header.version;
+    let error = |what: &str| Err(anyhow!("weights {version} {what}"));
+    if bytes > PAYLOAD_BYTES_MAX as u64 {
+        return error("are larger than a message may be");
+    }
+    let offsets = (PIECE_BYTES as u64..bytes).step_by(PIECE_BYTES);
+    let mut requests = offsets.map(|offset| WeightsRequest::Piece { version, offset });
+    let (mut safetensors, mut pending) = (first.to_vec(), VecDeque::new());
+    loop {
         while pending.len() < PIECES_IN_FLIGHT_MAX
             && let Some(request) = requests.next()
         {
-            pending.push_back(send(client, request)?);
+            pending.push_back(send(request)?);
         }
-        let error = |what: &str| anyhow!("weights {} {what}", weights.version);
-        let next = pending.pop_front();
-        let next = next.ok_or_else(|| error("have no last piece"))?;
-        let (reply, piece) = next.receive(&pool)?;
-        // Newer versions came so often that the replay server dropped this one.
-        let WeightsReply::Piece {
-            weights, offset, ..
-        } = reply
-        else {
-            return Err(error("were replaced too often while they were pulled"));
+        let Some(receive) = pending.pop_front() else {
+            break;
         };
-        assembly.push(weights, offset, &piece)?;
+        let (reply, piece) = receive()?;
+        // Newer versions came so often that the replay server dropped this one.
+        if !matches!(reply, WeightsReply::Piece { .. }) {
+            return error("were replaced too often while they were pulled");
+        }
+        if (safetensors.len() + piece.len()) as u64 > bytes {
+            return error("have more bytes than their first piece says");
+        }
+        safetensors.extend_from_slice(&piece);
     }
-    Ok(Some(assembly.finish()?))
+    // Any wrong, missing or misplaced piece changes the hash.
+    header.check_hash(&safetensors)?;
+    Ok(Some(Weights {
+        header,
+        safetensors,
+    }))
 }
 
-fn send(client: &RunClient, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
+/// Requests a piece. The returned function waits for the reply, and takes memory for it from `pool`.
+fn send(
+    client: &RunClient,
+    pool: &BufferPool,
+    request: WeightsRequest,
+) -> anyhow::Result<impl FnOnce() -> Result<(WeightsReply, Buffer), SessionError> + use<>> {
     let sent = client.send(client.encode(&request)?, PIECE_TIMEOUT);
-    sent.map_err(|e| anyhow!("requesting weights: {e}"))
+    let sent = sent.map_err(|e| anyhow!("requesting weights: {e}"))?;
+    let pool = pool.clone();
+    Ok(move || sent.receive(&pool))
 }
 
 #[cfg(test)]
@@ -301,5 +320,43 @@ mod tests {
         let taken = newest.take_within(Duration::from_secs(3600));
         assert_eq!(taken.unwrap().header.version, 2);
         pull.join().unwrap();
+    }
+
+    #[test]
+    fn pieces_make_the_whole_in_their_order_alone() {
+        let file: Vec<u8> = (0..6 * PIECE_BYTES + 10).map(|i| (i % 251) as u8).collect();
+        let header = WeightsHeader::new(3, 7, &file);
+        // Pulls from a replay server that serves `served` in place of the piece at `wrong`.
+        let pulled = |wrong: usize, served: &[u8]| {
+            pull(2, |request| {
+                let offset = match request {
+                    WeightsRequest::NewerThan(_) => 0,
+                    WeightsRequest::Piece { offset, .. } => offset,
+                };
+                let rest = &file[offset as usize..];
+                let piece = match offset == wrong as u64 {
+                    true => served,
+                    false => &rest[..rest.len().min(PIECE_BYTES)],
+                };
+                let piece = Buffer::from(piece.to_vec());
+                let reply = WeightsReply::Piece {
+                    weights: header,
+                    bytes: file.len() as u64,
+                    offset,
+                };
+                Ok(move || Ok((reply, piece)))
+            })
+        };
+        let whole = pulled(usize::MAX, &[]).unwrap().unwrap();
+        assert_eq!((whole.header, &whole.safetensors), (header, &file));
+        let (first, second) = file.split_at(PIECE_BYTES);
+        for (wrong, served) in [
+            (0, &first[1..]),
+            (PIECE_BYTES, first),
+            (0, &[]),
+            (0, second),
+        ] {
+            assert!(pulled(wrong, served).is_err(), "{wrong}");
+        }
     }
 }

@@ -4,12 +4,8 @@
 use std::{marker::PhantomData, time::Duration};
 
 use zenoh::{
-    Session, Wait,
-    bytes::ZBytes,
-    liveliness::LivelinessToken,
-    pubsub::{Publisher, Subscriber},
-    qos::CongestionControl,
-    sample::Sample,
+    Session, Wait, bytes::ZBytes, liveliness::LivelinessToken, pubsub::Subscriber,
+    qos::CongestionControl, sample::Sample,
 };
 
 use crate::{
@@ -154,19 +150,14 @@ impl RunClient {
         })
     }
 
-    /// Declares a publisher of messages of type `M`.
-    pub fn declare_announcer<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
-        let publisher = self
-            .session
-            .declare_publisher(self.keys.key::<M>())
+    /// Publishes a message to all current subscribers. A message that is lost on the way is not sent again.
+    pub fn publish<M: Keyed>(&self, message: &M) -> zenoh::Result<()> {
+        let encoded = EncodedMessage::new(message, self.spec_hash)?;
+        self.session
+            .put(self.keys.key::<M>(), encoded.bytes)
             .congestion_control(CongestionControl::Drop)
             .priority(M::PRIORITY)
-            .wait()?;
-        Ok(Announcer {
-            publisher,
-            spec_hash: self.spec_hash,
-            message: PhantomData,
-        })
+            .wait()
     }
 
     /// Calls `on_message` at each publication of `M`, until the returned subscriber is dropped. The call runs on the thread that reads the
@@ -189,22 +180,6 @@ impl RunClient {
     pub fn declare_alive(&self, who: Peer) -> zenoh::Result<LivelinessToken> {
         let token = self.session.liveliness();
         token.declare_token(self.keys.liveliness_key(who)).wait()
-    }
-}
-
-/// Publishes messages of type `M`. A message that is lost on the way is not sent again.
-#[derive(Debug)]
-pub struct Announcer<M> {
-    publisher: Publisher<'static>,
-    spec_hash: u64,
-    message: PhantomData<fn() -> M>,
-}
-
-impl<M: Message> Announcer<M> {
-    /// Publishes a message to all current subscribers.
-    pub fn publish(&self, message: &M) -> zenoh::Result<()> {
-        let encoded = EncodedMessage::new(message, self.spec_hash)?;
-        self.publisher.put(encoded.bytes).wait()
     }
 }
 

@@ -292,37 +292,30 @@ impl FromStr for WorldName {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let known = WorldName::all().find(|name| name.to_string() == text);
         let known = known.or_else(|| WorldName::parse_free_text(text));
-        known.ok_or_else(|| WorldNameError {
-            text: text.into(),
-            nearest: nearest_world(text),
-        })
+        known.ok_or_else(|| WorldNameError::new(text))
     }
 }
 
 /// The error for a text that names no world. The message lists all worlds and suggests the nearest if one is near.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct WorldNameError {
-    text: String,
-    nearest: Option<WorldName>,
-}
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct WorldNameError(String);
 
-impl fmt::Display for WorldNameError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "no world is named \"{}\"", self.text)?;
-        if let Some(name) = self.nearest {
-            write!(f, "; did you mean \"{name}\"?")?;
+impl WorldNameError {
+    fn new(text: &str) -> Self {
+        let mut why = format!("no world is named \"{text}\"");
+        if let Some(name) = nearest_world(text) {
+            why += &format!("; did you mean \"{name}\"?");
         }
-        if is_gymnasium_name(&self.text) {
-            let flags = match self.text.starts_with("ALE/") {
+        if is_gymnasium_name(text) {
+            let flags = match text.starts_with("ALE/") {
                 true => "--atari",
                 false => "--pixels --size 64 --grey",
             };
-            write!(
-                f,
-                "; a world of Gymnasium is \"exec:python3 deploy/python/driml_env.py {} {flags}\", \
-                 and deploy/docs/src/how-to/own-world.md says what that needs",
-                self.text
-            )?;
+            why += &format!(
+                "; a world of Gymnasium is \"exec:python3 deploy/python/driml_env.py {text} {flags}\", \
+                 and deploy/docs/src/how-to/own-world.md says what that needs"
+            );
         }
         let mut names = Vec::new();
         let mut listed = String::new();
@@ -340,11 +333,9 @@ impl fmt::Display for WorldNameError {
         }
         names.push(format!("{LIBENV_PREFIX}:PATH:GAME"));
         names.extend(plugin::registered_names().map(str::to_owned));
-        write!(f, " (the worlds: {}{listed})", names.join(", "))
+        Self(format!("{why} (the worlds: {}{listed})", names.join(", ")))
     }
 }
-
-impl std::error::Error for WorldNameError {}
 
 /// Whether a name has the form of Gymnasium's names: `ALE/Pong-v5`, `CartPole-v1`.
 fn is_gymnasium_name(text: &str) -> bool {

@@ -25,7 +25,6 @@ pub struct RestrictedWorld {
     actions: Vec<u8>,
     /// The actions of the step in progress [N], as `world` numbers them.
     step_actions: Vec<u8>,
-    whole_shape: FrameShape,
     shape: FrameShape,
     /// Whole frames of all environments: a reused buffer.
     whole_frames: Vec<u8>,
@@ -62,7 +61,6 @@ impl RestrictedWorld {
             world,
             actions,
             step_actions: Vec::with_capacity(envs),
-            whole_shape,
             shape,
             whole_frames: vec![0; envs * whole_shape.bytes()],
         }))
@@ -85,8 +83,9 @@ impl Environment for RestrictedWorld {
     fn observe(&mut self, frames: &mut [u8]) {
         check_frames(frames, self.num_envs(), self.shape);
         self.world.observe(&mut self.whole_frames);
-        let [whole_row, row] = [self.whole_shape, self.shape].map(|it| it.width * it.channels);
-        let whole = self.whole_frames.chunks_exact(self.whole_shape.bytes());
+        let whole_shape = self.world.frame_shape();
+        let [whole_row, row] = [whole_shape, self.shape].map(|it| it.width * it.channels);
+        let whole = self.whole_frames.chunks_exact(whole_shape.bytes());
         for (part, whole) in frames.chunks_exact_mut(self.shape.bytes()).zip(whole) {
             let rows = whole.chunks_exact(whole_row);
             for (part, whole) in part.chunks_exact_mut(row).zip(rows) {

@@ -296,10 +296,9 @@ impl Fetcher {
             return Err(e);
         }
         if partial.is_complete() {
-            let header = Batch::merged_header(&partial.parts);
-            let header = header.ok_or(BatchError::DifferentShards)?;
-            let memory = self.shared.pool.take_private(header.payload_bytes());
-            let batch = Batch::merge(&partial.parts, memory);
+            let allocate = |bytes| self.shared.pool.take_private(bytes);
+            let batch = Batch::merge(&partial.parts, allocate);
+            let batch = batch.ok_or(BatchError::DifferentShards)?;
             partial.parts.clear();
             let parts = std::mem::take(&mut partial.sources);
             partial.since_last_batch.record_answer();

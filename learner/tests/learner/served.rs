@@ -104,11 +104,9 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
         ..BatchHeader::largest(&config.spec, 6).with_sampling(&config.sampling)
     };
     let mut batch = WireBatch::from_rows(header, &rows, Buffer::zeroed);
-    let mut places = batch.states_mut();
-    for row in 0..6 {
-        for number in places.row_states(row).collect::<Vec<_>>() {
-            rng.fill(places.frame(number));
-        }
+    let states = batch.header.rows + batch.header.states_k + batch.header.states_n;
+    for number in 0..states as usize {
+        rng.fill(batch.frame_mut(number));
     }
     batch
 }

@@ -31,7 +31,7 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Creates a batch of `rows`, whose states the caller then writes with [`Batch::states_mut`]. The counts of rows and states come from
+    /// Creates a batch of `rows`, whose frames the caller then writes with [`Batch::frame_mut`]. The counts of rows and states come from
     /// `rows`, the count of frames from `header`. `allocate` returns a buffer of the given bytes, with arbitrary content.
     ///
     /// # Panics
@@ -90,14 +90,11 @@ impl Batch {
         }
     }
 
-    /// Merges the rows of all `parts`, one part after the other. `memory` may have arbitrary content, and has the payload bytes of
-    /// [`Batch::merged_header`].
-    ///
-    /// # Panics
-    /// If the parts have no common header, or the memory is of another size.
-    pub fn merge(parts: &[Self], memory: Buffer) -> Self {
-        let header = Self::merged_header(parts).expect("parts of one batch");
-        let mut merged = Self::with_buffer(header, memory);
+    /// Merges the rows of all `parts`, one part after the other; `None` if `parts` is empty or the parts differ in shape. `allocate` returns a
+    /// buffer of the given bytes, with arbitrary content.
+    pub fn merge(parts: &[Self], allocate: impl FnOnce(usize) -> Buffer) -> Option<Self> {
+        let header = Self::merged_header(parts)?;
+        let mut merged = Self::with_buffer(header, allocate(header.payload_bytes()));
         for (column, _) in header.columns() {
             let mut to = &mut merged.payload[header.range(column)];
             let pieces: Vec<_> = parts.iter().map(|part| part.split_column(column)).collect();
@@ -119,7 +116,7 @@ impl Batch {
             }
         }
         merged.origins = parts.iter().flat_map(|it| it.origins.clone()).collect();
-        merged
+        Some(merged)
     }
 
     /// The values of a column, split by positive; a column without positives is one piece.
@@ -142,8 +139,8 @@ impl Batch {
         }
     }
 
-    /// The header of [`Batch::merge`]; `None` if `parts` is empty or the parts differ in shape.
-    pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
+    /// The header of [`Batch::merge`].
+    fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
         // The fields that all parts must share.
         let shape = |it: &BatchHeader| {
             let frames = it.stacked.map(|it| StackedFrames { frames: 0, ..it });
@@ -304,9 +301,21 @@ impl Batch {
         })
     }
 
-    /// Borrows the places of all states that the rows have, for writing.
-    pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
-        BatchStatesMut::new(self.header, &mut self.payload)
+    /// The place of frame `number`, for writing. If a state is one frame, the frame has the state's number: first all s_t, then s_{t+k} in
+    /// the order of [P, B], then s_{t+n}, without those that rows lack.
+    pub fn frame_mut(&mut self, number: usize) -> &mut [u8] {
+        let bytes = self.header.frame_bytes();
+        &mut self.payload[number * bytes..][..bytes]
+    }
+
+    /// Writes the numbers of the frames of all states, one state after the other, each oldest first.
+    ///
+    /// # Panics
+    /// If a state is one frame, or the numbers are not those of all states.
+    pub fn set_stacks(&mut self, frames: &[u32]) {
+        assert!(self.header.stacked.is_some(), "states that are stacks");
+        let stacks = self.header.state_range();
+        StackedFrames::write_numbers(&mut self.payload[stacks], frames);
     }
 
     /// Header and payload, to be sent as a [`BatchReply`](super::batch_header::BatchReply).
@@ -348,70 +357,4 @@ impl RowScalars {
     pub const fn ks(&self) -> Range<u32> {
         self.k_first..self.k_first + self.positives
     }
-}
-
-/// The places of a batch's states and their frames, borrowed for writing.
-///
-/// States are numbered: first all s_t, then all s_{t+k}, then all s_{t+n}. If a state is one frame, the frame has the state's number.
-#[derive(Debug)]
-pub struct BatchStatesMut<'a> {
-    rows: usize,
-    frame_bytes: usize,
-    /// The frames in the payload.
-    frames: &'a mut [u8],
-    /// The numbers of each state's frames; empty if a state is one frame.
-    stacks: &'a mut [u8],
-    stack_bytes: usize,
-    /// The number of the state of each positive [P, B].
-    numbers_k: Vec<Option<usize>>,
-    /// The number of each row's s_{t+n} [B].
-    numbers_n: Vec<Option<usize>>,
-}
-
-impl<'a> BatchStatesMut<'a> {
-    /// Borrows the places in a payload whose scalars are written.
-    fn new(header: BatchHeader, payload: &'a mut [u8]) -> Self {
-        let rows = header.rows as usize;
-        let first_n = rows + header.states_k as usize;
-        let numbers_k = number_present(&header.positives_present(payload), rows);
-        let numbers_n = number_present(&header.bootstraps(payload), first_n);
-        let (count, frame_bytes) = header.frames();
-        let (frames, rest) = payload.split_at_mut(count * frame_bytes);
-        let stack_bytes = header.stacked.map_or(0, |it| it.stack_bytes());
-        let states = first_n + header.states_n as usize;
-        Self {
-            rows,
-            frame_bytes,
-            frames,
-            stacks: &mut rest[..states * stack_bytes],
-            stack_bytes,
-            numbers_k,
-            numbers_n,
-        }
-    }
-
-    /// The numbers of the states that `row` has: of s_t, of s_{t+n}, and of s_{t+k} of each positive, in this order.
-    pub fn row_states(&self, row: usize) -> impl Iterator<Item = usize> {
-        let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
-        let first = [Some(row), self.numbers_n[row]];
-        first.into_iter().chain(of_positives.copied()).flatten()
-    }
-
-    /// The place of frame `number`, for writing.
-    pub fn frame(&mut self, number: usize) -> &mut [u8] {
-        &mut self.frames[number * self.frame_bytes..][..self.frame_bytes]
-    }
-
-    /// Writes the numbers of the frames of state `number`, oldest first.
-    pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
-        let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
-        StackedFrames::write_numbers(stack, frames);
-    }
-}
-
-/// Numbers the entries of `present` that are true, from `first` on.
-fn number_present(present: &[bool], first: usize) -> Vec<Option<usize>> {
-    let mut numbers = first..;
-    let number = |&is_present: &bool| is_present.then(|| numbers.next()).flatten();
-    present.iter().map(number).collect()
 }

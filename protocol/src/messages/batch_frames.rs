@@ -52,10 +52,10 @@ impl StackedFrames {
         frame_numbers(stacks).find(|number| *number >= self.frames)
     }
 
-    /// Writes the frame numbers `frames` of a state into `stack`, oldest first.
-    pub(super) fn write_numbers(stack: &mut [u8], frames: &[u32]) {
-        let (places, _) = stack.as_chunks_mut::<{ size_of::<FrameNumber>() }>();
-        assert_eq!(places.len(), frames.len(), "a number for each of a stack");
+    /// Writes the frame numbers `frames` of all states into `stacks`.
+    pub(super) fn write_numbers(stacks: &mut [u8], frames: &[u32]) {
+        let (places, _) = stacks.as_chunks_mut::<{ size_of::<FrameNumber>() }>();
+        assert_eq!(places.len(), frames.len(), "a number for each place");
         for (place, number) in places.iter_mut().zip(frames) {
             *place = number.to_le_bytes();
         }

@@ -100,16 +100,19 @@ impl BatchHeader {
                     self.rows
                 )));
             }
-            if let Some(number) = stacked.first_unknown(self.state_columns(payload)) {
+            if let Some(number) = stacked.first_unknown(&payload[self.state_range()]) {
                 return Err(CodecError::Header(format!(
                     "a state has frame {number}, but the batch has {} frames",
                     stacked.frames
                 )));
             }
         }
-        let rows = (self.positives_present(payload), self.bootstraps(payload));
-        let count = |present: &[bool]| present.iter().filter(|it| **it).count();
-        let counted = (count(&rows.0), count(&rows.1));
+        let valid = payload[self.range(Column::PositiveValid)].iter();
+        let discounts = self.f32s(Column::BootstrapDiscount, payload);
+        let counted = (
+            valid.filter(|valid| **valid != 0).count(),
+            discounts.filter(|discount| *discount != 0.0).count(),
+        );
         if counted != (self.states_k as usize, self.states_n as usize) {
             return Err(CodecError::Header(format!(
                 "rows with {} positives and {} bootstraps come with {} and {} states",
@@ -159,9 +162,7 @@ impl BatchHeader {
         let rows = u128::from(self.rows);
         let positives = rows * u128::from(self.positives);
         let by_priority = self.origin.map_or(0, |_| rows);
-        let frames = |it: StackedFrames| {
-            u128::from(it.frames) * it.frame_bytes(self.state_bytes as usize) as u128
-        };
+        let frames = |it: StackedFrames| u128::from(it.frames) * self.frame_bytes() as u128;
         let states = |count: u32| u128::from(count) * self.value_bytes() as u128;
         [
             (Column::Frames, self.stacked.map_or(0, frames)),
@@ -216,20 +217,9 @@ impl BatchHeader {
         values.iter().copied().map(f32::from_le_bytes)
     }
 
-    /// Whether each row [B] bootstraps, from a payload whose scalars are written.
-    pub(super) fn bootstraps(&self, payload: &[u8]) -> Vec<bool> {
-        let discounts = self.f32s(Column::BootstrapDiscount, payload);
-        discounts.map(|discount| discount != 0.0).collect()
-    }
-
-    /// Whether each positive [P, B] exists, from a payload whose scalars are written.
-    pub(super) fn positives_present(&self, payload: &[u8]) -> Vec<bool> {
-        let valid = payload[self.range(Column::PositiveValid)].iter();
-        valid.map(|&valid| valid != 0).collect()
-    }
-
-    fn state_columns<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
-        &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
+    /// The range of all columns of states.
+    pub(super) fn state_range(&self) -> Range<usize> {
+        self.range(Column::StatesT).start..self.range(Column::StatesN).end
     }
 
     /// Bytes of a value in a column of states: a whole state, or the numbers of its frames.
@@ -238,13 +228,11 @@ impl BatchHeader {
         stacked.map_or(self.state_bytes as usize, StackedFrames::stack_bytes)
     }
 
-    /// The number of frames in the payload, and the bytes of each. Without stacks, each state is a frame.
-    pub(super) fn frames(&self) -> (usize, usize) {
+    /// Bytes of one frame. Without stacks, each state is a frame.
+    pub(super) fn frame_bytes(&self) -> usize {
         let state_bytes = self.state_bytes as usize;
-        match self.stacked {
-            None => (self.states() as usize, state_bytes),
-            Some(stacked) => (stacked.frames as usize, stacked.frame_bytes(state_bytes)),
-        }
+        self.stacked
+            .map_or(state_bytes, |it| it.frame_bytes(state_bytes))
     }
 }
 

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::status::Waiting;
+use super::{join::ActorJoin, status::Waiting};
 use crate::wire::{
     error::CodecError,
     keys::{Peer, ProcessName},
@@ -21,13 +21,8 @@ pub const WARNINGS_MAX: usize = 64;
 /// One incarnation of a process, by a number that only this process and the replay server know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Participant {
-    /// An actor, by its number and the incarnation that acts now.
-    Actor {
-        /// The actor's number in the run.
-        actor: u32,
-        /// The actor's incarnation.
-        incarnation: u64,
-    },
+    /// An actor, as it joined.
+    Actor(ActorJoin),
     /// A learner, by its number.
     Learner(u64),
 }
@@ -36,7 +31,7 @@ impl Participant {
     /// The process as other processes see it by its liveliness token.
     pub fn peer(self) -> Peer {
         match self {
-            Self::Actor { actor, incarnation } => Peer::actor(actor, incarnation),
+            Self::Actor(join) => Peer::actor(join.actor, join.incarnation),
             Self::Learner(learner) => Peer::learner(learner),
         }
     }
@@ -108,7 +103,7 @@ impl Report {
 
     pub(super) fn actor(&self) -> Option<u32> {
         match self.who {
-            Participant::Actor { actor, .. } => Some(actor),
+            Participant::Actor(join) => Some(join.actor),
             Participant::Learner(_) => None,
         }
     }

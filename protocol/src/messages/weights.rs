@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::check_no_payload};
+use crate::wire::{error::CodecError, message::check_no_payload};
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
@@ -88,7 +88,7 @@ pub enum WeightsReply {
 impl WeightsReply {
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
-            // [`WeightsAssembly`] checks that the piece is the expected one.
+            // The actor checks the hash once all pieces have arrived.
             Self::Piece { .. } => Ok(()),
             Self::NoneNewer | Self::Gone => check_no_payload(payload),
         }
@@ -119,113 +119,5 @@ impl WeightsHeader {
                 "the weights' SHA-256 is not the one announced".into(),
             ))
         }
-    }
-}
-
-/// Weights of which some pieces have arrived.
-#[derive(Debug)]
-pub struct WeightsAssembly {
-    weights: WeightsHeader,
-    bytes: usize,
-    received: Vec<u8>,
-}
-
-impl WeightsAssembly {
-    /// Starts to receive weights of `bytes` bytes in all.
-    pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
-        let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
-        CodecError::check_size(bytes, PAYLOAD_BYTES_MAX)?;
-        Ok(Self {
-            weights,
-            bytes,
-            received: Vec::new(),
-        })
-    }
-
-    /// Appends the next piece.
-    ///
-    /// # Errors
-    /// The piece is of other weights or is not the next one. It is then dropped.
-    pub fn push(
-        &mut self,
-        weights: WeightsHeader,
-        offset: u64,
-        piece: &[u8],
-    ) -> Result<(), CodecError> {
-        let left = self.bytes - self.received.len();
-        if weights != self.weights
-            || offset != self.next_offset()
-            || piece.len() != left.min(PIECE_BYTES)
-        {
-            return Err(CodecError::Header(format!(
-                "received {} bytes at {offset} of weights {}, expected {} at {} of weights {}",
-                piece.len(),
-                weights.version,
-                left.min(PIECE_BYTES),
-                self.next_offset(),
-                self.weights.version
-            )));
-        }
-        self.received.extend_from_slice(piece);
-        Ok(())
-    }
-
-    /// Position at which the next piece starts, bytes.
-    pub const fn next_offset(&self) -> u64 {
-        self.received.len() as u64
-    }
-
-    /// Bytes of the whole safetensors file.
-    pub const fn bytes(&self) -> u64 {
-        self.bytes as u64
-    }
-
-    /// Whether all pieces have arrived.
-    pub const fn is_complete(&self) -> bool {
-        self.received.len() == self.bytes
-    }
-
-    /// Returns the whole weights, after checking their hash.
-    pub fn finish(self) -> Result<Weights, CodecError> {
-        self.weights.check_hash(&self.received)?;
-        Ok(Weights {
-            header: self.weights,
-            safetensors: self.received,
-        })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn pieces_make_the_whole_in_their_order_alone() {
-        let file: Vec<u8> = (0..PIECE_BYTES + 10).map(|i| (i % 251) as u8).collect();
-        let weights = WeightsHeader::new(3, 7, &file);
-        let mut assembly = WeightsAssembly::new(weights, file.len() as u64).unwrap();
-        let (first, second) = file.split_at(PIECE_BYTES);
-        let at = PIECE_BYTES as u64;
-        assert!(assembly.push(weights, at, first).is_err(), "not its turn");
-        assert!(assembly.push(weights, 0, &first[1..]).is_err(), "too short");
-        let other = WeightsHeader {
-            version: 4,
-            ..weights
-        };
-        assert!(assembly.push(other, 0, first).is_err(), "of other weights");
-        assembly.push(weights, 0, first).unwrap();
-        assert!(!assembly.is_complete());
-        assembly.push(weights, at, second).unwrap();
-        assert!(assembly.is_complete());
-        let whole = Weights {
-            header: weights,
-            safetensors: file.clone(),
-        };
-        assert_eq!(assembly.finish().unwrap(), whole);
-
-        let mut damaged = WeightsAssembly::new(weights, 10).unwrap();
-        damaged.push(weights, 0, second).unwrap();
-        assert!(damaged.finish().is_err(), "another SHA-256");
-        assert!(WeightsAssembly::new(weights, u64::MAX).is_err());
     }
 }

@@ -6,8 +6,8 @@ use driml_protocol::{
 };
 
 use crate::samples::{
-    ORIGIN, SPEC, STACKED, batch, batch_from, encoded, prioritised_batch, refusal, rows,
-    stacked_batch,
+    ORIGIN, SPEC, STACKED, STACKS, batch, batch_from, encoded, prioritised_batch, refusal, rows,
+    stacked_batch, used_memory,
 };
 
 fn received(bytes: &[u8]) -> Batch {
@@ -59,9 +59,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     second.set_draws(&[(10, 0.5), (11, 0.25), (12, 0.25)]);
     back.scale_probabilities(0.25);
     second.scale_probabilities(0.75);
-    let parts = [back, second];
-    let whole = Batch::merged_header(&parts).unwrap();
-    let merged = Batch::merge(&parts, Buffer::zeroed(whole.payload_bytes()));
+    let merged = Batch::merge(&[back, second], Buffer::zeroed).unwrap();
     let scaled = [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875];
     assert_eq!(merged.probabilities().unwrap(), scaled);
     let found = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0];
@@ -71,8 +69,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
         part(other, &[10, 11, 12], &found[3..]),
     ];
     assert_eq!(update.parts, expected);
-    let mixed = [merged, plain];
-    assert_eq!(Batch::merged_header(&mixed), None);
+    assert_eq!(Batch::merge(&[merged, plain], Buffer::zeroed), None);
 }
 
 /// A run with stacks sends each frame once.
@@ -102,12 +99,11 @@ fn parts_of_stacks_are_merged() {
     let first = stacked_batch(None);
     let mut second = stacked_batch(None);
     for frame in 0..5 {
-        second.states_mut().frame(frame).fill(150 + frame as u8);
+        second.frame_mut(frame).fill(150 + frame as u8);
     }
     let parts = [first, second, stacked_batch(None)];
-    let whole = Batch::merged_header(&parts).unwrap();
-    assert_eq!(whole.stacked.unwrap().frames, 15);
-    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let merged = Batch::merge(&parts, used_memory).unwrap();
+    assert_eq!(merged.header.stacked.unwrap().frames, 15);
     let planes = |batch: &Batch| {
         [batch.states_t(), batch.states_k(), batch.states_n()].map(|plane| plane.to_vec())
     };
@@ -129,7 +125,8 @@ fn parts_of_stacks_are_merged() {
     ] {
         let mut other_part = part.clone();
         other_part.header.stacked = other;
-        assert_eq!(Batch::merged_header(&[part.clone(), other_part]), None);
+        let parts = [part.clone(), other_part];
+        assert_eq!(Batch::merge(&parts, Buffer::zeroed), None);
     }
 }
 
@@ -138,7 +135,9 @@ fn stacks_that_cannot_be_are_refused() {
     let said = |header, payload: Buffer| refusal(&BatchReply::Batch(header), &payload);
     for number in [5, 6, u32::MAX] {
         let mut wrong = stacked_batch(None);
-        wrong.states_mut().set_stack(5, &[0, number]);
+        let [stacks @ .., _] = STACKS;
+        let stacks = [&stacks[..], &[number]].concat();
+        wrong.set_stacks(&stacks);
         let (header, payload) = wrong.into_payload();
         let (said, why) = (said(header, payload), format!("a state has frame {number}"));
         assert!(
@@ -237,15 +236,15 @@ fn parts_are_merged_row_by_row() {
         };
         let rows: Vec<_> = values.clone().map(scalars).collect();
         let mut batch = Batch::from_rows(header, &rows, Buffer::zeroed);
-        let mut places = batch.states_mut();
-        for (row, value) in values.enumerate() {
-            let numbers: Vec<_> = places.row_states(row).collect();
-            let n = value.is_multiple_of(2).then_some(value + 20);
-            let k = [40, 60, 80].map(|more| value + more);
-            let bytes = [value].into_iter().chain(n).chain(k);
-            for (number, byte) in numbers.into_iter().zip(bytes) {
-                places.frame(number).fill(byte);
-            }
+        // s_t is the value; s_{t+n} is 20 more, s_{t+k} of the positives 40, 60 and 80.
+        let k = (0..3).flat_map(|p| {
+            let with_positive = rows.iter().filter(move |row| row.positives > p);
+            with_positive.map(move |row| row.action + 40 + 20 * p as u8)
+        });
+        let n = rows.iter().filter(|row| row.bootstraps());
+        let n = n.map(|row| row.action + 20);
+        for (number, byte) in values.chain(k).chain(n).enumerate() {
+            batch.frame_mut(number).fill(byte);
         }
         batch
     };
@@ -254,8 +253,8 @@ fn parts_are_merged_row_by_row() {
         part(header(4.0, (9, 5)), 4..6),
         part(header(1.0, (8, 4)), 6..8),
     ];
-    let whole = Batch::merged_header(&parts).unwrap();
-    let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
+    let merged = Batch::merge(&parts, used_memory).unwrap();
+    let whole = merged.header;
     let expected = part(whole, 0..8);
     assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
     assert_eq!((whole.counts.inserted, whole.held), (30, 15));
@@ -269,6 +268,7 @@ fn parts_are_merged_row_by_row() {
         ..header(0.0, (1, 1))
     };
     let other = part(other, 0..1);
-    assert_eq!(Batch::merged_header(&[parts[0].clone(), other]), None);
-    assert_eq!(Batch::merged_header(&[]), None);
+    let parts = [parts[0].clone(), other];
+    assert_eq!(Batch::merge(&parts, Buffer::zeroed), None);
+    assert_eq!(Batch::merge(&[], Buffer::zeroed), None);
 }

@@ -122,6 +122,11 @@ pub(crate) fn rows() -> Vec<RowScalars> {
     (0..).zip(rows).map(scalars).collect()
 }
 
+/// Memory for a batch, with arbitrary content.
+pub(crate) fn used_memory(bytes: usize) -> Buffer {
+    Buffer::from(vec![0xAB; bytes])
+}
+
 pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
     let header = BatchHeader {
         rows: 3,
@@ -139,13 +144,10 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
         origin,
         stacked: None,
     };
-    let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::from_rows(header, &rows(), used_memory);
     assert_eq!(batch.header, header);
-    let mut places = batch.states_mut();
-    let numbers = |row| places.row_states(row).collect::<Vec<_>>();
-    assert_eq!([0, 1, 2].map(numbers), [vec![0, 3], vec![1], vec![2, 5, 4]]);
     for (number, byte) in [10, 11, 12, 30, 32, 22].into_iter().enumerate() {
-        places.frame(number).fill(byte);
+        batch.frame_mut(number).fill(byte);
     }
     batch
 }
@@ -156,23 +158,21 @@ pub(crate) const STACKED: StackedFrames = StackedFrames {
     frame_channels: 1,
 };
 
+/// The numbers of the frames of each state: s_t of all rows; s_{t+k} of the first and the last; s_{t+n} of the last.
+pub(crate) const STACKS: [u32; 12] = [0, 0, 0, 1, 1, 2, 0, 1, 3, 4, 4, 4];
+
 /// The same rows with states that are stacks of two of five frames.
 pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     let header = BatchHeader {
         stacked: Some(STACKED),
         ..batch_from(origin).header
     };
-    let mut batch = Batch::from_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
+    let mut batch = Batch::from_rows(header, &rows(), used_memory);
     assert_eq!(batch.header, header);
-    let mut places = batch.states_mut();
     for frame in 0..5 {
-        places.frame(frame).fill(50 + frame as u8);
+        batch.frame_mut(frame).fill(50 + frame as u8);
     }
-    // s_t of all rows; s_{t+k} of the first and the last; s_{t+n} of the last.
-    let stacks = [[0, 0], [0, 1], [1, 2], [0, 1], [3, 4], [4, 4]];
-    for (state, stack) in stacks.iter().enumerate() {
-        places.set_stack(state, stack);
-    }
+    batch.set_stacks(&STACKS);
     if origin.is_some() {
         batch.set_draws(&[(1, 0.5), (2, 0.5), (3, 0.5)]);
     }

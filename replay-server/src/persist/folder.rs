@@ -6,19 +6,27 @@ use std::{
     fs::{self, File},
     io,
     path::{Path, PathBuf},
+    time::Duration,
 };
 
-use driml_protocol::{PROTOCOL_VERSION, atomic_write, lock_file};
+use driml_protocol::{PROTOCOL_VERSION, RunSpec, TRANSITION_BYTES, atomic_write, codec, lock_file};
 use serde::{Deserialize, Serialize};
 
-use super::snapshot::Snapshot;
+use super::{record, snapshot::Snapshot};
+use crate::config::{Config, SEGMENT_BYTES_MIN};
 
 /// Format of the log (thousands) and of the messages in it (ones). A log of another format is rejected.
-pub(super) const LOG_FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
+const LOG_FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
 /// The file that identifies the log.
 const ID_FILE: &str = "log.toml";
 /// Maximum number of a segment. Files with higher numbers do not belong to a log.
 const SEGMENT_NUMBER_MAX: u64 = 1 << 60;
+/// Default period between flushes of the log.
+const FSYNC_DEFAULT: Duration = Duration::from_secs(1);
+/// Maximum segment size unless it is given: small enough that the log keeps little beyond the content of the ring.
+const SEGMENT_BYTES_MAX: u64 = 1 << 26;
+/// Number of segments that the ring or the disk budget should span at least.
+const SEGMENTS_MIN: u64 = 16;
 
 /// Why a replay cannot be read from or written to its folder.
 #[derive(Debug, thiserror::Error)]
@@ -79,24 +87,71 @@ pub(super) struct SegmentHeader {
     pub(super) snapshot: Snapshot,
 }
 
-/// A folder that this process has locked.
-pub(super) struct LogFolder {
-    pub(super) path: PathBuf,
+/// Where a replay is kept on disk, and which shard of the run it is.
+#[derive(Clone, Debug)]
+pub struct PersistArgs {
+    /// The folder, for this replay alone.
+    pub dir: PathBuf,
+    /// The number of the shard, from 0.
+    pub shard: u32,
+    /// Size from which a segment is followed by another. Default: a size that suits the ring.
+    pub segment_bytes: Option<u64>,
+    /// The mark to which the log is rolled back: all records after it are removed.
+    pub mark: Option<Mark>,
+}
+
+/// The size limits of a log, and how often it is flushed.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct LogLimits {
+    /// Size from which a segment is followed by another.
+    pub(super) segment_bytes: u64,
+    pub(super) disk_bytes_max: Option<u64>,
+    /// Period between flushes of the log; zero flushes after each write.
+    pub(super) fsync_period: Duration,
+}
+
+/// The folder of a replay of this run, locked for this process.
+pub struct ReplayFolder {
+    pub(crate) path: PathBuf,
+    pub(super) id: LogId,
+    pub(super) limits: LogLimits,
+    /// The mark at which the log is to end, if any: then all state is restored.
+    pub(super) mark: Option<Mark>,
     _lock: File,
 }
 
-impl LogFolder {
-    /// Creates the folder if it does not exist, and locks it against other servers.
-    pub(super) fn open(path: &Path) -> Result<Self, PersistError> {
+impl ReplayFolder {
+    /// Creates the folder if it does not exist, locks it against other servers, and checks that a log in it belongs to this run. Does not
+    /// read the log, which may take long.
+    pub fn open(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
+        config.check_on_disk()?;
+        let path = &args.dir;
         fs::create_dir_all(path).map_err(io_error("making", path))?;
         let lock = path.join(".lock");
         let lock = lock_file::acquire(&lock, "start no other replay server there")
             .map_err(io_error("locking", &lock))?
-            .ok_or_else(|| PersistError::InUse(path.to_owned()))?;
-        Ok(Self {
-            path: path.to_owned(),
+            .ok_or_else(|| PersistError::InUse(path.clone()))?;
+        let mut folder = Self {
+            path: path.clone(),
+            id: LogId {
+                format: LOG_FORMAT,
+                identity: rand::random(),
+                spec_hash: spec.hash(),
+                shard: (args.shard, config.shards),
+            },
+            limits: log_limits(args, spec, config),
+            mark: args.mark,
             _lock: lock,
-        })
+        };
+        let known = match folder.read_id()? {
+            Some(id) => Some(id),
+            None => folder.find_id()?,
+        };
+        if let Some(known) = known {
+            folder.check_same_run(&known)?;
+            folder.id = known;
+        }
+        Ok(folder)
     }
 
     pub(super) fn segment_path(&self, number: u64) -> PathBuf {
@@ -142,7 +197,7 @@ impl LogFolder {
         fs::remove_file(&path).map_err(io_error("removing", &path))
     }
 
-    pub(super) fn read_id(&self) -> Result<Option<LogId>, PersistError> {
+    fn read_id(&self) -> Result<Option<LogId>, PersistError> {
         let path = self.path.join(ID_FILE);
         let text = match fs::read_to_string(&path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -154,16 +209,29 @@ impl LogFolder {
         })
     }
 
-    pub(super) fn write_id(&self, id: &LogId) -> Result<(), PersistError> {
+    /// Returns the identity of the log from the newest segment that can be read; `None` if none can.
+    fn find_id(&self) -> Result<Option<LogId>, PersistError> {
+        for number in self.segment_numbers()?.into_iter().rev() {
+            if let Ok(record) = record::read_first(&self.read_segment(number)?)
+                && let Ok(header) = codec::decode_value::<SegmentHeader>(record.body)
+            {
+                return Ok(Some(header.log));
+            }
+        }
+        Ok(None)
+    }
+
+    pub(super) fn write_id(&self) -> Result<(), PersistError> {
         let path = self.path.join(ID_FILE);
-        let text = toml::to_string(id).expect("a struct of numbers is TOML");
+        let text = toml::to_string(&self.id).expect("a struct of numbers is TOML");
         let text =
             format!("# The replay that a replay server of driml keeps in this folder.\n{text}");
         atomic_write::write(&path, text.as_bytes()).map_err(io_error("writing", &path))
     }
 
-    /// Checks that `found` is the log of the run and shard of `ours`.
-    pub(super) fn check_same_run(&self, found: &LogId, ours: &LogId) -> Result<(), PersistError> {
+    /// Checks that `found` is the log of this run and shard.
+    fn check_same_run(&self, found: &LogId) -> Result<(), PersistError> {
+        let ours = &self.id;
         let unusable = |why| Err(PersistError::Unusable(self.path.clone(), why));
         if found.format != LOG_FORMAT {
             return unusable(format!(
@@ -183,5 +251,20 @@ impl LogFolder {
         unusable(format!(
             "holds the replay of another run ({why}): use that run's settings, or choose another --replay-dir"
         ))
+    }
+}
+
+/// Returns the size of a segment, the disk budget of the shard, and the period between flushes.
+fn log_limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> LogLimits {
+    let shards = u64::from(config.shards);
+    let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
+    let transition_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;
+    let ring = (config.capacity_transitions / shards).saturating_mul(transition_bytes);
+    let all = disk_bytes_max.map_or(ring, |max| max.min(ring));
+    let fitting = (all / SEGMENTS_MIN).clamp(SEGMENT_BYTES_MIN, SEGMENT_BYTES_MAX);
+    LogLimits {
+        segment_bytes: args.segment_bytes.unwrap_or(fitting),
+        disk_bytes_max,
+        fsync_period: config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis),
     }
 }

@@ -14,7 +14,7 @@ use std::{
 use driml_protocol::{LogLimiter, LogStatus, codec};
 
 use super::{
-    folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader, io_error},
+    folder::{Mark, PersistError, ReplayFolder, SegmentHeader, io_error},
     record::{self, RecordKind},
     snapshot::{ProcessEvent, Snapshot},
     sync::Syncer,
@@ -49,16 +49,6 @@ pub(super) struct LogPosition {
     pub(super) mark: Option<(Mark, u64)>,
 }
 
-/// The size limits of a log, and how often it is flushed.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct LogLimits {
-    /// Size from which a segment is followed by another.
-    pub(super) segment_bytes: u64,
-    pub(super) disk_bytes_max: Option<u64>,
-    /// Period between flushes of the log; zero flushes after each write.
-    pub(super) fsync_period: Duration,
-}
-
 struct WriteFailure {
     since: Instant,
     /// The text of the last error.
@@ -67,13 +57,11 @@ struct WriteFailure {
 
 /// The writing side of a log.
 pub(crate) struct Journal {
-    folder: LogFolder,
-    id: LogId,
+    folder: ReplayFolder,
     /// All segments in the folder, oldest first. Records are written to the last one.
     segments: VecDeque<Segment>,
     pub(super) file: Arc<File>,
     ordinal: u64,
-    limits: LogLimits,
     /// Bytes of the largest record so far. A segment may exceed its length by this much.
     largest: u64,
     syncer: Syncer,
@@ -88,29 +76,25 @@ pub(crate) struct Journal {
 }
 
 impl Journal {
-    /// Continues the log `id` from `place` on, in a new segment that begins with `snapshot`.
+    /// Continues the log in `folder` from `position` on, in a new segment that begins with `snapshot`.
     pub(super) fn begin(
-        folder: LogFolder,
-        id: LogId,
+        folder: ReplayFolder,
         position: LogPosition,
-        limits: LogLimits,
         snapshot: &Snapshot,
     ) -> Result<Self, PersistError> {
         let syncer = File::open(&folder.path)
-            .and_then(|opened| Syncer::start(opened, limits.fsync_period))
+            .and_then(|opened| Syncer::start(opened, folder.limits.fsync_period))
             .map_err(io_error("opening", &folder.path))?;
         let (number, mut segments) = (position.next_segment, position.segments);
-        let begun = create_segment(&folder, id, number, position.next_ordinal, snapshot);
+        let begun = create_segment(&folder, number, position.next_ordinal, snapshot);
         let (segment, file) = begun.map_err(io_error("writing", &folder.segment_path(number)))?;
         segments.push_back(segment);
         syncer.add_segment(number, file.clone());
         Ok(Self {
             folder,
-            id,
             segments,
             file,
             ordinal: position.next_ordinal + 1,
-            limits,
             largest: 0,
             syncer,
             pending: Vec::new(),
@@ -122,7 +106,7 @@ impl Journal {
     }
 
     pub(crate) const fn spec_hash(&self) -> u64 {
-        self.id.spec_hash
+        self.folder.id.spec_hash
     }
 
     pub(crate) fn flush(&mut self) {
@@ -135,7 +119,7 @@ impl Journal {
         LogStatus {
             folder: self.folder.path.display().to_string(),
             bytes: self.bytes(),
-            bytes_max: self.limits.disk_bytes_max,
+            bytes_max: self.folder.limits.disk_bytes_max,
             flushed_s: self.syncer.since_flush_s(),
             refused: refused.map(|it| (it.since.elapsed().as_secs_f64(), it.why.clone())),
             unwritten_bytes: self.pending.len() as u64,
@@ -244,12 +228,12 @@ impl Journal {
     /// Returns the size from which a segment with such a snapshot is followed by another.
     fn rotation_bytes(&self, snapshot_bytes: u64) -> u64 {
         let least = SNAPSHOTS_PER_SEGMENT_MIN * snapshot_bytes;
-        self.limits.segment_bytes.max(least)
+        self.folder.limits.segment_bytes.max(least)
     }
 
     /// If the disk budget has no room for a new segment with `snapshot`, returns the oldest transition that may stay.
     pub(super) fn oldest_within_budget(&self, snapshot: impl FnOnce() -> Snapshot) -> Option<u64> {
-        let max = self.limits.disk_bytes_max?;
+        let max = self.folder.limits.disk_bytes_max?;
         let mut bytes = self.bytes() + self.rotation_bytes(snapshot().bytes()) + self.largest;
         let mut keep = None;
         for (segment, next) in self.segments.iter().zip(self.segments.iter().skip(1)) {
@@ -270,7 +254,7 @@ impl Journal {
         }
         let number = self.newest_segment().number + 1;
         // The record that closes the old segment gets the ordinal before this one.
-        let begun = create_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
+        let begun = create_segment(&self.folder, number, self.ordinal + 1, snapshot);
         let (segment, file) = match begun {
             Ok(begun) => begun,
             Err(e) => return self.record_rotation_failure(&e),
@@ -344,14 +328,13 @@ impl Journal {
 
 /// Creates a segment whose only record has the ordinal `ordinal`. Leaves no file if the write fails.
 fn create_segment(
-    folder: &LogFolder,
-    log: LogId,
+    folder: &ReplayFolder,
     number: u64,
     ordinal: u64,
     snapshot: &Snapshot,
 ) -> io::Result<(Segment, Arc<File>)> {
     let header = SegmentHeader {
-        log,
+        log: folder.id,
         number,
         snapshot: snapshot.clone(),
     };

@@ -22,7 +22,6 @@ mod upkeep;
 #[cfg(test)]
 mod tests;
 
-pub use folder::{Mark, PersistError};
+pub use folder::{Mark, PersistArgs, PersistError, ReplayFolder};
 pub use recover::{RecoveryControl, RecoveryReport};
 pub(crate) use upkeep::shard_dir;
-pub use upkeep::{PersistArgs, ReplayFolder};

@@ -12,7 +12,7 @@ use std::{
 use driml_protocol::{BufferPool, Chunk, RecoveryProgress, Shutdown, codec};
 
 use super::{
-    folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader},
+    folder::{Mark, PersistError, ReplayFolder, SegmentHeader},
     journal::{LogPosition, Segment},
     record::{self, ORDINAL_MAX, Record, RecordError, RecordKind},
     snapshot::ProcessEvent,
@@ -66,7 +66,7 @@ pub struct RecoveryReport {
     pub warnings: Vec<String>,
 }
 
-pub(super) fn roll_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
+pub(super) fn roll_back(folder: &ReplayFolder, mark: Mark) -> Result<(), PersistError> {
     let no_mark = || PersistError::NoMark(folder.segment_path(mark.0));
     let numbers = folder.segment_numbers()?;
     if !numbers.contains(&mark.0) {
@@ -83,25 +83,11 @@ pub(super) fn roll_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistErr
     folder.truncate_segment(mark.0, first.bytes())
 }
 
-/// Returns the identity of the log in `folder`, from the newest segment that can be read; `None` if none can.
-pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
-    for number in folder.segment_numbers()?.into_iter().rev() {
-        if let Ok(record) = record::read_first(&folder.read_segment(number)?)
-            && let Ok(header) = codec::decode_value::<SegmentHeader>(record.body)
-        {
-            return Ok(Some(header.log));
-        }
-    }
-    Ok(None)
-}
-
-/// Restores `replay`, which must be empty, from the segments of log `id` in `folder`. With `mark`, which must be the end of the log, all of
+/// Restores `replay`, which must be empty, from the segments of the log in `folder`. With a mark, which must be the end of the log, all of
 /// the replay's state is taken from the mark's snapshot.
 pub(super) fn recover(
-    folder: &LogFolder,
-    id: LogId,
+    folder: &ReplayFolder,
     replay: &mut Replay,
-    mark: Option<Mark>,
     control: &RecoveryControl,
 ) -> Result<(LogPosition, RecoveryReport), PersistError> {
     let numbers = folder.segment_numbers()?;
@@ -109,7 +95,6 @@ pub(super) fn recover(
     replay.is_recovering = true;
     let mut reader = LogReader {
         folder,
-        id,
         replay,
         packer,
         pool: BufferPool::new(2),
@@ -120,7 +105,6 @@ pub(super) fn recover(
         recovery: RecoveryReport::default(),
         oldest: 0,
         has_same_capacity: false,
-        mark,
         unusable: Vec::new(),
     };
     let bytes = |&number| fs::metadata(folder.segment_path(number)).map_or(0, |it| it.len());
@@ -152,8 +136,7 @@ pub(super) fn recover(
 
 /// Reads a log into a replay.
 struct LogReader<'a> {
-    folder: &'a LogFolder,
-    id: LogId,
+    folder: &'a ReplayFolder,
     replay: &'a mut Replay,
     packer: Packer,
     pool: BufferPool,
@@ -163,8 +146,6 @@ struct LogReader<'a> {
     oldest: u64,
     /// Whether the ring has the capacity that it had before and no limit in bytes, so that the number stored tells which are held.
     has_same_capacity: bool,
-    /// The mark at which the log ends, if any: then all state is restored.
-    mark: Option<Mark>,
     /// Segments that cannot be used. They are renamed once it is known that others can.
     unusable: Vec<PathBuf>,
 }
@@ -195,7 +176,7 @@ impl LogReader<'_> {
             self.mark_unusable(path, "its beginning is damaged");
             return Ok(());
         };
-        if header.log != self.id {
+        if header.log != self.folder.id {
             self.warn(format!("{name} is not of this log and was left unchanged"));
             return Ok(());
         }
@@ -209,7 +190,7 @@ impl LogReader<'_> {
             |why: String| PersistError::Unusable(path.clone(), format!("cannot be used: {why}"));
         let snapshot = header.snapshot;
         let is_prioritised = self.replay.config.sampling.is_prioritised();
-        if self.mark == Some(Mark(number)) {
+        if self.folder.mark == Some(Mark(number)) {
             if snapshot.rows.is_prioritised() != is_prioritised {
                 let why = "replay.sampling differs from the rule that was used before".into();
                 return Err(unusable(why));
@@ -296,7 +277,7 @@ impl LogReader<'_> {
             RecordKind::Closed => Ok(()),
             RecordKind::Segment => Err("a segment begins within another".into()),
             RecordKind::Chunk => {
-                let (hash, len) = (self.id.spec_hash, record.body.len());
+                let (hash, len) = (self.folder.id.spec_hash, record.body.len());
                 let chunk = codec::decode_from(record.body, len, &self.pool, Some(hash))
                     .and_then(|(header, payload)| Chunk::from_payload(header, payload))
                     .map_err(|e| e.to_string())?;
@@ -355,7 +336,7 @@ impl LogReader<'_> {
         }
         let replay = self.replay;
         replay.is_recovering = false;
-        if self.recovery.found && self.mark.is_none() {
+        if self.recovery.found && self.folder.mark.is_none() {
             // Draws since the last snapshot are unknown: the learner reports their number, and another random stream is used from here on.
             replay.awaits_row_count = replay.state.learner.is_some();
             replay.state.set_rng_stream(replay.origin.shard, end);

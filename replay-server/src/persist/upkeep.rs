@@ -1,47 +1,24 @@
-//! Connects a replay to its log: opens the folder, begins segments and sets marks as the replay runs, takes and restores snapshots.
+//! Connects a replay to its log: recovers the replay, begins segments and sets marks as the replay runs, takes and restores snapshots.
 //! `journal` writes the log; `recover` reads it. A replay in memory has no log, and these methods do nothing.
 
 use std::{
     borrow::Cow,
     path::{Path, PathBuf},
-    time::Duration,
 };
 
-use driml_protocol::{
-    Chunk, ChunkHeader, CodecError, End, RunSpec, Shutdown, TRANSITION_BYTES, codec,
-};
+use driml_protocol::{Chunk, ChunkHeader, CodecError, End, RunSpec, Shutdown, codec};
 
 use super::{
-    folder::{LOG_FORMAT, LogFolder, LogId, Mark, PersistError},
-    journal::{Journal, LogLimits},
-    recover::{RecoveryControl, RecoveryReport, find_id, recover, roll_back},
+    folder::{Mark, PersistArgs, PersistError, ReplayFolder},
+    journal::Journal,
+    recover::{RecoveryControl, RecoveryReport, recover, roll_back},
     snapshot::{ProcessEvent, ReplayState, Snapshot},
 };
 use crate::{
-    config::{Config, SEGMENT_BYTES_MIN},
+    config::Config,
     replay::Replay,
     storage::ring::{Link, Step},
 };
-
-/// Default period between flushes of the log.
-const FSYNC_DEFAULT: Duration = Duration::from_secs(1);
-/// Maximum segment size unless it is given: small enough that the log keeps little beyond the content of the ring.
-const SEGMENT_BYTES_MAX: u64 = 1 << 26;
-/// Number of segments that the ring or the disk budget should span at least.
-const SEGMENTS_MIN: u64 = 16;
-
-/// Where a replay is kept on disk, and which shard of the run it is.
-#[derive(Clone, Debug, Default)]
-pub struct PersistArgs {
-    /// The folder, for this replay alone.
-    pub dir: PathBuf,
-    /// The number of the shard, from 0.
-    pub shard: u32,
-    /// Size from which a segment is followed by another. Default: a size that suits the ring.
-    pub segment_bytes: Option<u64>,
-    /// The mark to which the log is rolled back: all records after it are removed.
-    pub mark: Option<Mark>,
-}
 
 impl Replay {
     /// Opens the replay of a run in a folder: restores it if it was kept there before, otherwise creates an empty one.
@@ -57,43 +34,7 @@ impl Replay {
     }
 }
 
-/// The folder of a replay of this run, locked for this process. Its log is not read yet.
-pub struct ReplayFolder {
-    mark: Option<Mark>,
-    id: LogId,
-    limits: LogLimits,
-    folder: LogFolder,
-}
-
 impl ReplayFolder {
-    /// Locks the folder, and checks that a log in it belongs to this run. Does not read the log, which may take long.
-    pub fn open(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
-        config.check_on_disk()?;
-        let folder = LogFolder::open(&args.dir)?;
-        let ours = LogId {
-            format: LOG_FORMAT,
-            identity: rand::random(),
-            spec_hash: spec.hash(),
-            shard: (args.shard, config.shards),
-        };
-        let known = match folder.read_id()? {
-            Some(id) => Some(id),
-            None => find_id(&folder)?,
-        };
-        let id = known.unwrap_or(ours);
-        folder.check_same_run(&id, &ours)?;
-        Ok(Self {
-            mark: args.mark,
-            id,
-            limits: log_limits(args, spec, config),
-            folder,
-        })
-    }
-
-    pub(crate) fn dir(&self) -> &Path {
-        &self.folder.path
-    }
-
     /// Reads the log into `replay`, which must be empty.
     ///
     /// # Errors
@@ -104,34 +45,17 @@ impl ReplayFolder {
         mut replay: Replay,
         control: &RecoveryControl,
     ) -> Result<(Replay, RecoveryReport), PersistError> {
-        let (folder, id) = (self.folder, self.id);
         if let Some(mark) = self.mark {
-            roll_back(&folder, mark)?;
+            roll_back(&self, mark)?;
         }
-        let (position, recovery) = recover(&folder, id, &mut replay, self.mark, control)?;
+        let (position, recovery) = recover(&self, &mut replay, control)?;
         if !recovery.found {
-            folder.write_id(&id)?;
+            self.write_id()?;
         }
         let snapshot = replay.snapshot();
-        let journal = Journal::begin(folder, id, position, self.limits, &snapshot)?;
-        replay.journal = Some(journal);
+        replay.journal = Some(Journal::begin(self, position, &snapshot)?);
         replay.rotate_and_prune();
         Ok((replay, recovery))
-    }
-}
-
-/// Returns the size of a segment, the disk budget of the shard, and the period between flushes.
-fn log_limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> LogLimits {
-    let shards = u64::from(config.shards);
-    let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
-    let transition_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;
-    let ring = (config.capacity_transitions / shards).saturating_mul(transition_bytes);
-    let all = disk_bytes_max.map_or(ring, |max| max.min(ring));
-    let fitting = (all / SEGMENTS_MIN).clamp(SEGMENT_BYTES_MIN, SEGMENT_BYTES_MAX);
-    LogLimits {
-        segment_bytes: args.segment_bytes.unwrap_or(fitting),
-        disk_bytes_max,
-        fsync_period: config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis),
     }
 }
 

@@ -2,9 +2,9 @@
 //! Compressed frames leave the replay compressed, and are unpacked without a lock.
 //! The rate limiter decides whether a batch may be drawn.
 
-use std::{collections::HashMap, iter, ops::Range, sync::Arc};
+use std::{collections::HashMap, ops::Range, sync::Arc};
 
-use driml_protocol::{Batch, BatchHeader, BatchStatesMut, Buffer, RunSpec, Sampling};
+use driml_protocol::{Batch, BatchHeader, Buffer, RunSpec, Sampling};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
@@ -56,9 +56,11 @@ impl BatchSampler {
         alloc: impl FnOnce(usize) -> Buffer,
     ) -> Option<PackedBatch> {
         let rows = header.rows as usize;
-        let (mut scalars, mut anchors) = (Vec::with_capacity(rows), Vec::with_capacity(rows));
-        // The states of all rows; those of a row are in the order of `BatchStatesMut::of_row`.
-        let mut states: Vec<RowState> = Vec::new();
+        let mut scalars = Vec::with_capacity(rows);
+        // The states by their numbers in the batch: s_t, then s_{t+k} of each positive, then s_{t+n}.
+        let mut states = Vec::with_capacity(rows);
+        let mut states_k = vec![Vec::with_capacity(rows); header.positives as usize];
+        let mut states_n = Vec::with_capacity(rows);
         let mut age_total = 0;
         for row in 0..rows {
             if !self.rows.draw(ring, rng, &mut self.window) {
@@ -66,51 +68,42 @@ impl BatchSampler {
             }
             let window = &self.window;
             let (row_scalars, bootstrap) = self.assembler.assemble(affinity, window, rng);
-            let ks = row_scalars.ks().map(|k| k as usize);
-            let steps = iter::once(0).chain(bootstrap).chain(ks);
-            states.extend(steps.map(|i| RowState {
+            let state = |i| NeededFrame {
                 row,
                 index: window.index(i),
-            }));
+            };
+            states.push(state(0));
+            states_n.extend(bootstrap.map(state));
+            for (states, k) in states_k.iter_mut().zip(row_scalars.ks()) {
+                states.push(state(k as usize));
+            }
             scalars.push(row_scalars);
-            anchors.push(window.index(0));
             age_total += ring.inserted() - 1 - window.index(0);
             let version = window.step(0).weights_version;
             let (newest, oldest) = header.weights_versions;
             header.weights_versions = (newest.max(version), oldest.min(version));
         }
         header.mean_age = age_total as f64 / rows as f64;
-        let shared = header.stacked.as_mut().map(|stacked| {
-            let shared = SharedFrames::collect(ring, &self.rules, &states);
-            stacked.frames = shared.frames.len() as u32;
-            shared
-        });
-        let mut batch = Batch::from_rows(header, &scalars, alloc);
         // Computed after all draws: a draw that finds an invalid anchor zeroes its mass, which makes the others more likely.
-        let probability = |anchor| {
-            let probability = self.rows.probability(anchor)? as f32;
-            Some((anchor, probability.clamp(f32::MIN_POSITIVE, 1.0)))
+        let draw = |anchor: &NeededFrame| {
+            let probability = self.rows.probability(anchor.index)? as f32;
+            Some((anchor.index, probability.clamp(f32::MIN_POSITIVE, 1.0)))
         };
-        let draws = anchors.into_iter().map(probability);
-        if let Some(draws) = draws.collect::<Option<Vec<_>>>() {
+        let draws: Option<Vec<_>> = states.iter().map(draw).collect();
+        states.extend(states_k.into_iter().flatten().chain(states_n));
+        let (mut frames, mut stacks) = (states, Vec::new());
+        if let Some(stacked) = &mut header.stacked {
+            (frames, stacks) = self.share_frames(ring, &frames);
+            stacked.frames = frames.len() as u32;
+        }
+        let mut batch = Batch::from_rows(header, &scalars, alloc);
+        if let Some(draws) = draws {
             batch.set_draws(&draws);
         }
-        let mut target = batch.states_mut();
-        let numbers: Vec<usize> = (0..rows).flat_map(|row| target.row_states(row)).collect();
-        let frames: Vec<NeededFrame> = match shared {
-            None => {
-                let frame = |(RowState { row, index }, place)| NeededFrame { row, index, place };
-                states.into_iter().zip(numbers).map(frame).collect()
-            }
-            Some(SharedFrames { frames, stacks }) => {
-                let stacks = stacks.chunks_exact(self.rules.frame_stack);
-                for (number, stack) in numbers.into_iter().zip(stacks) {
-                    target.set_stack(number, stack);
-                }
-                frames
-            }
-        };
-        let packed_frames = write_or_defer(ring, &frames, &mut target);
+        if header.stacked.is_some() {
+            batch.set_stacks(&stacks);
+        }
+        let packed_frames = write_or_defer(ring, &frames, &mut batch);
         let ks = scalars.iter().map(|row| row.ks().max().unwrap_or(0));
         Some(PackedBatch {
             batch,
@@ -119,38 +112,30 @@ impl BatchSampler {
             ks: ks.collect(),
         })
     }
-}
 
-/// A state of a row, with the ring index of its newest frame.
-struct RowState {
-    row: usize,
-    index: u64,
-}
-
-/// The distinct frames of stacked states, in the order in which rows need them. States of a row share frames, and sometimes rows do.
-/// The ring index identifies a frame: frames at two indices are distinct even if they look the same.
-struct SharedFrames {
-    frames: Vec<NeededFrame>,
-    /// The places of each state's frames in the batch, oldest first.
-    stacks: Vec<u32>,
-}
-
-impl SharedFrames {
-    fn collect(ring: &Ring, rules: &AnchorRules, states: &[RowState]) -> Self {
+    /// Returns the distinct frames of stacked `states`, and the places of each state's frames among them, oldest first. States of a row share
+    /// frames, and sometimes rows do. The ring index identifies a frame: frames at two indices are distinct even if they look the same.
+    fn share_frames(&self, ring: &Ring, states: &[NeededFrame]) -> (Vec<NeededFrame>, Vec<u32>) {
         let (mut frames, mut stacks) = (Vec::new(), Vec::new());
         let mut places = HashMap::new();
-        for &RowState { row, index } in states {
-            for index in rules.stack_indices(ring, index) {
+        for &NeededFrame { row, index } in states {
+            for index in self.rules.stack_indices(ring, index) {
                 let place = places.entry(index).or_insert_with(|| {
-                    let place = frames.len();
-                    frames.push(NeededFrame { row, index, place });
-                    place as u32
+                    frames.push(NeededFrame { row, index });
+                    frames.len() as u32 - 1
                 });
                 stacks.push(*place);
             }
         }
-        Self { frames, stacks }
+        (frames, stacks)
     }
+}
+
+/// A frame that a batch needs, or the newest frame of a state: the first row that needs it, and its ring index.
+#[derive(Clone, Copy)]
+struct NeededFrame {
+    row: usize,
+    index: u64,
 }
 
 /// A batch that is complete except for frames still to be unpacked.
@@ -158,20 +143,13 @@ impl SharedFrames {
 pub struct PackedBatch {
     pub(crate) batch: Batch,
     layout: BlockLayout,
-    /// The frames to unpack, row by row; empty if the batch has all its frames.
+    /// The frames to unpack; empty if the batch has all its frames.
     packed_frames: Vec<PackedFrame>,
     /// The k of each row, the largest if there are several; 0 if there is none.
     pub(crate) ks: Vec<u32>,
 }
 
-/// A frame that a batch needs: the first row that needs it, its ring index, and its place in the batch.
-struct NeededFrame {
-    row: usize,
-    index: u64,
-    place: usize,
-}
-
-/// A needed frame that is compressed: its block, and its position there.
+/// A needed frame that is compressed: its place in the batch, its block, and its position there.
 struct PackedFrame {
     row: usize,
     place: usize,
@@ -179,22 +157,18 @@ struct PackedFrame {
     position: usize,
 }
 
-/// Writes plain frames to their places in the batch. Of compressed frames returns what is needed to write them later.
-fn write_or_defer(
-    ring: &Ring,
-    needed: &[NeededFrame],
-    target: &mut BatchStatesMut<'_>,
-) -> Vec<PackedFrame> {
+/// Writes plain frames to the batch, in the order of `needed`. Of compressed frames returns what is needed to write them later.
+fn write_or_defer(ring: &Ring, needed: &[NeededFrame], batch: &mut Batch) -> Vec<PackedFrame> {
     match ring.frames() {
         FrameStore::Plain(frames) => {
-            for &NeededFrame { index, place, .. } in needed {
-                let frame = frames.frame(ring.slot(index));
-                target.frame(place).copy_from_slice(frame);
+            for (place, needed) in needed.iter().enumerate() {
+                let frame = frames.frame(ring.slot(needed.index));
+                batch.frame_mut(place).copy_from_slice(frame);
             }
             Vec::new()
         }
         FrameStore::Compressed(frames) => {
-            let packed = |&NeededFrame { row, index, place }: &NeededFrame| {
+            let packed = |(place, &NeededFrame { row, index }): (usize, &NeededFrame)| {
                 let (block, position) = frames.block(index);
                 PackedFrame {
                     row,
@@ -203,7 +177,7 @@ fn write_or_defer(
                     position,
                 }
             };
-            needed.iter().map(packed).collect()
+            needed.iter().enumerate().map(packed).collect()
         }
     }
 }
@@ -214,16 +188,16 @@ impl PackedBatch {
         let Self {
             mut batch,
             layout,
-            packed_frames,
+            mut packed_frames,
             ..
         } = self;
-        let mut target = batch.states_mut();
         let mut cache = UnpackCache {
             layout,
             parts: Vec::new(),
             bytes: Vec::new(),
         };
         // Unpacks a part once per row, as rows seldom share parts.
+        packed_frames.sort_unstable_by_key(|frame| frame.row);
         for row in packed_frames.chunk_by(|one, next| one.row == next.row) {
             cache.parts.clear();
             for frame in row {
@@ -232,7 +206,7 @@ impl PackedBatch {
                 let at = cache.part_offset(&frame.block, part);
                 let at = at + (frame.position - first) * layout.frame_bytes;
                 let bytes = &cache.bytes[at..at + layout.frame_bytes];
-                target.frame(frame.place).copy_from_slice(bytes);
+                batch.frame_mut(frame.place).copy_from_slice(bytes);
             }
         }
         batch

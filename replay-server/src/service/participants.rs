@@ -209,7 +209,7 @@ fn elapsed_s(now: Instant, since: Instant) -> f64 {
 mod tests {
     use std::time::Duration;
 
-    use driml_protocol::Participant;
+    use driml_protocol::{ActorJoin, Participant};
 
     use super::*;
 
@@ -230,9 +230,9 @@ mod tests {
         participants.mark_seen(actor(1), Some(7), at(6));
         participants.mark_seen(actor(9), Some(8), at(7));
         let report = |incarnation| {
-            let (actor, warning) = (3, Some(Warning::new("late", 1.0)));
-            let who = Participant::Actor { actor, incarnation };
-            Report::new(who, "plays", 2.0, warning)
+            let actor = 3;
+            let who = Participant::Actor(ActorJoin { actor, incarnation });
+            Report::new(who, "plays", 2.0, Some(Warning::new("late", 1.0)))
         };
         assert!(participants.store_report(report(1), at(8)));
         assert!(!participants.store_report(report(9), at(8)));
@@ -305,7 +305,7 @@ mod tests {
         let mut participants = Participants::new(now);
         for actor in 0..200 {
             let incarnation = 1;
-            let who = Participant::Actor { actor, incarnation };
+            let who = Participant::Actor(ActorJoin { actor, incarnation });
             participants.add_joined(who.peer(), now);
             // Warnings of actors with higher numbers are newer, and many have the same age.
             let age = f64::from((200 - actor) / 50);

@@ -10,8 +10,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, QueryWorkers, Request, RunClient,
-    RunSpec, Sampling, Shutdown,
+    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, Request, RunClient, RunSpec,
+    Sampling, Shutdown, answer_queries,
     config::{Settings, TransportConfig},
     fail_point, join_within,
     session::{self, Endpoints},
@@ -119,15 +119,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         limits.largest_bytes(),
     )?;
     let client = RunClient::new(session, keys, spec.hash());
-    let declare_error =
-        |e: zenoh::Error| anyhow::anyhow!("declaring the replay server's queries: {e}");
     let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
         recovery: RecoveryControl::new(args.drain.clone()),
         config_toml: args.config_toml.clone(),
     });
     let declared = Queries::declare(&client, &gate, limits, &config.sampling);
-    let (queryables, mut threads) = declared.map_err(declare_error)?;
+    let (queryables, mut threads) =
+        declared.map_err(|e| anyhow::anyhow!("declaring what the replay server answers: {e}"))?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
@@ -171,7 +170,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
-        announcements: client.declare_announcer().map_err(declare_error)?,
+        client: client.clone(),
         shutdown: shutdown.clone(),
     });
     let (subscriber, members) = watch_members(&client, &service)
@@ -220,7 +219,7 @@ fn recover_replay(
     control: &RecoveryControl,
     spec_hash: u64,
 ) -> Result<(Replay, WeightsStore), PersistError> {
-    let (started, folder) = (Instant::now(), kept.dir().to_owned());
+    let (started, folder) = (Instant::now(), kept.path.clone());
     let (replay, recovery) = kept.recover(empty, control)?;
     let dir = folder.display();
     for warning in &recovery.warnings {
@@ -303,20 +302,20 @@ impl<'a> Queries<'a> {
         bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
-        let (gate, spec_hash) = (self.gate.clone(), self.client.spec_hash());
+        let gate = self.gate.clone();
         let answer = move |incoming: Incoming<R>| match gate.service.get() {
             Some(service) => answer(service, incoming),
             None => incoming.into_responder().retry_later(&gate.retry_reply()),
         };
-        let workers = QueryWorkers::start(name, threads, spec_hash, answer)?;
         let gate = self.gate.clone();
         let reject_long = move |bytes| match gate.service.get() {
             Some(service) => service.reject_too_long(name, bytes, bytes_max),
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };
-        let queryable = workers.declare(self.client, bytes_max, reject_long)?;
+        let (queryable, workers) =
+            answer_queries(self.client, name, threads, bytes_max, answer, reject_long)?;
         self.queryables.push(queryable);
-        self.threads.extend(workers.into_threads());
+        self.threads.extend(workers);
         Ok(())
     }
 }

@@ -9,8 +9,8 @@ use std::{
 };
 
 use driml_protocol::{
-    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiter, Recovering,
-    Request, Responder, Shutdown, WeightsVersion, lock,
+    BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiter, Recovering, Request,
+    Responder, RunClient, Shutdown, lock,
 };
 
 use super::{
@@ -40,7 +40,7 @@ pub(super) struct Service {
     /// Signalled when something was stored, sampled or parked: threads then check the parked chunks and requests again.
     pub(super) changed: Condvar,
     pub(super) weights: Mutex<WeightsStore>,
-    pub(super) announcements: Announcer<WeightsVersion>,
+    pub(super) client: RunClient,
     pub(super) shutdown: Shutdown,
 }
 

@@ -31,7 +31,7 @@ impl Service {
                 let now = Instant::now();
                 self.state().timings.record_weights(&weights, now);
                 let version = weights.version;
-                if let Err(why) = self.announcements.publish(&WeightsVersion { version }) {
+                if let Err(why) = self.client.publish(&WeightsVersion { version }) {
                     tracing::warn!("weights {version} were not announced: {why}");
                 }
             }

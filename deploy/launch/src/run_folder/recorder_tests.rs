@@ -32,7 +32,7 @@ fn point(updates: u64) -> ResumePoint {
 }
 
 fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
-    let epsilon = Schedule::Linear {
+    let epsilon = Schedule {
         start: 0.5,
         end: 0.1,
         decay_frames: 4_000,

@@ -29,8 +29,6 @@ pub enum Boundary {
 /// absent site has spin 0 and no bonds.
 #[derive(Clone, Debug)]
 pub struct IsingLattice {
-    height: usize,
-    width: usize,
     /// Spins [H * W], then one absent site, which stands for all sites beyond the rim.
     spins: Vec<i8>,
     neighbours: Vec<[u32; NEIGHBOURS]>,
@@ -86,8 +84,6 @@ impl IsingLattice {
                 .map(|i| i as u32)
         };
         let mut lattice = Self {
-            height,
-            width,
             spins: vec![0; height * width + 1],
             neighbours: (0..height * width)
                 .map(|i| neighbours_of(i, height, width, boundary))
@@ -114,7 +110,7 @@ impl IsingLattice {
     /// # Errors
     /// Spins that are not -1 or +1 exactly where there is a site, and 0 elsewhere.
     pub fn set_spins(&mut self, spins: &[i8]) -> Result<(), EnvError> {
-        let current = &mut self.spins[..self.height * self.width];
+        let current = &mut self.spins[..self.neighbours.len()];
         // 1 where there is a site, else 0.
         let mask = |spin: &i8| spin.unsigned_abs();
         let fits = spins.iter().map(mask).eq(current.iter().map(mask));
@@ -139,7 +135,7 @@ impl IsingLattice {
 
     /// Spins [H, W] in row order; 0 where there is no site.
     pub fn spins(&self) -> &[i8] {
-        &self.spins[..self.height * self.width]
+        &self.spins[..self.neighbours.len()]
     }
 
     fn neighbour_sum(&self, site: usize) -> i32 {
@@ -196,7 +192,8 @@ fn accept_below(temperature: f64) -> [u64; 2 * NEIGHBOURS + 1] {
     })
 }
 
-fn neighbours_of(
+/// Returns the sites up, down, left and right of `site`; `height * width` stands for one that does not exist.
+pub(crate) fn neighbours_of(
     site: usize,
     height: usize,
     width: usize,

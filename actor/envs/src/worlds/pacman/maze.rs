@@ -5,6 +5,8 @@ use std::sync::LazyLock;
 
 use serde::{Deserialize, Serialize};
 
+use crate::worlds::ising::{Boundary, neighbours_of};
+
 /// Rows of the maze, one pixel each.
 pub(crate) const HEIGHT: usize = 21;
 /// Columns of the maze, one pixel each.
@@ -92,7 +94,8 @@ impl Maze {
             place(pixel).expect("a start is an open cell")
         };
         let next_of = |from: usize| {
-            adjacent_pixels(pixels[from].into()).map(|pixel| place(pixel).unwrap_or(from as Place))
+            let around = neighbours_of(pixels[from].into(), HEIGHT, WIDTH, Boundary::Periodic);
+            around.map(|pixel| place(pixel as usize).unwrap_or(from as Place))
         };
         let next: Vec<_> = (0..pixels.len()).map(next_of).collect();
         let open = |from: usize| {
@@ -156,18 +159,6 @@ impl Maze {
         let rows = LAYOUT.iter();
         rows.flat_map(|row| row.map(|c| c == b'#')).collect()
     }
-}
-
-/// The pixels up, down, left and right of `pixel`, wrapping around the rim.
-fn adjacent_pixels(pixel: usize) -> [usize; DIRECTIONS] {
-    let (row, column) = (pixel / WIDTH, pixel % WIDTH);
-    let at = |row: usize, column: usize| row % HEIGHT * WIDTH + column % WIDTH;
-    [
-        at(row + HEIGHT - 1, column),
-        at(row + 1, column),
-        at(row, column + WIDTH - 1),
-        at(row, column + 1),
-    ]
 }
 
 /// The pixel in which the run of open cells through `pixel` begins: along its row, and along its column.

@@ -36,7 +36,7 @@ fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let listed: Vec<u64> = neighbours.chain([u64::MAX]).collect();
     let mut frames = cases.listed_or(&[listed], |rng| (0..4).map(|_| draw_count(rng)).collect());
     frames.sort_unstable();
-    let schedule = Schedule::Linear {
+    let schedule = Schedule {
         start,
         end,
         decay_frames,
