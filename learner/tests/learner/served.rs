@@ -159,13 +159,13 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         learn(&mut straight, 0..8);
         let mut half = new_learner(&config);
         learn(&mut half, 0..4);
-        half.save(folder.path()).unwrap();
-        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, folder.path()).unwrap();
+        half.save(folder.path(), None).unwrap();
+        let mut resumed = new_learner(&config).resume(folder.path()).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
-        straight.save(&a).unwrap();
-        resumed.save(&b).unwrap();
+        straight.save(&a, None).unwrap();
+        resumed.save(&b, None).unwrap();
         let mut files = vec![
             "online.safetensors",
             "target.safetensors",
@@ -189,9 +189,9 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
     let folder = tempdir().unwrap();
     let config = config(CURL, Some(PAPER));
-    new_learner(&config).save(folder.path()).unwrap();
+    new_learner(&config).save(folder.path(), None).unwrap();
     let path = folder.path().join("checkpoint-000000000000");
-    let resume = || Learner::resume(config.clone(), &Compute::CPU, folder.path()).map(|_| ());
+    let resume = || new_learner(&config).resume(folder.path()).map(drop);
     resume().unwrap();
     fs::remove_file(path.join("key.safetensors")).unwrap();
     let missing = "key.safetensors is damaged: it is missing";
