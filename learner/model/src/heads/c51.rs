@@ -11,7 +11,7 @@ use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
 use crate::heads::noise::HeadNoise;
-use crate::heads::streams::Streams;
+use crate::heads::streams::{HeadLayer, merge};
 use crate::kernels::exponentials::exp_minus_max;
 use crate::kernels::tensors::values_of;
 use crate::layers::Layer;
@@ -23,7 +23,7 @@ const TASK_DISTRIBUTIONS: usize = 256;
 #[derive(Debug)]
 pub(crate) struct C51Head {
     kernels: Kernels,
-    streams: Streams,
+    layers: Vec<HeadLayer<Tensor>>,
     actions: usize,
     atoms: usize,
     support: Vec<f32>,
@@ -37,7 +37,7 @@ impl C51Head {
     ) -> Result<Self> {
         Ok(Self {
             kernels,
-            streams: Streams::new(config, parameters)?,
+            layers: HeadLayer::collect(config, |layer, part| parameters.tensor(layer, part))?,
             actions: config.num_actions,
             atoms: config.atoms,
             support: config.atoms_support(),
@@ -47,7 +47,7 @@ impl C51Head {
     /// Computes the logits [B, A, atoms] of f4 [B, hidden] before its ReLU. Without noise, noisy layers use their means.
     pub(crate) fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let layer = self.streams.merged_layer(noise)?;
+        let layer = merge(&self.layers, self.atoms, noise)?;
         let logits = self.kernels.linear(&active, &layer.weight, &layer.bias)?;
         Ok(logits.reshape(((), self.actions, self.atoms))?)
     }
@@ -60,7 +60,7 @@ impl C51Head {
         noise: Option<&HeadNoise>,
     ) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let Layer { weight, bias } = self.streams.merged_layer(noise)?;
+        let Layer { weight, bias } = merge(&self.layers, self.atoms, noise)?;
         let (kernels, atoms) = (self.kernels, self.atoms);
         Ok(kernels.grouped_linear(&active, &weight, &bias, actions, atoms)?)
     }
