@@ -323,8 +323,7 @@ impl Agent {
         adam_step: u64,
         moments: HashMap<String, Tensor>,
     ) -> Result<(), UpdateError> {
-        self.adam
-            .restore(adam_step, moments, &self.networks.compute.device)?;
+        self.adam.restore(adam_step, moments)?;
         self.updates = updates;
         Ok(())
     }
