@@ -38,7 +38,7 @@ pub struct NetworkParameters {
 /// An agent: online and target network, key encoder, optimiser, count of updates.
 #[derive(Debug)]
 pub struct Agent {
-    networks: Networks,
+    pub(crate) networks: Networks,
     target: Parameters,
     key_encoder: Option<Parameters>,
     /// Torso and head of the averaged network; `None` before the first update, and without `average_tau`.
@@ -323,8 +323,7 @@ impl Agent {
         adam_step: u64,
         moments: HashMap<String, Tensor>,
     ) -> Result<(), UpdateError> {
-        self.adam
-            .restore(adam_step, moments, &self.networks.compute.device)?;
+        self.adam.restore(adam_step, moments)?;
         self.updates = updates;
         Ok(())
     }

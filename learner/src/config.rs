@@ -11,8 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     affinity::{
-        AffinityError, AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity,
-        LearnedSettings,
+        AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
     },
     augment::AugmentSettings,
     auxiliary::positives::Positives,
@@ -103,7 +102,7 @@ impl AffinityConfig {
             ConfigError::new(&format!("learner.affinity.{key}"), "(missing)", why)
         };
         let name = format!("{:?}", self.estimator);
-        let bad = |e: AffinityError| ConfigError::new("learner.affinity", &name, e);
+        let bad = |e: UpdateError| ConfigError::new("learner.affinity", &name, e);
         // Tables that the chosen estimator does not use are checked too.
         let learned = self.learned.map_or(Ok(()), |it| it.check_valid());
         let exact = self.exact.map_or(Ok(()), |it| it.check_valid());
@@ -181,23 +180,6 @@ impl Config {
     }
 }
 
-/// Why a learner cannot work with a run's settings.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "each message says it")]
-pub enum LearnerConfigError {
-    /// The text is not TOML, a table is missing or does not fit, or a value of `[run]` or `[learner]` is invalid.
-    #[error(transparent)]
-    Tables(#[from] ConfigError),
-    #[error(transparent)]
-    Model(#[from] driml_model::ModelError),
-    #[error(transparent)]
-    Update(#[from] UpdateError),
-    #[error(
-        "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml train`"
-    )]
-    Sizes,
-}
-
 /// The settings of a run that its learner needs.
 #[derive(Clone, Debug)]
 pub struct LearnerConfig {
@@ -227,7 +209,7 @@ impl LearnerConfig {
     ///
     /// # Errors
     /// A table that is missing or does not fit, or invalid values.
-    pub fn from_toml(text: &str) -> Result<Self, LearnerConfigError> {
+    pub fn from_toml(text: &str) -> Result<Self, UpdateError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
@@ -258,7 +240,7 @@ impl LearnerConfig {
             && this.model.f3_shape() == whole.f3_shape()
             && this.input.resizer(frame_size, &this.model).is_ok();
         if !sizes_follow {
-            return Err(LearnerConfigError::Sizes);
+            return Err(UpdateError::ModelSizes);
         }
         Ok(this)
     }

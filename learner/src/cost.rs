@@ -98,19 +98,23 @@ impl UpdateCost {
         }
     }
 
+    /// All parts, with their names in a table.
+    pub const fn parts(&self) -> [(&'static str, u64); 8] {
+        [
+            ("s_t, torso", self.online),
+            ("s_t, C51 head", self.head),
+            ("s_{t+n}, target network", self.target),
+            ("s_{t+n}, online network", self.double_dqn),
+            ("more states, torso", self.states),
+            ("states, key encoder", self.keys),
+            ("psi and phi", self.heads),
+            ("scores", self.scores),
+        ]
+    }
+
     /// The sum of all parts.
-    pub const fn total(&self) -> u64 {
-        let Self {
-            online,
-            head,
-            target,
-            double_dqn,
-            states,
-            keys,
-            heads,
-            scores,
-        } = *self;
-        online + head + target + double_dqn + states + keys + heads + scores
+    pub fn total(&self) -> u64 {
+        self.parts().iter().map(|it| it.1).sum()
     }
 }
 

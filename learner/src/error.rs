@@ -1,6 +1,6 @@
 //! The error type of an update, shared by all modules that take part in it.
 
-/// Why an update, or the creation of a learner, failed. Parameters are unchanged, except after [`UpdateError::Diverged`].
+/// Why settings cannot work, or an update failed. Parameters are unchanged, except after [`UpdateError::Diverged`].
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum UpdateError {
@@ -11,6 +11,16 @@ pub enum UpdateError {
     /// Settings of the auxiliary loss contradict each other.
     #[error("{0}")]
     AuxiliaryLoss(String),
+    /// Settings, pairs of actions or a saved estimate of the affinity are invalid.
+    #[error("action affinity: {0}")]
+    Affinity(String),
+    /// A table of the settings is missing or does not fit, or one of its values is invalid.
+    #[error(transparent)]
+    Config(#[from] driml_protocol::config::ConfigError),
+    #[error(
+        "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml train`"
+    )]
+    ModelSizes,
     /// The state does not fit the network, for example because it is from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
     State(String),

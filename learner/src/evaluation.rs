@@ -1,6 +1,8 @@
 //! Computes the losses and gradients of a checked batch: the passes through the networks, the C51 target, and both losses.
 //! It takes no optimiser step: `agent` does.
 
+use std::ops::Range;
+
 use candle_core::Tensor;
 use driml_model::{Compute, Encoder, HeadNoise, ModelConfig, Network, Parameters, argmax};
 use driml_protocol::NO_ACTION;
@@ -8,7 +10,7 @@ use driml_protocol::NO_ACTION;
 use crate::{
     auxiliary::loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
     batch::Batch,
-    deduplicate::PassInput,
+    deduplicate::{PassInput, StateBytes},
     error::UpdateError,
     losses::{
         c51::{kl_loss, row_kls, softmax},
@@ -93,16 +95,7 @@ impl Networks {
         // The two are independent: while one works on a single thread, the other's matrix products use the remaining threads.
         let (target, features) = rayon::join(
             || self.bellman_target(batch, noise),
-            || {
-                OnlineFeatures::new(
-                    &self.online,
-                    &self.model,
-                    &*self.auxiliary,
-                    batch,
-                    self.deduplicate,
-                    &self.compute.device,
-                )
-            },
+            || self.online_features(batch),
         );
         let target = target?;
         let features = features?;
@@ -115,14 +108,7 @@ impl Networks {
             batch.importance_weight.map(<[f32]>::to_vec),
             self.compute.kernels,
         )?;
-        let auxiliary = self.auxiliary.losses(&LossInputs {
-            online: &self.online,
-            model: &self.model,
-            batch,
-            features: &features,
-            key_encoder: self.key_encoder.as_ref(),
-            device: &self.compute.device,
-        })?;
+        let auxiliary = self.auxiliary_losses(batch, &features)?;
         let mut total = kl.clone();
         for WeightedLoss { loss, weight, .. } in &auxiliary {
             total = (total + loss.affine(*weight, 0.0)?)?;
@@ -152,6 +138,51 @@ impl Networks {
             next_greedy_action: target.next_greedy_action,
             target_projection: target.projection,
             gradients,
+        })
+    }
+
+    /// Passes the states of `batch` that the auxiliary loss needs through the online network. It does not deduplicate augmented batches:
+    /// each state has a draw.
+    pub(crate) fn online_features(&self, batch: &Batch<'_>) -> Result<OnlineFeatures, UpdateError> {
+        let len = self.model.frame_len();
+        let mut states: Vec<StateBytes<'_>> = batch.states_t.chunks_exact(len).map(Some).collect();
+        let anchors = batch.anchors.unwrap_or_default().chunks_exact(len);
+        states.extend(anchors.map(Some));
+        let anchor_count = states.len() - batch.rows;
+        states.extend(self.auxiliary.later_states(batch, len));
+
+        let deduplicate = self.deduplicate && anchor_count == 0;
+        let input = PassInput::new(&states, batch.states_t, len, deduplicate);
+        let tensor = states_tensor(&self.model, input.bytes, &self.compute.device)?;
+        let features = self.online.features(&tensor)?;
+        let features_of = |range: Range<usize>| match &input.indices {
+            Some(indices) => features.select(&indices[range]),
+            None => features.narrow(range.start, range.len()),
+        };
+        let some_features =
+            |range: Range<usize>| (!range.is_empty()).then(|| features_of(range)).transpose();
+        let (first_anchor, first_later) = (batch.rows, batch.rows + anchor_count);
+        let now = features_of(0..first_anchor)?;
+        Ok(OnlineFeatures {
+            anchors: some_features(first_anchor..first_later)?.unwrap_or_else(|| now.clone()),
+            later: some_features(first_later..states.len())?,
+            now,
+        })
+    }
+
+    /// Computes the auxiliary losses of `batch`, whose `features` are given.
+    pub(crate) fn auxiliary_losses(
+        &self,
+        batch: &Batch<'_>,
+        features: &OnlineFeatures,
+    ) -> Result<Vec<WeightedLoss>, UpdateError> {
+        self.auxiliary.losses(&LossInputs {
+            online: &self.online,
+            model: &self.model,
+            batch,
+            features,
+            key_encoder: self.key_encoder.as_ref(),
+            device: &self.compute.device,
         })
     }
 

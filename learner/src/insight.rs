@@ -2,7 +2,7 @@
 //! It trains nothing and chooses no action.
 
 use candle_core::Tensor;
-use driml_model::{Compute, Features, ModelConfig, Network, Parameters};
+use driml_model::{Compute, Features, ModelConfig, Network, Parameters, Resizer};
 
 use crate::{
     agent::Agent,
@@ -19,6 +19,8 @@ pub struct Insight {
     model: ModelConfig,
     network: Network,
     compute: Compute,
+    /// Resizes states to the network's input; `None` if they have its size.
+    enlarge: Option<Resizer>,
     /// Bound of the scores' soft clip, if the auxiliary loss compares local features of s_t with local ones of s_{t+k}.
     local_clip: Option<f64>,
 }
@@ -36,15 +38,23 @@ pub struct NetworkOutputs {
 impl Insight {
     /// Inspects the online network of `agent` and shares its parameters. `compute` must be on the agent's device.
     pub fn from_agent(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
-        Self::new(agent.model(), agent.settings(), agent.online(), compute)
+        Self::new(
+            agent.model(),
+            agent.settings(),
+            agent.online(),
+            compute,
+            None,
+        )
     }
 
     /// Inspects a network with these parameters, trained with these settings. Without DIM's local heads it compares no features.
+    /// `enlarge` resizes states to the network's input; `None` if they have its size.
     pub fn new(
         model: &ModelConfig,
         settings: &UpdateSettings,
         parameters: &Parameters,
         compute: Compute,
+        enlarge: Option<Resizer>,
     ) -> Result<Self, UpdateError> {
         let is_local = settings.auxiliary_loss.name() == DIM.name
             && settings.lambda.active_pairs()[0]
@@ -54,6 +64,7 @@ impl Insight {
             model: model.clone(),
             network: Network::new(model, parameters, compute.kernels)?,
             compute,
+            enlarge,
             local_clip: is_local.then_some(settings.tanh_clip),
         })
     }
@@ -64,11 +75,17 @@ impl Insight {
         self.local_clip.map(|_| (rows, columns))
     }
 
-    /// Computes the network's outputs for states [B, H, W, C] of the network's input size.
-    pub fn evaluate(&self, bytes: &[u8]) -> Result<NetworkOutputs, UpdateError> {
-        let features =
-            self.network
-                .features(&states_tensor(&self.model, bytes, &self.compute.device)?)?;
+    /// Computes the network's outputs for states [B, H, W, C].
+    pub fn evaluate(&self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
+        let enlarged = self.enlarge.as_ref().map(|enlarge| {
+            let count = states.len() / enlarge.input_bytes();
+            let mut enlarged = vec![0; count * enlarge.output_bytes()];
+            enlarge.apply(states, &mut enlarged);
+            enlarged
+        });
+        let input = enlarged.as_deref().unwrap_or(states);
+        let states = states_tensor(&self.model, input, &self.compute.device)?;
+        let features = self.network.features(&states)?;
         let logits = self.network.logits(&features.f4, None)?;
         let q_values = self.network.q_values(&logits)?;
         let logits = to_vec_f32(&logits)?;

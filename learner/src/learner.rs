@@ -1,7 +1,7 @@
 //! The learner without network connections: takes a batch, returns a report, and exports weights and affinity on demand.
 //! Both the learner process and lockstep mode run this code. It neither requests batches nor sends messages.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use driml_model::Compute;
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    affinity::{AffinityError, AffinityEstimator},
+    affinity::AffinityEstimator,
     agent::Agent,
     checkpoint::{self, CheckpointError, Extras, LearnerState},
     config::LearnerConfig,
@@ -23,31 +23,9 @@ use crate::{
 /// The name under which the noisy layers' seed is derived from the run's seed.
 const NOISE_SEED_NAME: &str = "noisy layers";
 
-/// Why a learner could not be created, learn or be saved.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "each message says it")]
-pub enum LearnerError {
-    #[error(transparent)]
-    Update(#[from] UpdateError),
-    #[error(transparent)]
-    Affinity(#[from] AffinityError),
-    #[error(transparent)]
-    Config(#[from] driml_protocol::config::ConfigError),
-    #[error(transparent)]
-    Model(#[from] driml_model::ModelError),
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    #[error(
-        "the checkpoint in {} has another estimator of the action affinity: resume with the settings it was made with, or choose another folder",
-        .0.display()
-    )]
-    OtherAffinity(PathBuf),
-}
-
 /// A learner: its settings, its state, and the preparation of its batches.
 pub struct Learner {
     config: LearnerConfig,
-    spec_hash: u64,
     state: LearnerState,
     preparation: Preparation,
 }
@@ -61,7 +39,7 @@ fn apply_settings(agent: Agent, config: &LearnerConfig) -> Agent {
 
 impl Learner {
     /// Creates a learner before its first update. All its random generators are derived from the run's seed.
-    pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, LearnerError> {
+    pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, UpdateError> {
         let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
@@ -70,7 +48,6 @@ impl Learner {
         let affinity = &config.learner.affinity;
         let affinity = affinity.make_estimator(config.model.num_actions, &mut rng)?;
         Ok(Self {
-            spec_hash: spec.hash(),
             state: LearnerState {
                 agent: apply_settings(agent, &config),
                 affinity,
@@ -83,38 +60,33 @@ impl Learner {
         })
     }
 
-    /// Restores a learner from the newest checkpoint in `folder`, or creates a new learner if there are no checkpoints.
+    /// Restores the state of the newest checkpoint in `folder`; without checkpoints, the learner stays as it is.
     ///
     /// # Errors
-    /// Invalid settings, or a checkpoint that is damaged or belongs to another run or to other settings.
-    pub fn resume(
-        config: LearnerConfig,
-        compute: &Compute,
-        folder: &Path,
-    ) -> Result<Self, LearnerError> {
-        let mut this = Self::new(config, compute)?;
+    /// A checkpoint that is damaged or belongs to another run or to other settings.
+    pub fn resume(mut self, folder: &Path) -> Result<Self, CheckpointError> {
         let restored = checkpoint::load_latest(
             folder,
-            &this.config.model,
-            &this.config.learner.update,
-            compute,
-            this.spec_hash,
+            &self.config.model,
+            &self.config.learner.update,
+            &self.agent().networks.compute,
+            self.spec_hash(),
         )?;
         let Some(restored) = restored else {
-            return Ok(this);
+            return Ok(self);
         };
-        let [configured, saved] = [&this.state, &restored].map(|it| {
+        let [configured, saved] = [&self.state, &restored].map(|it| {
             let affinity = it.affinity.as_ref();
             affinity.map(AffinityEstimator::settings)
         });
         if configured != saved {
-            return Err(LearnerError::OtherAffinity(folder.to_owned()));
+            return Err(CheckpointError::OtherAffinity(folder.to_owned()));
         }
-        this.state = LearnerState {
-            agent: apply_settings(restored.agent, &this.config),
+        self.state = LearnerState {
+            agent: apply_settings(restored.agent, &self.config),
             ..restored
         };
-        Ok(this)
+        Ok(self)
     }
 
     /// The agent: networks, optimiser and count of updates.
@@ -123,8 +95,8 @@ impl Learner {
     }
 
     /// The hash of the run spec.
-    pub const fn spec_hash(&self) -> u64 {
-        self.spec_hash
+    pub fn spec_hash(&self) -> u64 {
+        self.config.spec.hash()
     }
 
     /// The number of updates since the run began, including those before a restart.
@@ -146,8 +118,8 @@ impl Learner {
     ///
     /// # Errors
     /// A batch that does not fit, or a result that is not finite. Nothing has changed then, except after
-    /// [`UpdateError::Diverged`](crate::UpdateError::Diverged): the learner can then neither publish weights nor save a checkpoint.
-    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
+    /// [`UpdateError::Diverged`]: the learner can then neither publish weights nor save a checkpoint.
+    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, UpdateError> {
         let beta = self.config.sampling.beta(self.updates());
         let columns = Columns::new(batch, beta);
         // A copy, which replaces the generator only if the update succeeds.
@@ -209,7 +181,7 @@ impl Learner {
     }
 
     /// Exports the current weights under a new version number.
-    pub fn export_weights(&mut self) -> Result<Weights, LearnerError> {
+    pub fn export_weights(&mut self) -> Result<Weights, UpdateError> {
         let dtype = self.config.learner.publish_dtype;
         let safetensors = self.agent().weights_as(dtype)?;
         self.state.weights_version += 1;
@@ -220,21 +192,17 @@ impl Learner {
         })
     }
 
-    /// Writes a checkpoint into `folder`.
+    /// Writes a checkpoint into `folder`, together with the bytes of the caller's `companion`, if any, which
+    /// [`checkpoint::read_companion`] reads.
     ///
     /// # Errors
     /// A state that is not finite, or a failing file system; older checkpoints are untouched.
-    pub fn save(&self, folder: &Path) -> Result<(), LearnerError> {
-        self.save_with(folder, None)
-    }
-
-    /// Writes a checkpoint into `folder`, together with the bytes of the caller's `companion`, which [`checkpoint::read_companion`] reads.
-    pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
+    pub fn save(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), CheckpointError> {
         let LearnerConfig {
             spec, model, input, ..
         } = &self.config;
         let extras = Extras {
-            run_spec_hash: self.spec_hash,
+            run_spec_hash: self.spec_hash(),
             description: &checkpoint::describe(spec, model, input),
             without_heads: &checkpoint::describe(spec, &model.without_dim(), input),
             companion,

@@ -79,13 +79,11 @@ pub use agent::{Agent, NetworkParameters};
 pub use augment::{AugmentSettings, Augmenter};
 pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
 pub use batch::{Batch, OwnedBatch};
-pub use config::{
-    AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerConfig, LearnerConfigError,
-};
+pub use config::{AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerConfig};
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
 pub use evaluation::{Evaluation, UpdateReport};
-pub use learner::{Learner, LearnerError};
+pub use learner::Learner;
 pub use noise::UpdateNoise;
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};

@@ -83,23 +83,18 @@ impl UpdateSettings {
         self.adam.validate()
     }
 
-    /// The settings from which the auxiliary loss is created.
-    pub const fn auxiliary_settings(&self) -> AuxiliarySettings<'_> {
-        AuxiliarySettings {
-            auxiliary_loss: self.auxiliary_loss.name(),
-            lambda: self.lambda,
-            condition_on_action: self.condition_on_action,
-            tanh_clip: self.tanh_clip,
-            own: &self.own,
-        }
-    }
-
     /// Creates the auxiliary loss.
     ///
     /// # Errors
     /// Invalid settings of the loss.
     pub fn make_auxiliary_loss(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-        self.auxiliary_loss.make_loss(&self.auxiliary_settings())
+        self.auxiliary_loss.make_loss(&AuxiliarySettings {
+            auxiliary_loss: self.auxiliary_loss.name(),
+            lambda: self.lambda,
+            condition_on_action: self.condition_on_action,
+            tanh_clip: self.tanh_clip,
+            own: &self.own,
+        })
     }
 
     /// The heads that the online network needs in an environment of `num_actions` actions; none if the settings are invalid, which

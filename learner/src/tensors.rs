@@ -2,7 +2,7 @@
 
 use std::{borrow::Cow, cell::RefCell};
 
-use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
+use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, bail};
 use driml_model::{ModelConfig, floats};
 
 use crate::error::UpdateError;
@@ -32,19 +32,19 @@ pub(crate) fn to_vec_f64(tensor: &Tensor) -> candle_core::Result<Vec<f64>> {
     tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()
 }
 
-/// Calls `change` with the values of `var`, to change in place, and those of `other`. Both are on the CPU and equally long.
+/// Calls `change` with the values of `tensor`, to change in place, and those of `other`. Both are on the CPU and equally long.
 pub(crate) fn modify_in_place(
-    var: &Var,
+    tensor: &Tensor,
     other: &Tensor,
-    change: impl FnMut(&mut [f32], &[f32]),
+    change: impl FnMut(&mut [f32], &[f32]) -> candle_core::Result<()>,
 ) -> candle_core::Result<()> {
     // candle passes the operation by shared reference only.
-    var.inplace_op2(other, &InPlaceOperation(RefCell::new(change)))
+    tensor.inplace_op2(other, &InPlaceOperation(RefCell::new(change)))
 }
 
 struct InPlaceOperation<F>(RefCell<F>);
 
-impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for InPlaceOperation<F> {
+impl<F: FnMut(&mut [f32], &[f32]) -> candle_core::Result<()>> InplaceOp2 for InPlaceOperation<F> {
     fn name(&self) -> &'static str {
         "change"
     }
@@ -64,8 +64,7 @@ impl<F: FnMut(&mut [f32], &[f32])> InplaceOp2 for InPlaceOperation<F> {
         if values.len() != other.len() {
             bail!("{} values meet {}", values.len(), other.len());
         }
-        (self.0.borrow_mut())(values, other);
-        Ok(())
+        (self.0.borrow_mut())(values, other)
     }
 }
 

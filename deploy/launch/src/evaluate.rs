@@ -7,10 +7,7 @@ use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{Evaluation, NetworkPolicy, OnStep, Policy, RandomPolicy, Step, episode_returns};
 use driml_envs::{RestrictedWorld, WorldConfig};
-use driml_learner::{
-    Compute, UpdateError, checkpoint,
-    insight::{Insight, NetworkOutputs},
-};
+use driml_learner::{Compute, checkpoint, insight::Insight};
 use driml_machine::error::{Usage, usage};
 use driml_model::{Parameters, Precision, Resizer, WeightDtype, is_dim};
 use driml_settings::config::RunConfig;
@@ -162,19 +159,22 @@ impl Player {
         episodes.min(ENVS_MAX)
     }
 
-    /// A viewer that shows what the network computes for the states it sees.
-    pub fn viewer(&self) -> anyhow::Result<Viewer> {
+    /// What the network computes for the states that the policy sees.
+    pub fn insight(&self) -> anyhow::Result<Insight> {
         let mut model = self.config.model.clone();
         if self.network.iter().count() < model.parameter_shapes().len() {
             model = model.without_dim();
         }
         let compute = Compute::cpu(self.config.actor.precision);
         let update = &self.config.learner.update;
-        Ok(Viewer {
-            insight: Insight::new(&model, update, &self.network, compute)?,
-            enlarge: self.enlarge()?,
-            enlarged: Vec::new(),
-        })
+        let enlarge = self.enlarge()?;
+        Ok(Insight::new(
+            &model,
+            update,
+            &self.network,
+            compute,
+            enlarge,
+        )?)
     }
 
     fn enlarge(&self) -> anyhow::Result<Option<Resizer>> {
@@ -230,29 +230,6 @@ fn play_episodes(
 const fn frame_size(config: &RunConfig) -> (usize, usize) {
     let spec = &config.run;
     (spec.frame_height as usize, spec.frame_width as usize)
-}
-
-/// Shows what the network computes for the states that the policy sees.
-#[derive(Debug)]
-pub struct Viewer {
-    /// The network.
-    pub insight: Insight,
-    enlarge: Option<Resizer>,
-    enlarged: Vec<u8>,
-}
-
-impl Viewer {
-    /// What the network computes for the states of a step.
-    pub fn compute(&mut self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
-        let Some(enlarge) = &self.enlarge else {
-            return self.insight.evaluate(states);
-        };
-        // Enlarging keeps the number of states.
-        let count = states.len() / enlarge.input_bytes();
-        self.enlarged.resize(count * enlarge.output_bytes(), 0);
-        enlarge.apply(states, &mut self.enlarged);
-        self.insight.evaluate(&self.enlarged)
-    }
 }
 
 /// The generator of the policy's random actions. Its numbers differ from those of every environment, which has the same seed.

@@ -164,7 +164,9 @@ fn check_changes(
     if network_settings(before) != network_settings(config) {
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
         let compute = DeviceName::Cpu.open(config.learner.precision)?;
-        Learner::resume(settings, &compute, &folder.checkpoints()).map_err(|e| usage!("{e}"))?;
+        let learner = Learner::new(settings, &compute)?;
+        let resumed = learner.resume(&folder.checkpoints());
+        resumed.map_err(|e| usage!("{e}"))?;
     }
     let (actors_before, actors) = (before.local.actors, config.local.actors);
     if lockstep && actors_before != actors {

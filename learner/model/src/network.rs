@@ -9,9 +9,11 @@ use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::features::FeatureLayers;
-use crate::heads::c51::C51Head;
+use crate::heads::c51::q_values;
 use crate::heads::dim::{ActionEmbedding, DimHead};
 use crate::heads::noise::HeadNoise;
+use crate::heads::streams::{HeadLayer, merge};
+use crate::layers::Layer;
 use crate::parameters::Parameters;
 
 /// The torso's output for a batch of frames.
@@ -57,7 +59,10 @@ impl Features {
 pub struct Network {
     kernels: Kernels,
     torso: FeatureLayers,
-    head: C51Head,
+    /// The layers of the C51 head.
+    head: Vec<HeadLayer<Tensor>>,
+    actions: usize,
+    support: Vec<f32>,
     action: Option<ActionEmbedding>,
     psi3: Option<DimHead>,
     phi3: Option<DimHead>,
@@ -86,7 +91,9 @@ impl Network {
             kernels,
             loss_layers: loss_layers.collect::<Result<_>>()?,
             torso: FeatureLayers::new(config, parameters, kernels)?,
-            head: C51Head::new(config, parameters, kernels)?,
+            head: HeadLayer::collect(config, |layer, part| parameters.tensor(layer, part))?,
+            actions: config.num_actions,
+            support: config.atoms_support(),
             action: action.transpose()?,
             psi3: head(config.dim.psi3, "dim.psi3")?,
             phi3: head(config.dim.phi3, "dim.phi3")?,
@@ -110,7 +117,10 @@ impl Network {
     /// Computes the logits [B, A, atoms] of `f4` [B, hidden], which is before its ReLU as in [`Features`].
     /// `noise` perturbs the head's noisy layers; without noise they use their means.
     pub fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
-        self.head.logits(f4, noise)
+        let active = self.kernels.relu(f4)?;
+        let Layer { weight, bias } = merge(&self.head, self.support.len(), noise)?;
+        let logits = self.kernels.linear(&active, &weight, &bias)?;
+        Ok(logits.reshape(((), self.actions, self.support.len()))?)
     }
 
     /// Computes the rows [B, atoms] of [`Network::logits`] for the taken actions [B], each below the number of actions.
@@ -120,13 +130,16 @@ impl Network {
         actions: &[u8],
         noise: Option<&HeadNoise>,
     ) -> Result<Tensor> {
-        self.head.taken_logits(f4, actions, noise)
+        let active = self.kernels.relu(f4)?;
+        let (kernels, atoms) = (self.kernels, self.support.len());
+        let Layer { weight, bias } = merge(&self.head, atoms, noise)?;
+        Ok(kernels.grouped_linear(&active, &weight, &bias, actions, atoms)?)
     }
 
     /// Computes the expected returns [B, A] of `logits` [B, A, atoms], without a gradient. On the CPU their error beyond
     /// f32 rounding is at most [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) times the support's width.
     pub fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
-        self.head.q_values(logits)
+        Ok(q_values(self.kernels, logits, &self.support)?)
     }
 
     /// Computes Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers, ignored if Psi does not see the action).

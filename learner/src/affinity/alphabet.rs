@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::arrays::AffinityError;
+use crate::error::UpdateError;
 
 /// A map from raw actions to visible actions, which are numbered without gaps.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,14 +18,16 @@ impl Alphabet {
     ///
     /// # Errors
     /// A table that is empty, longer than 255, or maps to an action that does not map to itself.
-    pub fn new(map: &[u8]) -> Result<Self, AffinityError> {
+    pub fn new(map: &[u8]) -> Result<Self, UpdateError> {
         let count = map.len();
         if !(1..=255).contains(&count) {
-            return Err(AffinityError(format!("an alphabet of {count} actions")));
+            return Err(UpdateError::Affinity(format!(
+                "an alphabet of {count} actions"
+            )));
         }
         for (raw, &visible) in map.iter().enumerate() {
             if map.get(usize::from(visible)) != Some(&visible) {
-                return Err(AffinityError(format!(
+                return Err(UpdateError::Affinity(format!(
                     "action {raw} maps to {visible}, which does not map to itself"
                 )));
             }
@@ -45,7 +47,7 @@ impl Alphabet {
     ///
     /// # Errors
     /// No actions, or more than 255.
-    pub fn raw(num_actions: usize) -> Result<Self, AffinityError> {
+    pub fn raw(num_actions: usize) -> Result<Self, UpdateError> {
         let map = (0..num_actions.min(256)).map(|action| action as u8);
         Self::new(&map.collect::<Vec<_>>())
     }
@@ -62,7 +64,7 @@ impl Alphabet {
     }
 
     /// Checks the invariants of [`Alphabet::new`]. An alphabet that was read from a file may violate them.
-    pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
         let mut used = self.index.clone();
         used.sort_unstable();
         used.dedup();
@@ -70,18 +72,19 @@ impl Alphabet {
         if is_dense && (1..=255).contains(&self.index.len()) {
             return Ok(());
         }
-        Err(AffinityError(format!(
+        Err(UpdateError::Affinity(format!(
             "an alphabet of {} visible actions over the raw ones {:?}",
             self.len, self.index
         )))
     }
 
     /// Maps pairs of raw actions to pairs of dense indices.
-    pub(super) fn index_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, AffinityError> {
+    pub(super) fn index_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, UpdateError> {
         let index = |action: u8| {
             let index = self.index.get(usize::from(action)).copied();
             let count = self.index.len();
-            index.ok_or_else(|| AffinityError(format!("action {action}; there are {count}")))
+            index
+                .ok_or_else(|| UpdateError::Affinity(format!("action {action}; there are {count}")))
         };
         let pairs = pairs.iter();
         pairs.map(|&(i, j)| Ok((index(i)?, index(j)?))).collect()

@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities, check_ranges},
+    arrays::{check_array, check_probabilities, check_ranges},
 };
+use crate::error::UpdateError;
 
 /// Decay and smoothing of the pair counts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -38,7 +39,7 @@ pub struct ExactAffinity {
 }
 
 impl ExactSettings {
-    pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(crate) fn check_valid(&self) -> Result<(), UpdateError> {
         check_ranges(&[
             ("decay", self.decay, 1e-300..=1.0),
             ("smoothing", self.smoothing, SMOOTHING_RANGE),
@@ -51,7 +52,7 @@ impl ExactAffinity {
     ///
     /// # Errors
     /// A setting out of its range.
-    pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self, AffinityError> {
+    pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self, UpdateError> {
         settings.check_valid()?;
         let m = alphabet.len();
         Ok(Self {
@@ -61,13 +62,15 @@ impl ExactAffinity {
         })
     }
 
-    pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
         self.alphabet.check_valid()?;
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         check_array("counts", &self.counts, m * m)?;
         if let Some(at) = self.counts.iter().position(|&count| count < 0.0) {
-            return Err(AffinityError(format!("counts is below 0 at index {at}")));
+            return Err(UpdateError::Affinity(format!(
+                "counts is below 0 at index {at}"
+            )));
         }
         check_probabilities("matrix", &self.ratios(), m * m)
     }
@@ -77,7 +80,7 @@ impl ExactAffinity {
         self.alphabet.expand_matrix(&self.ratios())
     }
 
-    pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) -> Result<(), AffinityError> {
+    pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) -> Result<(), UpdateError> {
         let pairs = self.alphabet.index_pairs(pairs)?;
         if pairs.is_empty() {
             return Ok(());

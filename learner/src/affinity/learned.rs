@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{AffinityError, check_array, check_probabilities, check_ranges},
+    arrays::{check_array, check_probabilities, check_ranges},
 };
+use crate::error::UpdateError;
 
 /// Sizes, optimiser and smoothing of the learned estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -46,7 +47,7 @@ pub struct LearnedAffinity {
 const HIDDEN_MAX: f64 = 4096.0;
 
 impl LearnedSettings {
-    pub(crate) fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(crate) fn check_valid(&self) -> Result<(), UpdateError> {
         let Self {
             hidden,
             lr,
@@ -76,7 +77,7 @@ impl LearnedAffinity {
         alphabet: Alphabet,
         settings: LearnedSettings,
         rng: &mut ChaCha8Rng,
-    ) -> Result<Self, AffinityError> {
+    ) -> Result<Self, UpdateError> {
         settings.check_valid()?;
         let hidden = settings.hidden;
         let m = alphabet.len();
@@ -99,7 +100,7 @@ impl LearnedAffinity {
         })
     }
 
-    pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
+    pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
         self.alphabet.check_valid()?;
         self.settings.check_valid()?;
         let m = self.alphabet.len();
@@ -109,7 +110,7 @@ impl LearnedAffinity {
         check_array("second_moments", &self.second_moments, count)?;
         if let Some(at) = self.second_moments.iter().position(|&moment| moment < 0.0) {
             let why = format!("second_moments is below 0 at index {at}");
-            return Err(AffinityError(why));
+            return Err(UpdateError::Affinity(why));
         }
         check_probabilities("smoothed", &self.smoothed, m * m)
     }
@@ -126,7 +127,7 @@ impl LearnedAffinity {
         &mut self,
         pairs: &[(u8, u8)],
         rng: &mut ChaCha8Rng,
-    ) -> Result<(), AffinityError> {
+    ) -> Result<(), UpdateError> {
         let pairs = self.alphabet.index_pairs(pairs)?;
         if pairs.is_empty() {
             return Ok(());

@@ -10,9 +10,10 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 pub use alphabet::Alphabet;
-pub use arrays::AffinityError;
 pub use exact::{ExactAffinity, ExactSettings};
 pub use learned::{LearnedAffinity, LearnedSettings};
+
+use crate::error::UpdateError;
 
 /// An estimator of A from the pairs (a_t, a_{t+1}) of the learner's batches, with all of its state, which checkpoints save.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,11 +31,7 @@ impl AffinityEstimator {
     /// # Errors
     /// An action that the alphabet does not have: nothing has then changed. Numbers that are no longer finite: the estimate is then
     /// unusable.
-    pub fn observe(
-        &mut self,
-        pairs: &[(u8, u8)],
-        rng: &mut ChaCha8Rng,
-    ) -> Result<(), AffinityError> {
+    pub fn observe(&mut self, pairs: &[(u8, u8)], rng: &mut ChaCha8Rng) -> Result<(), UpdateError> {
         match self {
             Self::Learned(learned) => learned.observe(pairs, rng)?,
             Self::Exact(exact) => exact.observe(pairs)?,
@@ -47,7 +44,7 @@ impl AffinityEstimator {
     /// # Errors
     /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
     /// are not probabilities.
-    pub fn check_valid(&self) -> Result<(), AffinityError> {
+    pub fn check_valid(&self) -> Result<(), UpdateError> {
         match self {
             Self::Learned(learned) => learned.check_valid(),
             Self::Exact(exact) => exact.check_valid(),

@@ -1,7 +1,7 @@
 //! The interface of auxiliary losses: the trait that a file of this folder implements, its inputs and its results.
 //! It names no loss; the menu is in `super`.
 
-use std::{fmt, ops::Range};
+use std::fmt;
 
 use candle_core::{Device, Tensor};
 use driml_model::{DimHeads, Encoder, Features, LossLayer, ModelConfig, Network};
@@ -120,42 +120,6 @@ pub struct OnlineFeatures {
     pub anchors: Features,
     /// Features of the loss's [`AuxiliaryLoss::later_states`]; `None` if it has none.
     pub later: Option<Features>,
-}
-
-impl OnlineFeatures {
-    /// Passes the states of `batch` that `loss` needs through `network`. It does not deduplicate augmented batches: each state has a draw.
-    pub fn new(
-        network: &Network,
-        model: &ModelConfig,
-        loss: &dyn AuxiliaryLoss,
-        batch: &Batch<'_>,
-        deduplicate: bool,
-        device: &Device,
-    ) -> Result<Self, UpdateError> {
-        let len = model.frame_len();
-        let mut states: Vec<StateBytes<'_>> = batch.states_t.chunks_exact(len).map(Some).collect();
-        let anchors = batch.anchors.unwrap_or_default().chunks_exact(len);
-        states.extend(anchors.map(Some));
-        let anchor_count = states.len() - batch.rows;
-        states.extend(loss.later_states(batch, len));
-
-        let deduplicate = deduplicate && anchor_count == 0;
-        let input = PassInput::new(&states, batch.states_t, len, deduplicate);
-        let features = network.features(&states_tensor(model, input.bytes, device)?)?;
-        let features_of = |range: Range<usize>| match &input.indices {
-            Some(indices) => features.select(&indices[range]),
-            None => features.narrow(range.start, range.len()),
-        };
-        let some_features =
-            |range: Range<usize>| (!range.is_empty()).then(|| features_of(range)).transpose();
-        let (first_anchor, first_later) = (batch.rows, batch.rows + anchor_count);
-        let now = features_of(0..first_anchor)?;
-        Ok(Self {
-            anchors: some_features(first_anchor..first_later)?.unwrap_or_else(|| now.clone()),
-            later: some_features(first_later..states.len())?,
-            now,
-        })
-    }
 }
 
 /// The inputs of an auxiliary loss.

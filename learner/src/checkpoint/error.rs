@@ -50,6 +50,11 @@ pub enum CheckpointError {
         found: String,
         expected: String,
     },
+    #[error(
+        "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
+        .0.display()
+    )]
+    OtherAffinity(PathBuf),
     /// No learner could be restored from the state, for example because a weight is not finite.
     #[error("the checkpoint was not saved, and the newest one is still that before it: {0}")]
     Unsound(UpdateError),

@@ -62,9 +62,37 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     Ok(all)
 }
 
+/// Writes the checkpoint `folder/name`, which has these files.
+///
+/// They are written and flushed to disk in a staging folder, which is then renamed: a crash at any moment leaves the older checkpoints
+/// whole and at most a `.tmp` folder, which the next call removes.
+///
+/// # Errors
+/// A failing file system, such as a full disk. The older checkpoints are then kept, and nothing of the new one is left.
+pub fn store(
+    folder: &Path,
+    name: &str,
+    files: &[(impl AsRef<Path>, Vec<u8>)],
+) -> Result<PathBuf, CheckpointError> {
+    fs::create_dir_all(folder).map_err(io_error("create", folder))?;
+    clean_up(folder)?;
+    let (path, staging) = (folder.join(name), folder.join(format!("{name}.tmp")));
+    let write = || {
+        fs::create_dir(&staging).map_err(io_error("create", &staging))?;
+        for (name, bytes) in files {
+            write_durably(&staging.join(name), bytes)?;
+        }
+        sync(&staging)?;
+        move_into_place(&staging, &path)
+    };
+    // An unfinished checkpoint would keep a full disk full.
+    write().inspect_err(|_| remove_or_warn(&staging))?;
+    Ok(path)
+}
+
 /// Renames the checkpoint in `staging` to `path`. If `path` exists, as at a stop right after a periodic save, it is replaced: it
 /// first moves to another name, under which [`list`] finds it between the two renames.
-pub(super) fn move_into_place(staging: &Path, path: &Path) -> Result<(), CheckpointError> {
+fn move_into_place(staging: &Path, path: &Path) -> Result<(), CheckpointError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     let replaced = with_suffix(path, OLD_SUFFIX);
     if path.exists() {
@@ -77,7 +105,7 @@ pub(super) fn move_into_place(staging: &Path, path: &Path) -> Result<(), Checkpo
 }
 
 /// Removes what interrupted saves have left, and gives a checkpoint whose replacement was interrupted its name back.
-pub(super) fn clean_up(folder: &Path) -> Result<(), CheckpointError> {
+fn clean_up(folder: &Path) -> Result<(), CheckpointError> {
     for entry in fs::read_dir(folder).map_err(io_error("read", folder))? {
         let path = entry.map_err(io_error("read", folder))?.path();
         let name = path.file_name().and_then(|name| name.to_str());
@@ -108,21 +136,21 @@ pub(super) fn read_file(path: &Path) -> Result<Vec<u8>, CheckpointError> {
 }
 
 /// Writes a new file and flushes it to disk.
-pub(super) fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
     File::create(path)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .map_err(io_error("write", path))
 }
 
 /// Flushes a folder's entries to disk.
-pub(super) fn sync(folder: &Path) -> Result<(), CheckpointError> {
+fn sync(folder: &Path) -> Result<(), CheckpointError> {
     File::open(folder)
         .and_then(|folder| folder.sync_all())
         .map_err(io_error("flush", folder))
 }
 
 /// Renames a checkpoint and removes it: what an interrupted removal leaves must not look like a checkpoint.
-pub(super) fn prune(path: &Path) {
+pub fn prune(path: &Path) {
     let temporary = with_suffix(path, ".tmp");
     match fs::rename(path, &temporary) {
         Ok(()) => remove_or_warn(&temporary),
@@ -137,7 +165,7 @@ fn with_suffix(path: &Path, end: &str) -> PathBuf {
 }
 
 /// Removes a folder, if it exists. A failure is only logged, as it does not affect what is saved.
-pub(super) fn remove_or_warn(folder: &Path) {
+fn remove_or_warn(folder: &Path) {
     match fs::remove_dir_all(folder) {
         Err(why) if why.kind() != io::ErrorKind::NotFound => {
             let why = io_error("remove", folder)(why);

@@ -11,6 +11,6 @@ mod save;
 pub use contents::{AVERAGE, LearnerState, check_state};
 pub use description::{METADATA_KEY, describe, read_description};
 pub use error::CheckpointError;
-pub use folder::{FOLDER, list, lock};
+pub use folder::{FOLDER, list, lock, prune, store};
 pub use load::{load, load_latest, read_affinity, read_companion, read_run_counts};
 pub use save::{Extras, save};

@@ -1,10 +1,7 @@
-//! Saves a checkpoint: writes and flushes each file, flushes the folder, and then renames the folder.
+//! Saves a checkpoint: makes its files from a learner's state.
+//! `folder` writes them.
 
-use std::{
-    collections::BTreeMap,
-    fs,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 use driml_model::{Parameters, WeightDtype};
 
@@ -14,8 +11,8 @@ use super::{
         STATE_SHA256, StateFile, TARGET, format_hash, sha256_hex,
     },
     description,
-    error::{CheckpointError, io_error},
-    folder::{PREFIX, clean_up, list, move_into_place, prune, remove_or_warn, sync, write_durably},
+    error::CheckpointError,
+    folder::{PREFIX, list, prune, store},
 };
 use crate::{agent::Agent, error::UpdateError};
 
@@ -34,9 +31,6 @@ pub struct Extras<'a> {
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
 ///
-/// The files are written and flushed to disk in a staging folder, which is then renamed: a crash at any moment leaves the older
-/// checkpoints whole and at most a `.tmp` folder, which the next save removes.
-///
 /// # Errors
 /// A state that is not finite, or a failing file system, such as a full disk. Older checkpoints are then kept, and nothing of the new
 /// one is left.
@@ -49,16 +43,8 @@ pub fn save(
     if keep == 0 {
         return Err(CheckpointError::KeepNone);
     }
-    fs::create_dir_all(folder).map_err(io_error("create", folder))?;
-    clean_up(folder)?;
     let name = format!("{PREFIX}{:012}", state.agent.updates());
-    let (path, staging) = (folder.join(&name), folder.join(format!("{name}.tmp")));
-    let saved = write(&staging, state, extras).and_then(|()| move_into_place(&staging, &path));
-    if let Err(error) = saved {
-        // The unfinished checkpoint would keep a full disk full.
-        remove_or_warn(&staging);
-        return Err(error);
-    }
+    let path = store(folder, &name, &files(state, extras)?)?;
     let all = list(folder)?;
     for (_, old) in &all[..all.len().saturating_sub(keep)] {
         prune(old);
@@ -66,17 +52,15 @@ pub fn save(
     Ok(path)
 }
 
-/// Creates the folder `staging` and writes a checkpoint's files into it.
-fn write(staging: &Path, state: &LearnerState, extras: Extras<'_>) -> Result<(), CheckpointError> {
+/// A checkpoint's files, with their names.
+fn files(
+    state: &LearnerState,
+    extras: Extras<'_>,
+) -> Result<Vec<(&'static str, Vec<u8>)>, CheckpointError> {
     let agent = &state.agent;
     let mut files = tensor_files(agent, extras).map_err(CheckpointError::Unsound)?;
     files.extend(extras.companion.map(|bytes| (COMPANION, bytes.to_vec())));
-    fs::create_dir(staging).map_err(io_error("create", staging))?;
-    let mut sha256 = BTreeMap::new();
-    for (name, bytes) in files {
-        write_durably(&staging.join(name), &bytes)?;
-        sha256.insert(name.to_owned(), sha256_hex(&bytes));
-    }
+    let sums = files.iter();
     let file = StateFile {
         format: FORMAT,
         run_spec_hash: format_hash(extras.run_spec_hash),
@@ -86,20 +70,19 @@ fn write(staging: &Path, state: &LearnerState, extras: Extras<'_>) -> Result<(),
         progress: state.run_counts.clone(),
         rng: state.rng.clone(),
         affinity: state.affinity.clone(),
-        sha256,
+        sha256: sums
+            .map(|(name, bytes)| (name.to_string(), sha256_hex(bytes)))
+            .collect(),
     };
     let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {
         what: "encode",
-        path: staging.join(STATE),
+        path: STATE.into(),
         why: why.into(),
     })?;
-    write_durably(&staging.join(STATE), &text)?;
     // In the format of `sha256sum --check`.
-    write_durably(
-        &staging.join(STATE_SHA256),
-        format!("{}  {STATE}\n", sha256_hex(&text)).as_bytes(),
-    )?;
-    sync(staging)
+    let sum = format!("{}  {STATE}\n", sha256_hex(&text));
+    files.extend([(STATE, text), (STATE_SHA256, sum.into_bytes())]);
+    Ok(files)
 }
 
 /// Serialises the networks and the moments, all of which must be finite, into files with their names.

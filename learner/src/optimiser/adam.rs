@@ -12,7 +12,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::gradients::Gradients;
-use crate::{error::UpdateError, ranges::check_range, tensors::modify_in_place};
+use crate::{
+    error::UpdateError,
+    ranges::check_range,
+    tensors::{modify_in_place, to_vec_f32},
+};
 
 /// Elements that a thread takes at a time.
 const CHUNK: usize = 1 << 14;
@@ -71,54 +75,14 @@ impl AdamSettings {
     }
 }
 
-/// Running moments of one parameter's gradient.
-#[derive(Clone, Debug)]
-enum Moments {
-    /// In the parameter's layout, for the fused step.
-    Fused {
-        m: Vec<f32>,
-        v: Vec<f32>,
-    },
-    Tensors {
-        m: Tensor,
-        v: Tensor,
-    },
-}
-
-impl Moments {
-    fn new(m: &Tensor, v: &Tensor, kernels: Kernels) -> candle_core::Result<Self> {
-        Ok(match kernels {
-            Kernels::Fused(_) => Self::Fused {
-                m: m.flatten_all()?.to_vec1()?,
-                v: v.flatten_all()?.to_vec1()?,
-            },
-            Kernels::Candle => Self::Tensors {
-                m: m.clone(),
-                v: v.clone(),
-            },
-        })
-    }
-
-    /// Copies m and v to the CPU, in the given shape.
-    fn tensors(&self, shape: &[usize]) -> candle_core::Result<[Tensor; 2]> {
-        Ok(match self {
-            Self::Fused { m, v } => [
-                Tensor::from_slice(m, shape, &Device::Cpu)?,
-                Tensor::from_slice(v, shape, &Device::Cpu)?,
-            ],
-            Self::Tensors { m, v } => [m.to_device(&Device::Cpu)?, v.to_device(&Device::Cpu)?],
-        })
-    }
-}
-
 /// Adam's state: the step count and both moments of every parameter, by name.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Adam {
     settings: AdamSettings,
     step: u64,
     kernels: Kernels,
-    /// By the parameter's name, with its shape.
-    moments: BTreeMap<String, (Vec<usize>, Moments)>,
+    /// The running mean of a parameter's gradient, and that of its square, in the parameter's shape and on its device.
+    moments: BTreeMap<String, [Tensor; 2]>,
 }
 
 impl Adam {
@@ -134,9 +98,7 @@ impl Adam {
         settings.validate()?;
         let mut moments = BTreeMap::new();
         for (name, var) in parameters.iter() {
-            let zeros = var.zeros_like()?;
-            let zero_moments = Moments::new(&zeros, &zeros, kernels)?;
-            moments.insert(name.to_owned(), (var.dims().to_vec(), zero_moments));
+            moments.insert(name.to_owned(), [var.zeros_like()?, var.zeros_like()?]);
         }
         Ok(Self {
             settings,
@@ -176,28 +138,19 @@ impl Adam {
             return Err(UpdateError::NonFinite(what));
         }
         self.step = step;
-        for (name, (_, moments)) in &mut self.moments {
+        for (name, moments) in &mut self.moments {
             let (Some(var), Some(gradient)) = (parameters.get(name), gradients.get(name)) else {
                 continue;
             };
-            match moments {
-                Moments::Fused { m, v } => {
-                    let mut all_finite = true;
-                    modify_in_place(var, gradient, |p, g| {
-                        let chunks = p.par_chunks_mut(CHUNK).zip(g.par_chunks(CHUNK));
-                        let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
-                        let finite = chunks
-                            .zip(moments)
-                            .map(|((p, g), (m, v))| coefficients.apply(p, g, m, v));
-                        all_finite = finite.reduce(|| true, |one, other| one & other);
-                    })?;
-                    if !all_finite {
+            match self.kernels {
+                Kernels::Fused(_) => {
+                    if !coefficients.apply_in_place(var, gradient, moments)? {
                         let name = name.clone();
                         let update = self.step;
                         return Err(UpdateError::Diverged { name, update, lr });
                     }
                 }
-                Moments::Tensors { m, v } => coefficients.apply_to_tensors(var, gradient, m, v)?,
+                Kernels::Candle => coefficients.apply_to_tensors(var, gradient, moments)?,
             }
         }
         Ok(())
@@ -209,21 +162,22 @@ impl Adam {
     /// A failing allocation, or a moment that is not finite.
     pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>, UpdateError> {
         let mut tensors = HashMap::new();
-        for (name, (shape, moments)) in &self.moments {
-            for (which, tensor) in ["m", "v"].into_iter().zip(moments.tensors(shape)?) {
-                let values = tensor.flatten_all()?.to_vec1::<f32>()?;
+        for (name, moments) in &self.moments {
+            for (which, moment) in ["m", "v"].into_iter().zip(moments) {
+                let name = format!("{which}.{name}");
+                let values = to_vec_f32(moment)?;
                 if !values.iter().all(|value| value.is_finite()) {
-                    return Err(UpdateError::State(format!(
-                        "the moment {which}.{name} is not finite"
-                    )));
+                    let why = format!("the moment {name} is not finite");
+                    return Err(UpdateError::State(why));
                 }
-                tensors.insert(format!("{which}.{name}"), tensor);
+                let copied = Tensor::from_vec(values, moment.shape(), &Device::Cpu)?;
+                tensors.insert(name, copied);
             }
         }
         Ok(tensors)
     }
 
-    /// Restores the moments from [`Adam::to_tensors`], bit for bit, on `device`, and the count of steps.
+    /// Restores the moments from [`Adam::to_tensors`], bit for bit, and the count of steps.
     ///
     /// # Errors
     /// A moment that is missing, of another shape or type, not finite, or of no parameter of this optimiser.
@@ -231,45 +185,33 @@ impl Adam {
         &mut self,
         step: u64,
         mut tensors: HashMap<String, Tensor>,
-        device: &Device,
     ) -> Result<(), UpdateError> {
-        let mut restored = self.moments.clone();
-        for (name, (shape, moments)) in &mut restored {
-            let mut take = |which: &str| {
-                let name = format!("{which}.{name}");
-                let Some(tensor) = tensors.remove(&name) else {
-                    return Err(UpdateError::State(format!("the moment {name} is missing")));
-                };
-                if tensor.dims() != shape.as_slice() {
-                    let found = tensor.dims();
-                    return Err(UpdateError::State(format!(
-                        "the moment {name} is {found:?}, not {shape:?}"
-                    )));
-                }
-                let values = match tensor.dtype() {
-                    DType::F32 => tensor.flatten_all()?.to_vec1::<f32>()?,
-                    other => {
-                        return Err(UpdateError::State(format!(
-                            "the moment {name} has type {other:?}, not F32"
-                        )));
-                    }
-                };
-                // A mean of squares is never negative.
-                let least = if which == "v" { 0.0 } else { f32::MIN };
-                if let Some(at) = values.iter().position(|v| !(least..=f32::MAX).contains(v)) {
-                    let value = values[at];
-                    return Err(UpdateError::State(format!(
-                        "the moment {name} is {value} at index {at}"
-                    )));
-                }
-                Ok(tensor.to_device(device)?)
-            };
-            *moments = Moments::new(&take("m")?, &take("v")?, self.kernels)?;
+        let error = |name: &str, why: &str| UpdateError::State(format!("the moment {name} {why}"));
+        let mut take = |which: &str, name: &str, ours: &Tensor| -> Result<_, UpdateError> {
+            let name = format!("{which}.{name}");
+            let error = |why: &str| error(&name, why);
+            let tensor = tensors.remove(&name).ok_or_else(|| error("is missing"))?;
+            let (found, shape) = (tensor.dims(), ours.dims());
+            if found != shape {
+                return Err(error(&format!("is {found:?}, not {shape:?}")));
+            }
+            if tensor.dtype() != DType::F32 {
+                return Err(error(&format!("has type {:?}, not F32", tensor.dtype())));
+            }
+            let values = to_vec_f32(&tensor)?;
+            // A mean of squares is never negative.
+            let least = if which == "v" { 0.0 } else { f32::MIN };
+            if let Some(at) = values.iter().position(|v| !(least..=f32::MAX).contains(v)) {
+                return Err(error(&format!("is {} at index {at}", values[at])));
+            }
+            Ok(Tensor::from_vec(values, shape, ours.device())?)
+        };
+        let mut restored = BTreeMap::new();
+        for (name, [m, v]) in &self.moments {
+            restored.insert(name.clone(), [take("m", name, m)?, take("v", name, v)?]);
         }
         if let Some(name) = tensors.keys().min() {
-            return Err(UpdateError::State(format!(
-                "the moment {name} belongs to no parameter"
-            )));
+            return Err(error(name, "belongs to no parameter"));
         }
         self.moments = restored;
         self.step = step;
@@ -338,12 +280,35 @@ impl StepCoefficients {
         not_finite == 0
     }
 
+    /// [`StepCoefficients::apply`] on tensors on the CPU, in parallel.
+    fn apply_in_place(
+        &self,
+        p: &Tensor,
+        g: &Tensor,
+        [m, v]: &[Tensor; 2],
+    ) -> candle_core::Result<bool> {
+        let mut all_finite = true;
+        // Nested, as an operation changes one tensor.
+        modify_in_place(m, g, |m, _| {
+            modify_in_place(v, g, |v, _| {
+                modify_in_place(p, g, |p, g| {
+                    let chunks = p.par_chunks_mut(CHUNK).zip(g.par_chunks(CHUNK));
+                    let moments = m.par_chunks_mut(CHUNK).zip(v.par_chunks_mut(CHUNK));
+                    let chunks = chunks.zip(moments);
+                    let finite = chunks.map(|((p, g), (m, v))| self.apply(p, g, m, v));
+                    all_finite = finite.reduce(|| true, |one, other| one & other);
+                    Ok(())
+                })
+            })
+        })?;
+        Ok(all_finite)
+    }
+
     fn apply_to_tensors(
         &self,
         p: &Var,
         g: &Tensor,
-        m: &mut Tensor,
-        v: &mut Tensor,
+        [m, v]: &mut [Tensor; 2],
     ) -> candle_core::Result<()> {
         let by = |tensor: &Tensor, factor: f32| tensor.affine(factor.into(), 0.0);
         let g = by(g, self.factor)?;

@@ -41,11 +41,13 @@ pub fn follow(
             Kernels::Fused(_) => modify_in_place(var, source, |target, online| {
                 let tau = tau as f32;
                 if tau >= 1.0 {
-                    return target.copy_from_slice(online);
+                    target.copy_from_slice(online);
+                    return Ok(());
                 }
                 for (target, &online) in target.iter_mut().zip(online) {
                     *target += tau * (online - *target);
                 }
+                Ok(())
             })?,
             Kernels::Candle if tau >= 1.0 => var.set(source)?,
             Kernels::Candle => {

@@ -11,7 +11,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_model::{Compute, DimHeads, Encoder, ModelConfig, Network, Parameters};
+use driml_model::{Compute, DimHeads, Encoder, Parameters};
 use driml_protocol::NO_ACTION;
 
 use case::Case;
@@ -20,14 +20,10 @@ use tolerance::Tolerances;
 
 use crate::{
     agent::{Agent, NetworkParameters},
-    auxiliary::{
-        AuxiliaryKind,
-        dim::DIM,
-        loss::{LossInputs, OnlineFeatures},
-        settings::{AuxiliarySettings, Lambda},
-    },
+    auxiliary::{AuxiliaryKind, dim::DIM, settings::Lambda},
     evaluation::Evaluation,
     losses::scores::{DotProducts, ScoreClip},
+    settings::UpdateSettings,
     tensors::to_vec_f64,
 };
 
@@ -105,7 +101,7 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let mut agent = case_agent(case, compute)?;
+    let mut agent = case_agent(case, case.settings.clone(), compute)?;
     let forward = forward_losses(case, compute)?;
     let evaluation = agent.evaluate_with(&case.batch(), &case.noise(agent.model())?)?;
     let mut check = CaseCheck {
@@ -245,35 +241,29 @@ impl CaseCheck<'_> {
     }
 }
 
-/// The agent of a case before its update.
-fn case_agent(case: &Case, compute: &Compute) -> Result<Agent, ParityError> {
+/// An agent with the parameters of a case before its update.
+fn case_agent(
+    case: &Case,
+    settings: UpdateSettings,
+    compute: &Compute,
+) -> Result<Agent, ParityError> {
     let sizes = case.model(DimHeads::NONE);
-    let model = case.model(case.settings.dim_heads(sizes.num_actions));
+    let model = case.model(settings.dim_heads(sizes.num_actions));
     let slow = model.without_dim();
     let device = &compute.device;
+    let key_tau = settings.make_auxiliary_loss()?.key_tau();
+    let key_encoder = key_tau.map(|_| {
+        let named = case.parameters("key.", &model);
+        Parameters::part_from_tensors(&model, Encoder::has_parameter, named, device)
+    });
     let parameters = NetworkParameters {
         online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
         target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
-        key_encoder: key_parameters(case, &model, compute)?,
+        key_encoder: key_encoder.transpose()?,
     };
-    let settings = case.settings.clone();
     Ok(Agent::from_parameters(
         model, settings, compute, parameters,
     )?)
-}
-
-/// The parameters of the case's key encoder, if its auxiliary loss has one.
-fn key_parameters(
-    case: &Case,
-    model: &ModelConfig,
-    compute: &Compute,
-) -> Result<Option<Parameters>, ParityError> {
-    if case.settings.make_auxiliary_loss()?.key_tau().is_none() {
-        return Ok(None);
-    }
-    let named = case.parameters("key.", model);
-    let key = Parameters::part_from_tensors(model, Encoder::has_parameter, named, &compute.device)?;
-    Ok(Some(key))
 }
 
 /// The value of an auxiliary loss, from a forward pass alone.
@@ -287,39 +277,23 @@ struct ForwardLoss {
 /// Computes the auxiliary losses of all pairs that the case contains, by a forward pass alone and whatever lambda is.
 fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>, ParityError> {
     let settings = &case.settings;
-    let kind = if settings.auxiliary_loss == AuxiliaryKind::NONE {
-        AuxiliaryKind::from_item(&DIM)
-    } else {
-        settings.auxiliary_loss
-    };
-    let all_pairs = AuxiliarySettings {
-        auxiliary_loss: kind.name(),
+    let mut all_pairs = UpdateSettings {
         lambda: Lambda::ONES,
-        ..settings.auxiliary_settings()
+        ..settings.clone()
     };
+    if settings.auxiliary_loss == AuxiliaryKind::NONE {
+        all_pairs.auxiliary_loss = AuxiliaryKind::from_item(&DIM);
+        // Read from the case's parameters: if the update is C51's alone, the settings do not say it.
+        let mut parameters = case.online_parameters();
+        all_pairs.condition_on_action = parameters.any(|it| it.0.starts_with("dim.action."));
+    }
     // A loss that rejects some of the pairs keeps the case's settings.
-    let loss = kind.make_loss(&all_pairs);
-    let loss = loss.or_else(|_| settings.make_auxiliary_loss())?;
-    // Read from the case's parameters: if the update is C51's alone, the settings do not say it.
-    let gives_action = |(name, _): (&str, _)| name.starts_with("dim.action.");
-    let model = case.model(loss.heads(case.online_parameters().any(gives_action)));
-    let (device, kernels) = (&compute.device, compute.kernels);
-    let named = case.parameters("online.", &model);
-    let parameters = Parameters::from_tensors(&model, named, device)?;
-    let online = Network::new(&model, &parameters, kernels)?;
-    let key = key_parameters(case, &model, compute)?;
-    let key = key.map(|key| Encoder::new(&model, &key, kernels));
-    let key = key.transpose()?;
+    if all_pairs.make_auxiliary_loss().is_err() {
+        all_pairs = settings.clone();
+    }
+    let networks = case_agent(case, all_pairs, compute)?.networks;
     let batch = case.batch();
-    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, false, device)?;
-    let losses = loss.losses(&LossInputs {
-        online: &online,
-        model: &model,
-        batch: &batch,
-        features: &features,
-        key_encoder: key.as_ref(),
-        device,
-    })?;
+    let losses = networks.auxiliary_losses(&batch, &networks.online_features(&batch)?)?;
     let is_saturated = |it: &DotProducts| -> Result<bool, ParityError> {
         let clip = ScoreClip::new(it.width, settings.tanh_clip);
         let mut dots = to_vec_f64(&it.values)?.into_iter();
@@ -407,7 +381,7 @@ mod tests {
             }
             let case = Case::parse(&std::fs::read(&path).unwrap()).unwrap();
             let (batch, name) = (case.batch(), path.display());
-            let agent = case_agent(&case, &Compute::CPU).unwrap();
+            let agent = case_agent(&case, case.settings.clone(), &Compute::CPU).unwrap();
             let shape = [batch.rows, agent.model().num_actions];
             let expected = case.expected("q_values_t", &shape).unwrap();
             let weights = agent.weights().unwrap();

@@ -7,12 +7,12 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{RunClient, Shutdown, Waiting, join_within};
+use driml_protocol::{RunClient, Shutdown, join_within};
 
-pub use super::fetcher::{Counters, Requests, ServedBatch};
+pub use super::fetcher::{Counters, NextBatch, Requests, ServedBatch};
 use super::{
     error::BatchError,
-    fetcher::{Fetcher, Message, SharedState},
+    fetcher::{Fetched, Fetcher, SharedState},
 };
 
 /// How long the threads may take to end.
@@ -20,21 +20,11 @@ const JOIN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The queue of fetched batches.
 pub struct BatchSource {
-    fetched: mpsc::Receiver<Message>,
+    fetched: mpsc::Receiver<Fetched>,
     /// Number of threads that have not reported that they are finished.
     running_threads: u32,
     threads: Vec<JoinHandle<()>>,
     shared: Arc<SharedState>,
-}
-
-/// The result of waiting for the next batch.
-pub enum NextBatch {
-    /// A batch to learn from.
-    Ready(Box<ServedBatch>),
-    /// No batch arrived within the time-out; call again. The replay server reports which side waits for the other.
-    NotYet(Waiting),
-    /// The run is over: no further batch will come.
-    Finished,
 }
 
 impl BatchSource {
@@ -79,9 +69,8 @@ impl BatchSource {
         while self.running_threads > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.fetched.recv_timeout(left) {
-                Ok(Message::Batch(served)) => return Ok(NextBatch::Ready(served)),
-                Ok(Message::Finished) => self.running_threads -= 1,
-                Ok(Message::Failed(e)) => return Err(e),
+                Ok(Ok(NextBatch::Finished)) => self.running_threads -= 1,
+                Ok(fetched) => return fetched,
                 Err(mpsc::RecvTimeoutError::Disconnected) if !self.shared.shutdown.is_set() => {
                     return Err(BatchError::ThreadsEnded);
                 }

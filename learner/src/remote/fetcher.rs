@@ -94,12 +94,18 @@ pub struct ServedBatch {
     pub parts: Vec<BatchPart>,
 }
 
-/// A message from a fetching thread.
-pub(super) enum Message {
-    Batch(Box<ServedBatch>),
+/// The result of waiting for the next batch.
+pub enum NextBatch {
+    /// A batch to learn from.
+    Ready(Box<ServedBatch>),
+    /// No batch arrived within the time-out; call again. The replay server reports which side waits for the other.
+    NotYet(Waiting),
+    /// The run is over: no further batch will come.
     Finished,
-    Failed(BatchError),
 }
+
+/// What a fetching thread sends: a batch, or why it ends.
+pub(super) type Fetched = Result<NextBatch, BatchError>;
 
 pub(super) struct SharedState {
     clients: Vec<RunClient>,
@@ -159,16 +165,17 @@ impl Fetcher {
         }
     }
 
-    pub(super) fn run(mut self, sender: &mpsc::SyncSender<Message>) {
+    pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
         let mut silence = Silence::default();
         while !self.shared.shutdown.is_set() {
             fail_point::reach("batches");
-            let fetched = match self.fetch() {
-                Ok(None) => {
+            let fetched = self.fetch();
+            let fetched = match fetched {
+                Ok(NextBatch::NotYet(_)) => {
                     silence.record_answer();
                     continue;
                 }
-                Ok(Some(fetched)) => fetched,
+                Ok(_) | Err(BatchError::Refused(_)) => fetched,
                 Err(e) => {
                     if e.is_recovering() {
                         silence.record_answer();
@@ -184,13 +191,14 @@ impl Fetcher {
                         self.shared.shutdown.wait_timeout(RETRY_PAUSE);
                         continue;
                     }
-                    Message::Failed(BatchError::Unreachable {
+                    Err(BatchError::Unreachable {
                         unreachable_max,
                         source: Box::new(e),
                     })
                 }
             };
-            if let Message::Batch(served) = &fetched {
+            let is_last = !matches!(fetched, Ok(NextBatch::Ready(_)));
+            if let Ok(NextBatch::Ready(served)) = &fetched {
                 let header = &served.batch.header;
                 let (newest, oldest) = header.weights_versions;
                 tracing::debug!(
@@ -198,7 +206,6 @@ impl Fetcher {
                     header.rows
                 );
             }
-            let is_last = !matches!(fetched, Message::Batch(_));
             if sender.send(fetched).is_err() || is_last {
                 return;
             }
@@ -206,8 +213,8 @@ impl Fetcher {
         }
     }
 
-    /// Fetches one batch; `None` if the replay has none yet.
-    fn fetch(&mut self) -> Result<Option<Message>, BatchError> {
+    /// Fetches one batch, if the replay has one already.
+    fn fetch(&mut self) -> Fetched {
         if self.shared.clients.len() > 1 {
             return self.fetch_from_shards();
         }
@@ -215,15 +222,15 @@ impl Fetcher {
         let pending = self.send_request(0, self.request_id, self.shared.requests.rows, None)?;
         let reply = self.receive_reply(pending)?;
         self.request_id = self.request_id.next();
-        Ok(match reply {
+        match reply {
             Ok(batch) => {
                 let parts = vec![self.count_received(0, &batch)];
-                Some(Message::Batch(Box::new(ServedBatch { batch, parts })))
+                Ok(NextBatch::Ready(Box::new(ServedBatch { batch, parts })))
             }
-            Err(NotReady::Wait(_)) => None,
-            Err(NotReady::Finished) => Some(Message::Finished),
-            Err(NotReady::Refused { why }) => Some(Message::Failed(BatchError::Refused(why))),
-        })
+            Err(NotReady::Wait(waiting)) => Ok(NextBatch::NotYet(waiting)),
+            Err(NotReady::Finished) => Ok(NextBatch::Finished),
+            Err(NotReady::Refused { why }) => Err(BatchError::Refused(why)),
+        }
     }
 
     /// Counts the rows received from a shard.
@@ -239,7 +246,7 @@ impl Fetcher {
 
     /// Assembles one batch from the parts of the shards. Only one batch is assembled at a time: each shard is told the counts of the
     /// others, so that their rate limiters decide as one.
-    fn fetch_from_shards(&mut self) -> Result<Option<Message>, BatchError> {
+    fn fetch_from_shards(&mut self) -> Fetched {
         let shared = self.shared.clone();
         let mut partial = lock(&shared.partial);
         if partial.parts.is_empty() && partial.is_complete() {
@@ -247,10 +254,10 @@ impl Fetcher {
             if !partial.begin(self.shared.requests.rows, &mut self.rng) {
                 // The run had all its updates when it was resumed: the shards stay empty.
                 if partial.all_stored {
-                    return Ok(Some(Message::Finished));
+                    return Ok(NextBatch::Finished);
                 }
                 self.shared.shutdown.wait_timeout(EMPTY_SHARDS_PAUSE);
-                return Ok(None);
+                return Ok(NextBatch::NotYet(self.shared.waiting()));
             }
         }
         let mut pending_replies = Vec::new();
@@ -287,9 +294,7 @@ impl Fetcher {
                 }
                 Err(NotReady::Wait(waiting)) => partial.record_waiting(waiting),
                 Err(NotReady::Finished) => finished = true,
-                Err(NotReady::Refused { why }) => {
-                    return Ok(Some(Message::Failed(BatchError::Refused(why))));
-                }
+                Err(NotReady::Refused { why }) => return Err(BatchError::Refused(why)),
             }
         }
         if let Some(e) = failed {
@@ -302,7 +307,7 @@ impl Fetcher {
             partial.parts.clear();
             let parts = std::mem::take(&mut partial.sources);
             partial.since_last_batch.record_answer();
-            return Ok(Some(Message::Batch(Box::new(ServedBatch { batch, parts }))));
+            return Ok(NextBatch::Ready(Box::new(ServedBatch { batch, parts })));
         }
         self.fetch_counts(&mut partial, |_, _| true)?;
         // Once a part has come, a shard that reports the end may have been told outdated counts of the other shards.
@@ -319,13 +324,16 @@ impl Fetcher {
                 left.join(" and "),
                 LAST_BATCH_MAX.as_secs()
             );
-            return Ok(Some(Message::Finished));
+            return Ok(NextBatch::Finished);
         }
         if partial.parts.is_empty() {
             // No part came, so draw anew: a shard that was not asked may hold back inserts until a request tells it how far the run is.
             partial.abandon();
         }
-        Ok(is_over.then_some(Message::Finished))
+        Ok(match is_over {
+            true => NextBatch::Finished,
+            false => NextBatch::NotYet(self.shared.waiting()),
+        })
     }
 
     /// Fetches the counts of the shards for which `is_due` is true.

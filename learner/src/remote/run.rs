@@ -20,9 +20,9 @@ use super::{
     shards::Shards,
 };
 use crate::{
-    checkpoint,
+    checkpoint::{self, CheckpointError},
     config::LearnerConfig,
-    learner::{Learner, LearnerError},
+    learner::Learner,
 };
 
 /// Time-out of the last request for the number of transitions that a replay server has stored.
@@ -87,7 +87,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         requests.shared_memory = false;
     }
     let sampling = config.sampling;
-    let mut learner = Learner::resume(config, &compute, &folder)?;
+    let mut learner = Learner::new(config, &compute)?.resume(&folder)?;
     let updates = learner.updates();
     if updates > 0 {
         let folder = folder.display();
@@ -252,12 +252,12 @@ struct Checkpointer {
     /// Updates and frames in the newest checkpoint that this process saved.
     saved_counts: Option<(u64, u64)>,
     /// The first failure since that checkpoint.
-    first_failure: Option<LearnerError>,
+    first_failure: Option<CheckpointError>,
 }
 
 impl Checkpointer {
     fn save(&mut self, learner: &Learner) {
-        match learner.save(&self.folder) {
+        match learner.save(&self.folder, None) {
             Ok(()) => {
                 self.saved_counts = Some(Self::counts(learner));
                 let saved_updates = &self.counters.saved_updates;
@@ -279,7 +279,7 @@ impl Checkpointer {
     }
 
     /// Saves a last checkpoint, if updates were made or frames stored since the newest one.
-    fn save_last(mut self, learner: &Learner) -> Result<(), LearnerError> {
+    fn save_last(mut self, learner: &Learner) -> Result<(), CheckpointError> {
         if self.saved_counts != Some(Self::counts(learner)) {
             self.save(learner);
         }

@@ -157,13 +157,13 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         learn(&mut straight, 0..8);
         let mut half = new_learner(&config);
         learn(&mut half, 0..4);
-        half.save(folder.path()).unwrap();
-        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, folder.path()).unwrap();
+        half.save(folder.path(), None).unwrap();
+        let mut resumed = new_learner(&config).resume(folder.path()).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
         let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
-        straight.save(&a).unwrap();
-        resumed.save(&b).unwrap();
+        straight.save(&a, None).unwrap();
+        resumed.save(&b, None).unwrap();
         let mut files = vec![
             "online.safetensors",
             "target.safetensors",
@@ -187,9 +187,9 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
     let folder = tempdir().unwrap();
     let config = config(CURL, Some(PAPER));
-    new_learner(&config).save(folder.path()).unwrap();
+    new_learner(&config).save(folder.path(), None).unwrap();
     let path = folder.path().join("checkpoint-000000000000");
-    let resume = || Learner::resume(config.clone(), &Compute::CPU, folder.path()).map(|_| ());
+    let resume = || new_learner(&config).resume(folder.path()).map(drop);
     resume().unwrap();
     fs::remove_file(path.join("key.safetensors")).unwrap();
     let missing = "key.safetensors is damaged: it is missing";
@@ -208,17 +208,12 @@ fn a_refused_batch_draws_nothing() {
     assert_eq!(after, new_learner(&config).update(&good).unwrap());
 }
 
+/// The other refusals are among those of the settings.
 #[test]
-fn augmentation_and_auxiliary_loss_belong_together() {
-    let plain = config(CURL, None).learner;
-    check_says(plain.validate().unwrap_err(), &["take the agent curl"]);
+fn without_an_auxiliary_loss_nothing_is_augmented() {
     let mut c51 = config(DIM, Some(PAPER)).learner;
     c51.update.auxiliary_loss = AuxiliaryKind::NONE;
     check_says(c51.validate().unwrap_err(), &["this agent has none"]);
-    let wild = config(DIM, Some(AugmentSettings { hue: 0.7, ..PAPER })).learner;
-    let range = "it must lie between 0 and 0.5, half a turn either way";
-    let wanted = format!("learner.augment.hue = 0.7 cannot work: {range}");
-    assert_eq!(wild.validate().unwrap_err().to_string(), wanted);
 }
 
 /// The probability of each row weights its C51 loss alone, at the update's beta. The row's unweighted loss is reported.

@@ -113,17 +113,7 @@ impl<'a> CostCounter<'a> {
     }
 
     pub(super) fn update_flops(&self) -> Counts {
-        let cost = UpdateCost::compute(&self.model, &self.shape);
-        to_counts([
-            ("s_t, torso", cost.online),
-            ("s_t, C51 head", cost.head),
-            ("s_{t+n}, target network", cost.target),
-            ("s_{t+n}, online network", cost.double_dqn),
-            ("more states, torso", cost.states),
-            ("states, key encoder", cost.keys),
-            ("psi and phi", cost.heads),
-            ("scores", cost.scores),
-        ])
+        to_counts(UpdateCost::compute(&self.model, &self.shape).parts())
     }
 
     /// Bytes of a transition, of a batch whose rows have every state, and of a broadcast, without compression and socket overhead.

@@ -119,7 +119,7 @@ impl Lockstep {
         let saved = SavedState::read(run_dir)?;
         let compute = config.local.learner_device.open(config.learner.precision)?;
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
-        let learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
+        let learner = Learner::new(settings, &compute)?.resume(&run_dir.checkpoints())?;
         let replay = open(config, run_dir, Some(saved.replay))?;
         let (actors, turn) = (saved.actors, saved.turn);
         let (found, wanted) = (actors.len(), config.local.actors as usize);
@@ -208,7 +208,7 @@ impl Lockstep {
         self.learner.run_counts_mut().record_inserted(0, inserted);
         let Some(mark) = self.replay.mark()? else {
             // An empty companion says that the run is in lockstep, and cannot be resumed.
-            return Ok(self.learner.save_with(folder, Some(&[]))?);
+            return Ok(self.learner.save(folder, Some(&[]))?);
         };
         let saved = self.save_with_mark(mark, folder);
         if saved.is_err() {
@@ -225,7 +225,7 @@ impl Lockstep {
             replay: mark,
             turn: self.turn.clone(),
         };
-        Ok(self.learner.save_with(folder, Some(&saved.to_bytes()?))?)
+        Ok(self.learner.save(folder, Some(&saved.to_bytes()?))?)
     }
 
     /// Stores one chunk of the next actor, then does every update that it allows. Returns false once all updates are done.

@@ -1,15 +1,11 @@
 //! The returns of a run's evaluated checkpoints: `evaluations.csv`, and the best checkpoint, kept in `best/`.
 //! This module plays nothing.
 
-use std::{
-    ffi::OsString,
-    fs::{self, File},
-    path::Path,
-};
+use std::{ffi::OsString, fs, path::Path};
 
 use anyhow::Context;
+use driml_learner::checkpoint;
 use driml_machine::{error::usage, units::count};
-use driml_protocol::atomic_write;
 use serde::Deserialize;
 
 use super::{
@@ -19,9 +15,6 @@ use super::{
 use crate::metrics::{cell, rounded};
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
-
-/// The name of a checkpoint that is about to become the best. A checkpoint with this name is left from a process that was killed.
-const NEW_BEST: &str = ".new";
 
 /// The return of a checkpoint over whole episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
@@ -56,7 +49,7 @@ impl EvaluationRow {
 
     /// The kept best checkpoint, with the evaluation of it that has the most episodes; none if none is kept.
     pub(crate) fn best(folder: &RunFolder) -> anyhow::Result<Option<Self>> {
-        let kept = driml_learner::checkpoint::list(&folder.best())?;
+        let kept = checkpoint::list(&folder.best())?;
         let played = Self::all(folder)?.into_iter();
         let of_best = played.filter(|it| kept.last().is_some_and(|(best, _)| *best == it.updates));
         Ok(of_best.max_by_key(|it| it.episodes))
@@ -119,7 +112,7 @@ impl EvaluationRow {
 /// A checkpoint that is being evaluated, in memory, so that it can be kept even if the learner deletes it meanwhile.
 #[derive(Debug)]
 pub(crate) struct Candidate {
-    name: OsString,
+    name: String,
     files: Vec<(OsString, Vec<u8>)>,
 }
 
@@ -132,7 +125,8 @@ impl Candidate {
             let bytes = fs::read(entry.path()).with_context(doing)?;
             files.push((entry.file_name(), bytes));
         }
-        let name = checkpoint.file_name().unwrap_or_default().to_owned();
+        let name = checkpoint.file_name().unwrap_or_default();
+        let name = name.to_string_lossy().into_owned();
         Ok(Self { name, files })
     }
 
@@ -162,26 +156,13 @@ impl Candidate {
 
     /// Makes this checkpoint the only one in the folder `best`.
     fn replace_best(&self, best: &Path) -> anyhow::Result<()> {
-        let (new, path) = (best.join(NEW_BEST), best.join(&self.name));
-        let doing = || format!("keeping {}", path.display());
-        if new.exists() {
-            fs::remove_dir_all(&new).with_context(doing)?;
-        }
-        fs::create_dir_all(&new).with_context(doing)?;
-        for (name, bytes) in &self.files {
-            atomic_write::write(&new.join(name), bytes).with_context(doing)?;
-        }
-        let older = driml_learner::checkpoint::list(best)?;
-        // Only if the old best has the same name, the folder is without a best for a moment.
-        if path.is_dir() {
-            fs::remove_dir_all(&path).with_context(doing)?;
-        }
-        fs::rename(&new, &path).with_context(doing)?;
-        // Before this sync, a power cut may leave only the older best, which is therefore removed afterwards.
-        let best = File::open(best).and_then(|folder| folder.sync_all());
-        best.with_context(doing)?;
-        for (_, older) in older.into_iter().filter(|(_, it)| *it != path) {
-            fs::remove_dir_all(older).with_context(doing)?;
+        let stored = checkpoint::store(best, &self.name, &self.files);
+        let path =
+            stored.with_context(|| format!("keeping {}", best.join(&self.name).display()))?;
+        for (_, other) in checkpoint::list(best)? {
+            if other != path {
+                checkpoint::prune(&other);
+            }
         }
         Ok(())
     }
@@ -214,13 +195,13 @@ mod tests {
         assert!(keep(20, 3.0, 4));
         assert!(!keep(30, 3.0, 4), "the first of equals stays");
         assert!(!keep(40, 9.0, 1), "one episode is luck");
-        let best = driml_learner::checkpoint::list(&folder.best()).unwrap();
+        let best = checkpoint::list(&folder.best()).unwrap();
         assert_eq!(best.len(), 1);
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
         // The remains of a process that was killed do not count as a checkpoint.
-        fs::create_dir(folder.best().join(NEW_BEST)).unwrap();
-        let again = driml_learner::checkpoint::list(&folder.best()).unwrap();
+        fs::create_dir(folder.best().join("checkpoint-50.tmp")).unwrap();
+        let again = checkpoint::list(&folder.best()).unwrap();
         assert_eq!(again, best);
         let all = EvaluationRow::all(&folder).unwrap();
         let at = all.iter().map(|it| (it.frames, it.updates, it.mean_return));
@@ -252,7 +233,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         assert!(keep(&folder, 20, 3.0, 4).unwrap());
-        let taken = folder.best().join("checkpoint-50");
+        let taken = folder.best().join("checkpoint-50.tmp");
         fs::write(&taken, "").unwrap();
         keep(&folder, 50, 9.0, 4).unwrap_err();
         fs::remove_file(taken).unwrap();

@@ -7,8 +7,8 @@ use clap::Args;
 use driml_actor::Step;
 use driml_envs::StepEnd;
 use driml_figure::{FigureError, Film, Picture};
-use driml_launch::evaluate::{Player, Viewer};
-use driml_learner::insight::NetworkOutputs;
+use driml_launch::evaluate::Player;
+use driml_learner::insight::{Insight, NetworkOutputs};
 use driml_machine::error::{Usage, usage};
 use driml_protocol::Horizon;
 
@@ -41,7 +41,7 @@ pub(crate) struct Recording {
     film: Film,
     layout: Layout,
     /// Computes the network's outputs for the states, if they are shown.
-    viewer: Option<Viewer>,
+    insight: Option<Insight>,
     /// The newest shot of each environment. The last one stays once all episodes of the environment are filmed.
     shots: Vec<Shot>,
     episodes_max: u32,
@@ -71,19 +71,19 @@ impl Recording {
         };
         let played = Player::envs(episodes as usize);
         let envs = (args.record_envs as usize).min(played);
-        let viewer = args.overlay.then(|| player.viewer()).transpose()?;
+        let insight = args.overlay.then(|| player.insight()).transpose()?;
         let k = match player.config.run.horizon {
             Horizon::Fixed { k } => k as usize,
             _ => 1,
         };
-        let shape = viewer.as_ref().and_then(|it| it.insight.f3_shape());
+        let shape = insight.as_ref().and_then(Insight::f3_shape);
         let local = shape.filter(|_| played > 1).map(|(rows, columns)| Local {
             k,
             rows,
             columns,
             candidates: played,
         });
-        let layout = Layout::new(&player.config, envs, viewer.is_some(), local);
+        let layout = Layout::new(&player.config, envs, insight.is_some(), local);
         let rate = player.config.world.steps_per_second();
         let film = Film::create(path, layout.size, rate).map_err(film_error)?;
         // Start as if an episode had ended before the first.
@@ -95,7 +95,7 @@ impl Recording {
             path: path.clone(),
             film,
             layout,
-            viewer,
+            insight,
             shots: vec![before; envs],
             episodes_max: args.record_episodes,
             steps_max: args.record_steps,
@@ -121,14 +121,14 @@ impl Recording {
         let played = step.actions.len();
         let frames = step.frames.chunks_exact(step.frames.len() / played);
         let mut seen = None;
-        if let Some(viewer) = &mut self.viewer {
+        if let Some(insight) = &self.insight {
             // Local DIM tells a state from those of all environments, not only of the filmed ones.
             let num_states = match self.layout.local {
                 Some(_) => played,
                 None => self.shots.len(),
             };
             let states = &step.states[..step.states.len() / played * num_states];
-            seen = Some(viewer.compute(states)?);
+            seen = Some(insight.evaluate(states)?);
         }
         for (i, (shot, frame)) in self.shots.iter_mut().zip(frames).enumerate() {
             if !shot.is_over(self.episodes_max) {
@@ -162,9 +162,8 @@ impl Recording {
         };
         let between = self.steps_ahead().saturating_sub(1);
         let later = self.waiting.get(between).and_then(|it| it.seen.as_ref());
-        let matches = match (&self.viewer, &filmed.seen, later) {
-            (Some(viewer), Some(now), Some(later)) => {
-                let insight = &viewer.insight;
+        let matches = match (&self.insight, &filmed.seen, later) {
+            (Some(insight), Some(now), Some(later)) => {
                 insight.local_matches(now, &filmed.actions, later)?
             }
             _ => None,

@@ -1,87 +1,35 @@
-//! The C51 head: computes a distribution over the atoms for each action from relu(f4), and its expectation.
+//! The values of a C51 head: the expectation of each action's distribution over the atoms.
 //! This module computes no loss and no projection.
 //!
 //! Source: Bellemare et al. 2017.
 
-use candle_core::{D, Tensor, bail};
+use candle_core::{D, Result, Tensor, bail};
 use candle_nn::ops::softmax;
 use rayon::prelude::*;
 
 use crate::compute::Kernels;
-use crate::config::ModelConfig;
-use crate::error::Result;
-use crate::heads::noise::HeadNoise;
-use crate::heads::streams::Streams;
 use crate::kernels::exponentials::exp_minus_max;
 use crate::kernels::tensors::values_of;
-use crate::layers::Layer;
-use crate::parameters::Parameters;
 
 /// Distributions that one task processes.
 const TASK_DISTRIBUTIONS: usize = 256;
 
-#[derive(Debug)]
-pub(crate) struct C51Head {
-    kernels: Kernels,
-    streams: Streams,
-    actions: usize,
-    atoms: usize,
-    support: Vec<f32>,
-}
-
-impl C51Head {
-    pub(crate) fn new(
-        config: &ModelConfig,
-        parameters: &Parameters,
-        kernels: Kernels,
-    ) -> Result<Self> {
-        Ok(Self {
-            kernels,
-            streams: Streams::new(config, parameters)?,
-            actions: config.num_actions,
-            atoms: config.atoms,
-            support: config.atoms_support(),
-        })
-    }
-
-    /// Computes the logits [B, A, atoms] of f4 [B, hidden] before its ReLU. Without noise, noisy layers use their means.
-    pub(crate) fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
-        let active = self.kernels.relu(f4)?;
-        let layer = self.streams.merged_layer(noise)?;
-        let logits = self.kernels.linear(&active, &layer.weight, &layer.bias)?;
-        Ok(logits.reshape(((), self.actions, self.atoms))?)
-    }
-
-    /// Computes the logits [B, atoms] of one action a row.
-    pub(crate) fn taken_logits(
-        &self,
-        f4: &Tensor,
-        actions: &[u8],
-        noise: Option<&HeadNoise>,
-    ) -> Result<Tensor> {
-        let active = self.kernels.relu(f4)?;
-        let Layer { weight, bias } = self.streams.merged_layer(noise)?;
-        let (kernels, atoms) = (self.kernels, self.atoms);
-        Ok(kernels.grouped_linear(&active, &weight, &bias, actions, atoms)?)
-    }
-
-    /// Computes the expected returns [B, A] of logits [B, A, atoms], without a gradient.
-    pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
-        match self.kernels {
-            Kernels::Fused(_) => Ok(fused_q_values(&logits.contiguous()?, &self.support)?),
-            Kernels::Candle => {
-                let (v_min, spacing) = v_min_and_spacing(&self.support);
-                let positions = Tensor::arange(0f32, self.atoms as f32, logits.device())?;
-                let probs = softmax(&logits.detach(), D::Minus1)?;
-                let mean = probs.broadcast_mul(&positions)?.sum(D::Minus1)?;
-                Ok(mean.affine(spacing, v_min)?)
-            }
+/// Computes the expected returns [B, A] of logits [B, A, atoms] over the atoms `support`, without a gradient.
+pub(crate) fn q_values(kernels: Kernels, logits: &Tensor, support: &[f32]) -> Result<Tensor> {
+    match kernels {
+        Kernels::Fused(_) => fused_q_values(&logits.contiguous()?, support),
+        Kernels::Candle => {
+            let (v_min, spacing) = v_min_and_spacing(support);
+            let positions = Tensor::arange(0f32, support.len() as f32, logits.device())?;
+            let probs = softmax(&logits.detach(), D::Minus1)?;
+            let mean = probs.broadcast_mul(&positions)?.sum(D::Minus1)?;
+            mean.affine(spacing, v_min)
         }
     }
 }
 
 /// Computes [`expected_returns`] [B, A] of logits [B, A, atoms] on the rayon pool.
-fn fused_q_values(logits: &Tensor, support: &[f32]) -> candle_core::Result<Tensor> {
+fn fused_q_values(logits: &Tensor, support: &[f32]) -> Result<Tensor> {
     let (batch, actions, atoms) = logits.dims3()?;
     if atoms != support.len() {
         bail!("logits {:?} over {} atoms", logits.shape(), support.len());

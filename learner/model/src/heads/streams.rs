@@ -11,7 +11,6 @@ use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::heads::noise::HeadNoise;
 use crate::layers::Layer;
-use crate::parameters::Parameters;
 
 /// A layer of the head: its mean, and the scale of its noise if it is noisy.
 #[derive(Debug)]
@@ -70,34 +69,23 @@ impl HeadLayer<Tensor> {
     }
 }
 
-#[derive(Debug)]
-pub(crate) struct Streams {
-    layers: Vec<HeadLayer<Tensor>>,
+/// Merges a head's `layers` into one layer of A * N outputs, with or without noise. For a plain head without noise, this is the
+/// head's layer itself, whose parameters are variables.
+pub(crate) fn merge(
+    layers: &[HeadLayer<Tensor>],
     atoms: usize,
-}
-
-impl Streams {
-    pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
-        Ok(Self {
-            layers: HeadLayer::collect(config, |layer, part| parameters.tensor(layer, part))?,
-            atoms: config.atoms,
-        })
-    }
-
-    /// Reduces the head to one layer of A * N outputs, with or without noise. For a plain head without noise,
-    /// this is the head's layer itself, whose parameters are variables.
-    pub(crate) fn merged_layer(&self, noise: Option<&HeadNoise>) -> Result<Layer<Tensor>> {
-        let first = self.layers[0].with_noise(noise, 0)?;
-        let Some(advantage) = self.layers.get(1) else {
-            return Ok(first);
-        };
-        let (value, advantage) = (first, advantage.with_noise(noise, 1)?);
-        let (v, a) = (value.bias.unsqueeze(1)?, advantage.bias.unsqueeze(1)?);
-        Ok(Layer {
-            weight: add_streams(&value.weight, &advantage.weight, self.atoms)?,
-            bias: add_streams(&v, &a, self.atoms)?.squeeze(D::Minus1)?,
-        })
-    }
+    noise: Option<&HeadNoise>,
+) -> Result<Layer<Tensor>> {
+    let first = layers[0].with_noise(noise, 0)?;
+    let Some(advantage) = layers.get(1) else {
+        return Ok(first);
+    };
+    let (value, advantage) = (first, advantage.with_noise(noise, 1)?);
+    let (v, a) = (value.bias.unsqueeze(1)?, advantage.bias.unsqueeze(1)?);
+    Ok(Layer {
+        weight: add_streams(&value.weight, &advantage.weight, atoms)?,
+        bias: add_streams(&v, &a, atoms)?.squeeze(D::Minus1)?,
+    })
 }
 
 /// Computes V + A - mean_a A of outputs: `value` [N, in], `advantage` [A * N, in], result [A * N, in].
