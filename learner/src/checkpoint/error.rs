@@ -51,7 +51,7 @@ pub enum CheckpointError {
         expected: String,
     },
     #[error(
-        "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
+        "the checkpoint in {} has another estimator of the action affinity: resume with the settings it was made with, or choose another folder",
         .0.display()
     )]
     OtherAffinity(PathBuf),
