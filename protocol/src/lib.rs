@@ -1,7 +1,7 @@
 //! The interface between the processes of a run: the run spec, the messages, their encoding, and the connections that carry them.
 //! This crate has no algorithm and no state of a run; `deploy/docs/src/reference/protocol.md` has the table of messages.
 //!
-//! Start at [`RunClient`], which queries, fetches, publishes and subscribes, and at [`QueryWorkers`], which reply. A [`Message`] is a
+//! Start at [`RunClient`], which queries, fetches, publishes and subscribes, and at [`answer_queries`], which replies. A [`Message`] is a
 //! header and perhaps a payload; [`codec`] encodes and decodes both, and rejects damaged, foreign and unexpected messages. All processes of
 //! a run must agree on the [`RunSpec`], whose hash is in every message.
 //!
@@ -67,7 +67,7 @@ pub use process::{
     shutdown::{GracefulShutdown, Shutdown, join_within},
     silence::Silence,
 };
-pub use query_workers::{Incoming, QueryWorkers, Responder};
+pub use query_workers::{Incoming, Responder, answer_queries};
 pub use run_spec::{FRAME_STACK_MAX, Horizon, RunSpec, TimeoutRule};
 pub use sampling::Sampling;
 pub use wire::{

@@ -13,7 +13,6 @@ use std::{
     thread::JoinHandle,
 };
 
-use crossbeam_channel::Sender;
 use zenoh::{
     Wait,
     bytes::ZBytes,
@@ -118,92 +117,66 @@ impl<M: Message> Responder<M> {
 /// An item in the queue of the threads.
 enum Work {
     Query(Query),
-    /// A rejected query: the bytes of its payload, and the callback that reports them.
-    Rejected(usize, Arc<dyn Fn(usize) + Send + Sync>),
+    /// A rejected query: the bytes of its payload.
+    Rejected(usize),
 }
 
-/// Threads that answer requests `R`, and their queue. The threads exit once this value and all queryables that it declared are dropped.
-#[derive(Debug)]
-pub struct QueryWorkers<R> {
-    work: Sender<Work>,
-    queued_bytes: Arc<AtomicUsize>,
-    threads: Vec<JoinHandle<()>>,
-    request: PhantomData<fn() -> R>,
-}
-
-impl<R: Request + 'static> QueryWorkers<R> {
-    /// Starts `threads` threads, each of which answers one request of the run `spec_hash` after another by calling `answer`.
-    pub fn start(
-        name: &str,
-        threads: usize,
-        spec_hash: u64,
-        answer: impl Fn(Incoming<R>) + Clone + Send + 'static,
-    ) -> std::io::Result<Self> {
-        let (work, queue) = crossbeam_channel::bounded::<Work>(QUEUE_MAX);
-        let queued_bytes = Arc::<AtomicUsize>::default();
-        let thread = |i: usize| {
-            let (queue, answer, bytes) = (queue.clone(), answer.clone(), queued_bytes.clone());
-            let point = name.to_owned();
-            let next = move || {
-                fail_point::reach(&point);
-                queue.recv().ok()
-            };
-            let handle = move |work| match work {
-                Work::Query(query) => {
-                    bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
-                    answer(Incoming {
-                        query,
-                        spec_hash,
-                        request: PhantomData,
-                    });
-                }
-                Work::Rejected(bytes, on_rejected) => on_rejected(bytes),
-            };
-            std::thread::Builder::new()
-                .name(format!("{name}-{i}"))
-                .spawn(move || std::iter::from_fn(next).for_each(handle))
+/// Answers requests `R` of the client's run until the returned queryable is dropped, which also ends the returned threads. Each of `threads`
+/// threads calls `answer` for one request after another. The reply is complete: zenoh need query no other process.
+///
+/// A request of more than `bytes_max` bytes is dropped before anything is copied, and `on_rejected` is called with its bytes.
+pub fn answer_queries<R: Request + 'static>(
+    client: &RunClient,
+    name: &str,
+    threads: usize,
+    bytes_max: usize,
+    answer: impl Fn(Incoming<R>) + Clone + Send + 'static,
+    on_rejected: impl Fn(usize) + Clone + Send + 'static,
+) -> zenoh::Result<(Queryable<()>, Vec<JoinHandle<()>>)> {
+    let spec_hash = client.spec_hash();
+    let (work, queue) = crossbeam_channel::bounded::<Work>(QUEUE_MAX);
+    let queued_bytes = Arc::<AtomicUsize>::default();
+    let thread = |i: usize| {
+        let (queue, bytes) = (queue.clone(), queued_bytes.clone());
+        let (answer, on_rejected) = (answer.clone(), on_rejected.clone());
+        let point = name.to_owned();
+        let next = move || {
+            fail_point::reach(&point);
+            queue.recv().ok()
         };
-        let threads = (0..threads).map(thread).collect::<Result<_, _>>()?;
-        Ok(Self {
-            work,
-            queued_bytes,
-            threads,
-            request: PhantomData,
-        })
-    }
-
-    /// Accepts requests of the client's run until the returned queryable is dropped. A request of more than `bytes_max` bytes is dropped
-    /// before anything is copied, and `on_rejected` is called with its bytes. The reply is complete: zenoh need query no other process.
-    pub fn declare(
-        &self,
-        client: &RunClient,
-        bytes_max: usize,
-        on_rejected: impl Fn(usize) + Send + Sync + 'static,
-    ) -> zenoh::Result<Queryable<()>> {
-        let (work, queued_bytes) = (self.work.clone(), self.queued_bytes.clone());
-        let on_rejected: Arc<dyn Fn(usize) + Send + Sync> = Arc::new(on_rejected);
-        let enqueue = move |query: Query| {
-            let bytes = payload_bytes(&query);
-            if bytes > bytes_max {
-                // If the queue is full, this report is lost; it is one of very many.
-                let _ = work.try_send(Work::Rejected(bytes, on_rejected.clone()));
-                return;
+        let handle = move |work| match work {
+            Work::Query(query) => {
+                bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
+                answer(Incoming {
+                    query,
+                    spec_hash,
+                    request: PhantomData,
+                });
             }
-            let before = queued_bytes.fetch_add(bytes, Ordering::Relaxed);
-            // Dropping a query notifies its sender at once.
-            if before > QUEUE_BYTES_MAX || work.try_send(Work::Query(query)).is_err() {
-                queued_bytes.fetch_sub(bytes, Ordering::Relaxed);
-                tracing::debug!("more queries than can wait; the sender retries");
-            }
+            Work::Rejected(bytes) => on_rejected(bytes),
         };
-        let queryable = client.session().declare_queryable(client.keys().key::<R>());
-        queryable.complete(true).callback(enqueue).wait()
-    }
-
-    /// Returns the threads so that the caller can join them.
-    pub fn into_threads(self) -> Vec<JoinHandle<()>> {
-        self.threads
-    }
+        std::thread::Builder::new()
+            .name(format!("{name}-{i}"))
+            .spawn(move || std::iter::from_fn(next).for_each(handle))
+    };
+    let threads = (0..threads).map(thread).collect::<Result<_, _>>()?;
+    let enqueue = move |query: Query| {
+        let bytes = payload_bytes(&query);
+        if bytes > bytes_max {
+            // If the queue is full, this report is lost; it is one of very many.
+            let _ = work.try_send(Work::Rejected(bytes));
+            return;
+        }
+        let before = queued_bytes.fetch_add(bytes, Ordering::Relaxed);
+        // Dropping a query notifies its sender at once.
+        if before > QUEUE_BYTES_MAX || work.try_send(Work::Query(query)).is_err() {
+            queued_bytes.fetch_sub(bytes, Ordering::Relaxed);
+            tracing::debug!("more queries than can wait; the sender retries");
+        }
+    };
+    let queryable = client.session().declare_queryable(client.keys().key::<R>());
+    let queryable = queryable.complete(true).callback(enqueue).wait()?;
+    Ok((queryable, threads))
 }
 
 fn payload_bytes(query: &Query) -> usize {

@@ -12,7 +12,7 @@ use std::{
 
 use driml_protocol::{
     Ack, AffinityUpdate, CodecError, EncodedMessage, Incoming, LearnerStatus, LogLimiter,
-    PriorityUpdate, QueryWorkers, Request, RunClient, Sampling, Shutdown, Weights, WeightsUpload,
+    PriorityUpdate, Request, RunClient, Sampling, Shutdown, Weights, WeightsUpload, answer_queries,
     codec::PAYLOAD_BYTES_MAX, fail_point, lock, session::SessionError,
 };
 use zenoh::query::Queryable;
@@ -111,12 +111,12 @@ impl Publisher {
             incoming.into_responder().reply(&status);
             sent.store(status.finished, Ordering::Relaxed);
         };
-        let status_queries = QueryWorkers::start("learner-status", 1, spec_hash, reply_status)?;
         let mut queryables = Vec::new();
         for client in clients {
-            let declared = status_queries.declare(client, PAYLOAD_BYTES_MAX, |_| ());
+            let (name, answer) = ("learner-status", reply_status.clone());
+            let declared = answer_queries(client, name, 1, PAYLOAD_BYTES_MAX, answer, |_| ());
             let error = |e| anyhow::anyhow!("declaring the learner's status: {e}");
-            queryables.push(declared.map_err(error)?);
+            queryables.push(declared.map_err(error)?.0);
         }
         let this = Self {
             learner_id,

@@ -10,8 +10,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, QueryWorkers, Request, RunClient,
-    RunSpec, Sampling, Shutdown,
+    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, Request, RunClient, RunSpec,
+    Sampling, Shutdown, answer_queries,
     config::{Settings, TransportConfig},
     fail_point, join_within,
     session::{self, Endpoints},
@@ -303,20 +303,20 @@ impl<'a> Queries<'a> {
         bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
-        let (gate, spec_hash) = (self.gate.clone(), self.client.spec_hash());
+        let gate = self.gate.clone();
         let answer = move |incoming: Incoming<R>| match gate.service.get() {
             Some(service) => answer(service, incoming),
             None => incoming.into_responder().retry_later(&gate.retry_reply()),
         };
-        let workers = QueryWorkers::start(name, threads, spec_hash, answer)?;
         let gate = self.gate.clone();
         let reject_long = move |bytes| match gate.service.get() {
             Some(service) => service.reject_too_long(name, bytes, bytes_max),
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };
-        let queryable = workers.declare(self.client, bytes_max, reject_long)?;
+        let (queryable, workers) =
+            answer_queries(self.client, name, threads, bytes_max, answer, reject_long)?;
         self.queryables.push(queryable);
-        self.threads.extend(workers.into_threads());
+        self.threads.extend(workers);
         Ok(())
     }
 }
