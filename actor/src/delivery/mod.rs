@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
+use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown, lock};
 
 use state::{DeliveryState, Progress};
 use worker::DeliveryWorker;
@@ -39,9 +39,9 @@ impl Delivery {
         shutdown: Shutdown,
     ) -> std::io::Result<Self> {
         let state = Arc::new(DeliveryState::default());
-        state.progress().inserted_total = inserted_total;
+        lock(&state.progress).inserted_total = inserted_total;
         // Held until a first chunk is stored at once: actors that start together must not run ahead of the learner together.
-        state.progress().is_held = true;
+        lock(&state.progress).is_held = true;
         let (queue, chunks) = mpsc::channel();
         let worker = DeliveryWorker::new(client, limits, pool, shutdown, state.clone());
         let thread = std::thread::Builder::new()
@@ -57,7 +57,7 @@ impl Delivery {
 
     /// Returns the progress as of the last reply.
     pub(crate) fn progress(&self) -> Progress {
-        *self.state.progress()
+        *lock(&self.state.progress)
     }
 
     /// How long the actor may wait for newer weights before its next chunk: while the rate limiter holds its chunks, waiting is free.
@@ -82,7 +82,7 @@ impl Delivery {
     /// Queues a chunk, waiting while `chunks_in_flight_max` chunks are not settled, or one if the rate limiter holds
     /// chunks. Returns `false` if the thread has ended; [`Self::finish`] then returns why.
     pub fn send(&self, chunk: Chunk) -> bool {
-        let mut progress = self.state.progress();
+        let mut progress = lock(&self.state.progress);
         loop {
             let limit = if progress.is_held { 1 } else { self.chunks_max };
             if progress.in_flight < limit || self.thread.is_finished() {

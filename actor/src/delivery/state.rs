@@ -2,11 +2,11 @@
 //! The chunks themselves go through a queue.
 
 use std::{
-    sync::{Condvar, Mutex, MutexGuard},
+    sync::{Condvar, Mutex},
     time::Duration,
 };
 
-use driml_protocol::{lock, session::SessionError};
+use driml_protocol::session::SessionError;
 
 use crate::config::Config;
 
@@ -35,7 +35,7 @@ impl DeliveryLimits {
 /// The state that the acting thread and the delivery thread share, besides the queue.
 #[derive(Debug, Default)]
 pub(super) struct DeliveryState {
-    progress: Mutex<Progress>,
+    pub(super) progress: Mutex<Progress>,
     /// Notified when a chunk is settled: stored, no longer wanted, or given up after a failure.
     pub(super) settled: Condvar,
 }
@@ -53,12 +53,6 @@ pub(crate) struct Progress {
     pub(super) is_held: bool,
     /// Chunks that were queued and are not yet settled.
     pub(super) in_flight: usize,
-}
-
-impl DeliveryState {
-    pub(super) fn progress(&self) -> MutexGuard<'_, Progress> {
-        lock(&self.progress)
-    }
 }
 
 /// Why chunks could not be delivered.

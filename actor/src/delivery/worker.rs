@@ -10,7 +10,7 @@ use std::{
 
 use driml_protocol::{
     BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
-    RunClient, Shutdown, Silence, fail_point, session::SessionError,
+    RunClient, Shutdown, Silence, fail_point, lock, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
@@ -111,13 +111,13 @@ impl DeliveryWorker {
                 Ok(Outcome::Unwanted) => unwanted += transitions,
                 Err(e) => {
                     result = Err(e);
-                    self.state.progress().is_finished = true;
+                    lock(&self.state.progress).is_finished = true;
                 }
             }
             produced += transitions;
             sender = Some((header.actor, header.incarnation));
             self.outgoing.pop_front();
-            self.state.progress().in_flight -= 1;
+            lock(&self.state.progress).in_flight -= 1;
             self.state.settled.notify_all();
         }
         if let Some((actor, incarnation)) = sender {
@@ -185,7 +185,7 @@ impl DeliveryWorker {
                 waited,
             }) => {
                 let was_held = self.held_since.take().is_some() || waited;
-                let mut progress = self.state.progress();
+                let mut progress = lock(&self.state.progress);
                 progress.inserted_total = inserted_total;
                 progress.actors = actors;
                 progress.is_held = was_held;
@@ -200,7 +200,7 @@ impl DeliveryWorker {
                 Ok(Outcome::Stored)
             }
             Ok(InsertReply::Finished { inserted_total }) => {
-                let mut progress = self.state.progress();
+                let mut progress = lock(&self.state.progress);
                 progress.inserted_total = inserted_total;
                 progress.is_finished = true;
                 Ok(Outcome::Unwanted)
@@ -209,7 +209,7 @@ impl DeliveryWorker {
                 inserted_total,
                 kept,
             }) => {
-                self.state.progress().inserted_total = inserted_total;
+                lock(&self.state.progress).inserted_total = inserted_total;
                 self.mark_held(kept);
                 Ok(self.prepare_resend())
             }
@@ -268,7 +268,7 @@ impl DeliveryWorker {
     /// Records that the rate limiter holds the first chunk. Pauses before the retry unless the replay server keeps the chunk.
     fn mark_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
-        self.state.progress().is_held = true;
+        lock(&self.state.progress).is_held = true;
         self.outgoing[0].is_kept = kept;
         if !kept {
             self.pause();
