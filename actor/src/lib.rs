@@ -50,6 +50,6 @@ pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
 pub use error::ActError;
 pub use evaluate::{Evaluation, OnStep, episode_returns};
 pub use policy::{NetworkPolicy, Policy, RandomPolicy};
-pub use recorder::{ChunkNumbers, ChunkRecorder};
+pub use recorder::ChunkRecorder;
 pub use run::{RunArgs, run};
 pub use schedule::Schedule;

@@ -3,7 +3,6 @@
 
 use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
-use serde::{Deserialize, Serialize};
 
 /// Converts the end of a step to its wire format.
 const fn wire_end(end: StepEnd) -> End {
@@ -13,13 +12,6 @@ const fn wire_end(end: StepEnd) -> End {
         StepEnd::TimedOut => End::TimedOut,
         StepEnd::Terminal => End::Terminal,
     }
-}
-
-/// The number of a chunk in its incarnation, and the number of transitions before it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ChunkNumbers {
-    sequence: u64,
-    first_transition: u64,
 }
 
 /// Records steps into one chunk after another.
@@ -76,22 +68,18 @@ impl ChunkRecorder {
         self.header.first_transition
     }
 
-    /// Returns the numbers of the next chunk, between two chunks.
+    /// Returns the number of the next chunk in its incarnation, and the number of transitions before it.
     ///
     /// # Panics
     /// If a chunk is being filled.
-    pub fn next_chunk_numbers(&self) -> ChunkNumbers {
+    pub fn next_chunk_numbers(&self) -> (u64, u64) {
         assert!(self.chunk.is_none(), "a chunk is kept whole or not at all");
-        ChunkNumbers {
-            sequence: self.header.sequence,
-            first_transition: self.header.first_transition,
-        }
+        (self.header.sequence, self.header.first_transition)
     }
 
     /// Continues with the numbers of another recorder of the same incarnation.
-    pub fn resume_at(&mut self, next: ChunkNumbers) {
-        self.header.sequence = next.sequence;
-        self.header.first_transition = next.first_transition;
+    pub fn resume_at(&mut self, next_chunk_numbers: (u64, u64)) {
+        (self.header.sequence, self.header.first_transition) = next_chunk_numbers;
     }
 
     /// Records one step of every environment: the `frames` [N, frame bytes] in which `actions` [N] were taken, `rewards` and `ends` [N].
