@@ -78,7 +78,7 @@ impl ChunkRecorder {
     }
 
     /// Continues with the numbers of another recorder of the same incarnation.
-    pub const fn resume_at(&mut self, next_chunk_numbers: (u64, u64)) {
+    pub fn resume_at(&mut self, next_chunk_numbers: (u64, u64)) {
         (self.header.sequence, self.header.first_transition) = next_chunk_numbers;
     }
 

@@ -134,7 +134,7 @@ pub fn answer_queries<R: Request + 'static>(
     on_rejected: impl Fn(usize) + Clone + Send + 'static,
 ) -> zenoh::Result<(Queryable<()>, Vec<JoinHandle<()>>)> {
     let spec_hash = client.spec_hash();
-    let (work, queue) = crossbeam_channel::bounded(QUEUE_MAX);
+    let (work, queue) = crossbeam_channel::bounded::<Work>(QUEUE_MAX);
     let queued_bytes = Arc::<AtomicUsize>::default();
     let thread = |i: usize| {
         let (queue, bytes) = (queue.clone(), queued_bytes.clone());

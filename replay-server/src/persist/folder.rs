@@ -88,7 +88,6 @@ pub(super) struct SegmentHeader {
 }
 
 /// Where a replay is kept on disk, and which shard of the run it is.
-#[derive(Clone, Debug)]
 #[derive(Clone, Debug, Default)]
 pub struct PersistArgs {
     /// The folder, for this replay alone.
