@@ -1,5 +1,7 @@
 //! The run folder's files: what a run leaves, and what a resumed run continues.
 
+use std::fs;
+
 use driml_actor::Schedule;
 use driml_protocol::{EndedEpisode, LearnerStatus, Totals, Waiting};
 use expect_test::expect;
