@@ -195,8 +195,8 @@ impl RunConfig {
             let period = learner.checkpoint_period_updates;
             if every_updates == 0 || !every_updates.is_multiple_of(period) {
                 return Err(usage!(
-                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one after every \
-                     {period}: take a multiple of that, or --set learner.checkpoint_period_updates"
+                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and \
+                     learner.checkpoint_period_updates = {period}: take a multiple of that, or --set it"
                 ));
             }
             if !(1..=1_000_000).contains(&episodes) {

@@ -189,7 +189,7 @@ fn format_table(comparison: &Comparison) -> String {
     let mut cells = vec![heads.map(String::from).to_vec()];
     let mut skipped = BTreeSet::new();
     for row in &comparison.rows {
-        let number = |value: Option<f64>| value.map_or("-".into(), format_number);
+        let number = |value: Option<f64>| value.map_or("-".into(), units::format_number);
         let verdict = match (row.ratio, row.goal) {
             _ if row.skipped.is_some() => "skipped",
             (_, None) => "",

@@ -20,7 +20,7 @@ const REPORT_AGE_MAX: f64 = 10.0;
 
 /// The most characters of a line, except for a path or a command that is longer.
 const LINE_CHARS_MAX: usize = 80;
-const NAME_CHARS_MAX: usize = 20;
+const NAME_CHARS_MAX: usize = 21;
 /// The blanks before the rest of a line that is broken.
 const INDENT: usize = 4;
 
@@ -175,7 +175,7 @@ fn server_row(server: &ServerAnswer, server_count: usize) -> Vec<String> {
         format!("; weights {} old", rough_duration(age))
     });
     let activity = format!(
-        "queued: {} ({:.1} MiB), {}{weights}",
+        "queued: {} ({:.1}\u{a0}MiB), {}{weights}",
         count(status.chunks_waiting, "chunk"),
         status.chunk_bytes_waiting as f64 / f64::from(1 << 20),
         count(status.requests_waiting, "request")
