@@ -16,6 +16,7 @@ pub fn check_file(what: &str, path: &Path) -> Result<(), Usage> {
     let folder = folder.unwrap_or(Path::new("."));
     match access(folder, AccessFlags::W_OK | AccessFlags::X_OK) {
         _ if path.is_dir() => Err(unwritable(what, path, Errno::EISDIR)),
+        _ if folder.is_file() => Err(unwritable(what, path, Errno::ENOTDIR)),
         Err(e) if !is_special(path) => Err(unwritable(what, path, e)),
         _ => Ok(()),
     }
