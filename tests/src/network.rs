@@ -6,7 +6,7 @@ use std::{
     sync::atomic::{AtomicU32, Ordering},
 };
 
-use crate::{process::run, skipped::skip};
+use crate::skipped::skip;
 
 /// Namespaces joined by a router. Dropping the network removes them; processes in them must have ended before.
 #[derive(Debug)]
@@ -56,7 +56,7 @@ impl Network {
         );
         for (number, machine) in self.machines.iter().enumerate() {
             let namespace = self.namespace(machine);
-            let (inner, outer) = (self.machine_end(machine), self.router_end(machine));
+            let (inner, outer) = (format!("{}i{number}", self.name), self.router_end(machine));
             commands += &format!(
                 "
                 netns add {namespace}
@@ -86,11 +86,6 @@ impl Network {
         format!("{}o{}", self.name, self.machine_index(machine))
     }
 
-    /// A machine's end of its link.
-    fn machine_end(&self, machine: &str) -> String {
-        format!("{}i{}", self.name, self.machine_index(machine))
-    }
-
     /// A machine's address.
     pub fn address(&self, machine: &str) -> String {
         format!("10.77.{}.2", self.machine_index(machine))
@@ -118,9 +113,10 @@ impl Network {
 
     /// Limits a machine's link to `kbit` kbit/s in each direction. Returns false if the kernel does not support it.
     pub fn limit_rate(&self, machine: &str, kbit: u32) -> bool {
+        let inner = format!("{}i{}", self.name, self.machine_index(machine));
         let ends = [
             (self.namespace("router"), self.router_end(machine)),
-            (self.namespace(machine), self.machine_end(machine)),
+            (self.namespace(machine), inner),
         ];
         ends.iter().all(|(namespace, device)| {
             let words = format!(
@@ -128,15 +124,6 @@ impl Network {
             );
             ip(&words).is_ok()
         })
-    }
-
-    /// Returns how often [`Self::limit_rate`] has delayed what a machine sends.
-    pub fn delays(&self, machine: &str) -> u64 {
-        let (on, device) = (self.exec_prefix(machine), self.machine_end(machine));
-        let shown =
-            run(Command::new("sh").args(["-c", &format!("{on} tc -s qdisc show dev {device}")]));
-        let (_, delays) = shown.split_once("overlimits ").expect("tc counts them");
-        delays.split(' ').next().unwrap().parse().unwrap()
     }
 }
 

@@ -209,7 +209,7 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     process
         .interrupt()
         .expect_code(130)
-        .expect_stderr("an evaluation was left out");
+        .expect_stderr("skipped an evaluation");
     fs::write(system.path("run/best"), "not a folder").unwrap();
     system
         .run_ok("local --resume run --set local.evaluation.episodes=2")

@@ -90,7 +90,7 @@ pub(crate) fn continues_exactly(flags: &str) {
         }
         system
             .run_ok("local --resume run")
-            .expect_stdout("with everything in lockstep");
+            .expect_stdout("processes   one, in lockstep");
         let resumed = run.check_finished();
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
         assert_eq!(compared_results(resumed), whole, "{signal}");

@@ -57,7 +57,10 @@ fn check_panic_ends_run((process, point, flags): (&str, &str, &str)) {
     contains(line, " panicked at ");
     contains(
         line,
-        &format!(": {}={point}; this is a fault", fail_point::PANIC_VAR),
+        &format!(
+            ": {}={point}; this is a bug in the program",
+            fail_point::PANIC_VAR
+        ),
     );
     let killed = "was killed by signal 6 SIGABRT";
     if process.is_empty() {

@@ -98,7 +98,7 @@ fn an_experiment_of_three_seeds_has_scores_over_games() {
     let lines = [
         "| game | random | c51 training | c51 greedy | c51 paper |",
         "| 4.45 |\n",
-        "* Interquartile mean of `driml-ada` over 1 games: 0.",
+        "* Interquartile mean of `driml-ada` over 1 game: 0.",
         "* Probability that `driml-ada` trains better than `c51`: ",
     ];
     check_has(&page, &lines);

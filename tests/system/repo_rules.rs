@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_735),
-    ("actor", 11_130),
-    ("replay-server", 11_225),
-    ("learner", 23_865),
-    ("deploy", 31_290),
-    ("tests", 10_640),
+    ("protocol", 7_500),
+    ("actor", 11_125),
+    ("replay-server", 11_170),
+    ("learner", 23_695),
+    ("deploy", 31_245),
+    ("tests", 10_650),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -132,7 +132,7 @@ fn what_cannot_be_resumed() {
         local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => only in memory; add --durable
         local --resume step --frames 2000 --set local.actors=3 => but this run in lockstep has 1
         local --resume rainbow --frames 1280 --set replay.sampling.alpha=0 => replay.sampling.alpha = 0, but the replay that is kept has its priorities to the power of 0.5
-        local --resume kept --frames 2000 --durable => lacks what the run did later
+        local --resume kept --frames 2000 --durable => lacks what the run stored later
         ",
     );
     // The rejected calls have changed nothing.

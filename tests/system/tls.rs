@@ -222,7 +222,12 @@ fn the_doctor_looks_at_certificates() {
     ] {
         check_line(&well, "ok", what, words);
     }
-    check_line(&well, "note", "tls authority", "ca.key is here");
+    check_line(
+        &well,
+        "note",
+        "tls authority",
+        "ca.key can sign any certificate",
+    );
     assert!(!well.stderr.contains("--tls-dir"), "{}", well.stderr);
 
     let bad = tls_copy(&system, "bad").sign_again("learner", EXPIRED);

@@ -42,6 +42,7 @@ pub fn make_folder(what: &str, path: &Path) -> Result<(), Usage> {
 
 /// Writes a file whole or not at all. A link, pipe or device stays, and is written to.
 pub fn write_file(what: &str, path: &Path, bytes: &[u8]) -> Result<(), Usage> {
+    check_file(what, path)?;
     let written = match is_special(path) {
         true => fs::write(path, bytes),
         false => atomic_write::write(path, bytes),

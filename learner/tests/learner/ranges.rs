@@ -56,7 +56,7 @@ exact = { decay = nan, smoothing = 1.0 }    : decay = NaN
 exact = { decay = 0.9, smoothing = 0.0 }    : smoothing = 0.0
 exact = { decay = 0.9, smoothing = 1e-320 } : smoothing = 1e-320
 exact = { decay = 0.9, smoothing = 1e306 }  : smoothing = 1e306
-visible = [0, 2]                            : action 1 amounts to 2
+visible = [0, 2]                            : action 1 maps to 2
 learned = { hidden = 8, lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8, keep = 1.0 } : keep = 1.0
 ";
 

@@ -83,7 +83,7 @@ fn a_web_server_is_no_replay_server() {
             .expect_stderr(&format!(
                 "something listens on {endpoint} that is not driml"
             ))
-            .expect_stderr("it says \"HTTP/1.0 404 Not Found\"");
+            .expect_stderr("it sent \"HTTP/1.0 404 Not Found\"");
     });
 }
 

@@ -153,7 +153,10 @@ fn what_cannot_go_on_says_why() {
     assert!(said.contains(why), "{said}");
     // The newest segment begins with the mark, the one before it has the transitions.
     for (is_newest, why) in [
-        (true, "is missing or damaged: the replay cannot be rolled back"),
+        (
+            true,
+            "is missing or damaged: the replay cannot be rolled back",
+        ),
         (false, "cannot resume to the same weights"),
     ] {
         let (_folder, run_dir, _) = begun(&config, 9);
