@@ -12,11 +12,7 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console::{self, align_columns};
-use driml_machine::{
-    resources::MachineInfo,
-    speed_meter::median,
-    units::{self, format_number},
-};
+use driml_machine::{resources::MachineInfo, speed_meter::median, units};
 use serde::Serialize;
 
 use crate::{
