@@ -60,7 +60,7 @@ impl Learner {
         })
     }
 
-    /// Restores the state of the newest checkpoint in `folder`; without checkpoints, the learner stays as it is.
+    /// Restores the state of the newest checkpoint in `folder`; without checkpoints, nothing changes.
     ///
     /// # Errors
     /// A checkpoint that is damaged or belongs to another run or to other settings.

@@ -262,7 +262,7 @@ fn tradeoff() {
     call("--dials learner.precision --report");
     assert_eq!(counts()[0], 2);
 
-    // The errors of a level are measured on a batch of its own size, at most 64 rows.
+    // The errors of a level are measured on a batch of its size, at most 64 rows.
     call("--dials learner.batch_size");
     let rows = ["64 (base) | c51 | 16", "32 | c51 | 32", "256 | c51 | 64"];
     check_has(&system.read("t/README.md"), &rows);

@@ -210,7 +210,7 @@ impl Chunk {
         header.check_payload(&payload)?;
         let chunk = Self { header, payload };
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
-            return Err(CodecError::Header(format!("there is no end {end}")));
+            return Err(CodecError::Header(format!("unknown end {end}")));
         }
         let mut rows = 0..header.transitions();
         if let Some(row) = rows.find(|&row| !chunk.reward(row).is_finite()) {
