@@ -235,7 +235,7 @@ fn what_no_world_gives_is_refused() {
         let said = decode(change).unwrap_err().to_string();
         assert!(said.contains(words), "{said}");
     };
-    refused(&|it| it[36 + 5] = 4, "no end 4");
+    refused(&|it| it[36 + 5] = 4, "unknown end 4");
     for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let reward = reward.to_le_bytes();
         refused(&|it| it[42 + 4..42 + 8].copy_from_slice(&reward), "row 1");
