@@ -95,7 +95,7 @@ impl AnySimd {
         all
     }
 
-    const fn describe(self) -> &'static str {
+    fn describe(self) -> &'static str {
         match self {
             Self::PortableF32(_) => "portable code, f32",
             Self::PortableBf16(_) => {
@@ -108,7 +108,11 @@ impl AnySimd {
             #[cfg(target_arch = "x86_64")]
             Self::Avx512F32(_) => "AVX-512, f32",
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512Bf16(_) => "AVX512_BF16: bf16 products, f32 sums",
+            Self::Avx512Bf16(_) if avx512::is_bf16_fast() => "AVX512_BF16: bf16 products, f32 sums",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16(_) => {
+                "AVX512_BF16: bf16 products, f32 sums; no faster than f32 on this processor"
+            }
             #[cfg(target_arch = "x86_64")]
             Self::Amx(_) => "AMX: bf16 products, f32 sums",
             #[cfg(all(test, target_arch = "x86_64"))]
@@ -117,11 +121,13 @@ impl AnySimd {
     }
 }
 
-/// Whether this processor multiplies faster in bf16 than in f32: it has AVX512_BF16 or AMX.
+/// Whether this processor multiplies faster in bf16 than in f32: it has AMX, or is AMD's with AVX512_BF16.
 pub fn is_bf16_fast() -> bool {
     match AnySimd::fastest(Precision::Bf16) {
         #[cfg(target_arch = "x86_64")]
-        AnySimd::Avx512Bf16(_) | AnySimd::Amx(_) => true,
+        AnySimd::Amx(_) => true,
+        #[cfg(target_arch = "x86_64")]
+        AnySimd::Avx512Bf16(_) => avx512::is_bf16_fast(),
         _ => false,
     }
 }
@@ -138,6 +144,14 @@ mod tests {
     use super::*;
     use crate::kernels::isa::element::Rounding;
     use crate::kernels::isa::{Element, LANES, LeftOperand, Mode, OutputTile, Simd, multiply_tile};
+
+    #[cfg(target_arch = "x86_64")]
+    #[test]
+    fn avx512_bf16_is_fast_where_it_was_measured_to_be() {
+        for (vendor, is_fast) in [(*b"Auth", true), (*b"Genu", false)] {
+            assert_eq!(avx512::is_bf16_fast_by(vendor), is_fast, "{vendor:?}");
+        }
+    }
 
     /// Compares a tile, written or added to ones, with a plain sum. Returns whether the instruction set has this
     /// size of tile. With `rows_adjacent` the rows are adjacent and a row's steps are apart, else the reverse.
