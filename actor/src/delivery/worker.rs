@@ -18,7 +18,8 @@ use super::state::{DeliveryError, DeliveryLimits, DeliveryState};
 
 /// How long the queued chunks may take to be stored after `Shutdown`.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
-/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`].
+/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`]. Of a longer time
+/// between two tries, in which this process was stopped, only twice as much counts.
 const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
@@ -62,7 +63,8 @@ pub(super) struct DeliveryWorker {
     silence: Silence,
     /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
-    draining_since: Option<Instant>,
+    /// The time since the shutdown.
+    draining: Option<Silence>,
     retry_log: LogLimiter,
     wait_log: LogLimiter,
 }
@@ -85,7 +87,7 @@ impl DeliveryWorker {
             window: 1,
             silence: Silence::with_try_timeout(limits.ack_timeout),
             held_since: None,
-            draining_since: None,
+            draining: None,
             retry_log: LogLimiter::default(),
             wait_log: LogLimiter::default(),
         }
@@ -163,8 +165,8 @@ impl DeliveryWorker {
     fn settle_first(&mut self) -> Result<Outcome, DeliveryError> {
         let sequence = self.outgoing[0].header.sequence;
         if self.shutdown.is_set() {
-            let since = *self.draining_since.get_or_insert_with(Instant::now);
-            if since.elapsed() > DRAIN_MAX {
+            let begin = || Silence::with_gap_max(2 * DRAIN_ACK_TIMEOUT);
+            if self.draining.get_or_insert_with(begin).record_failure() > DRAIN_MAX {
                 return Err(DeliveryError::Failed(format!(
                     "chunk {sequence} was not stored within {DRAIN_MAX:?} of the end"
                 )));
@@ -339,7 +341,7 @@ impl DeliveryWorker {
     }
 
     fn send_leave(&self, leave: Leave) {
-        let (began, mut silence) = (Instant::now(), Silence::default());
+        let (began, mut silence) = (Instant::now(), Silence::with_gap_max(2 * LEAVE_TIMEOUT));
         while let Err(e) = self.client.ask(&leave, LEAVE_TIMEOUT) {
             // The process that told the actor to stop does not wait for long.
             let may_wait = !self.shutdown.is_set() || began.elapsed() <= DRAIN_MAX;
