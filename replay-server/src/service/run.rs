@@ -271,8 +271,12 @@ impl<'a> Queries<'a> {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
         this.answer("run-info", 1, small, Service::run_info)?;
-        this.answer("join-actor", 1, small, Service::join_actor)?;
-        this.answer("join-learner", 1, small, Service::join_learner)?;
+        this.answer("join-actor", 1, small, |it, join| {
+            it.join(join, State::join_actor)
+        })?;
+        this.answer("join-learner", 1, small, |it, join| {
+            it.join(join, State::join_learner)
+        })?;
         this.answer("leave", 1, small, Service::leave)?;
         this.answer("weights-upload", 1, limits.weights, Service::store_weights)?;
         this.answer("weights", WEIGHTS_THREADS, small, Service::send_weights)?;
