@@ -195,7 +195,7 @@ mod tests {
 
     #[test]
     fn the_time_in_which_the_process_was_stopped_is_no_waiting() {
-        let (begin, second, hour) = (Instant::now(), Duration::from_secs(1), 3_600 * STOP_MIN);
+        let (begin, second, stop) = (Instant::now(), Duration::from_secs(1), 240 * STOP_MIN);
         let mut replay = Replay::new(&RunSpec::smallest(), &Config::unlimited(9), 1).unwrap();
         let (actor, incarnation) = (0, 1);
         replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
@@ -215,8 +215,8 @@ mod tests {
             queried_at: begin,
         });
         state.leave_out_stop(begin + second);
-        state.leave_out_stop(begin + second + hour);
-        state.store_parked(begin + 2 * second + hour);
+        state.leave_out_stop(begin + second + stop);
+        state.store_parked(begin + 2 * second + stop);
         let status = state.replay.status();
         assert_eq!(
             (status.transitions_inserted, status.actors_waited_s),
