@@ -211,14 +211,6 @@ mod tests {
     }
 
     #[test]
-    fn a_world_that_says_nothing_of_itself_cannot_be_saved() {
-        let (scripts, step) = (vec![SHORT.to_vec()], 0);
-        let mut world = Scripted { scripts, step };
-        assert!(matches!(world.save(), Err(EnvError::NotSaved(_))));
-        assert!(matches!(world.load(&[]), Err(EnvError::NotSaved(_))));
-    }
-
-    #[test]
     fn episodes_that_do_not_end_are_an_error() {
         assert_eq!(play(&[LONG], 1, 4).unwrap(), [100.0]);
         let message = play(&[LONG], 2, 7).unwrap_err().to_string();

@@ -46,7 +46,7 @@ mod weights;
 pub use acting::{ActingLoop, ActingState, Step};
 pub use collect::{Collector, CollectorState, Incarnation};
 pub use config::{ActorSettings, Config, EpsilonLadder};
-pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
+pub use delivery::{Delivery, DeliveryLimits};
 pub use error::ActError;
 pub use evaluate::{Evaluation, OnStep, episode_returns};
 pub use policy::{NetworkPolicy, Policy, RandomPolicy};

@@ -285,10 +285,4 @@ pub(crate) mod tests {
         assert_eq!(steps(&mut again, &mut saved.clone()), second);
         assert_ne!(first, second);
     }
-
-    #[test]
-    fn the_random_policy_knows_no_epsilon() {
-        let shares = [0.2; ACTIONS];
-        check_shares(counts(&mut RandomPolicy::new(ACTIONS as u8), 0.0), shares);
-    }
 }

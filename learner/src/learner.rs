@@ -163,7 +163,6 @@ impl Learner {
         self.state.affinity.as_ref().map(|affinity| AffinityUpdate {
             learner,
             version: self.state.agent.updates(),
-            num_actions: affinity.num_actions() as u32,
             matrix: affinity.matrix(),
         })
     }

@@ -6,8 +6,10 @@ use std::{
     net::{TcpStream, ToSocketAddrs},
     os::unix::net::UnixStream,
     path::PathBuf,
-    time::{Duration, Instant},
+    time::Duration,
 };
+
+use crate::process::silence::Silence;
 
 /// How long one address may take to answer.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
@@ -93,7 +95,7 @@ fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
 
 /// Waits until something accepts connections at one of `endpoints`.
 pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(), Unreachable> {
-    let (started, [mut pause, pause_max]) = (Instant::now(), PAUSES);
+    let (mut silence, [mut pause, pause_max]) = (Silence::default(), PAUSES);
     let mut is_logged = false;
     loop {
         let mut failed = None;
@@ -106,10 +108,11 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
         let Some(e) = failed else {
             return Ok(());
         };
-        if !e.is_retryable || started.elapsed() + pause > wait_max {
+        let waited = silence.record_failure();
+        if !e.is_retryable || waited + pause > wait_max {
             return Err(e);
         }
-        if started.elapsed() > CONNECT_TIMEOUT && !std::mem::replace(&mut is_logged, true) {
+        if waited > CONNECT_TIMEOUT && !std::mem::replace(&mut is_logged, true) {
             tracing::info!("waiting for {} s: {e}", wait_max.as_secs());
         }
         std::thread::sleep(pause);

@@ -10,6 +10,9 @@ use std::time::Duration;
 /// The shortest nap; shorter ones are skipped, as a sleep may end some 60 us late.
 const NAP_MIN: Duration = Duration::from_micros(100);
 
+/// The longest nap, for the case that the process was stopped during the first step.
+const NAP_MAX: Duration = Duration::from_millis(100);
+
 /// A sleep of half the duration of a fast step, estimated from the latest steps.
 #[derive(Debug, Default)]
 pub(crate) struct Nap {
@@ -33,7 +36,8 @@ impl Nap {
     }
 
     fn duration(&self) -> Option<Duration> {
-        self.estimate.map(|it| it / 2).filter(|nap| *nap >= NAP_MIN)
+        let nap = self.estimate.map(|it| NAP_MAX.min(it / 2));
+        nap.filter(|nap| *nap >= NAP_MIN)
     }
 }
 
@@ -52,6 +56,7 @@ mod tests {
             (&[400], Some(us(200))),
             (&[400, 4_000], Some(us(225))),
             (&[400, 4_000, 400], Some(us(200))),
+            (&[3_600_000_000], Some(us(100_000))),
             (&[199], None),
             (&[400, 150], None),
         ] {

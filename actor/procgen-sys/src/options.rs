@@ -166,23 +166,4 @@ mod tests {
         let memory = "caveflyer, dodgeball, heist, jumper, maze, miner";
         rejected(|o| o.distribution_mode = DistributionMode::Memory, memory);
     }
-
-    #[test]
-    fn values_lie_where_the_items_point() {
-        let values = with_raw_options(&OPTIONS, "/somewhere/", |raw| {
-            // SAFETY: `raw.items` has `raw.count` items, which are valid until this closure returns.
-            let items = unsafe { std::slice::from_raw_parts(raw.items, raw.count as usize) };
-            // SAFETY: no caller reads more bytes than the item's value has.
-            let bytes = |item: usize, len| unsafe {
-                std::slice::from_raw_parts(items[item].data.cast::<u8>(), len).to_vec()
-            };
-            assert_eq!(items.len(), 17);
-            let texts = [bytes(0, 7), bytes(1, 11)];
-            (texts, [bytes(2, 4), bytes(8, 4)], bytes(16, 1))
-        });
-        let number = |value: i32| value.to_ne_bytes().to_vec();
-        let texts = [b"coinrun".to_vec(), b"/somewhere/".to_vec()];
-        let mode = OPTIONS.distribution_mode as i32;
-        assert_eq!(values, (texts, [number(500), number(mode)], vec![0]));
-    }
 }

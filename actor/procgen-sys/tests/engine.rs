@@ -4,7 +4,7 @@
 
 use std::{io::Write, sync::OnceLock};
 
-use procgen_sys::{DistributionMode, Engine, Game, NUM_ACTIONS, Options, RESET, State, VecGame};
+use procgen_sys::{DistributionMode, Engine, Game, NUM_ACTIONS, Options, State, VecGame};
 
 /// The installed engine, or a line that says the test was skipped.
 fn engine() -> Option<&'static Engine> {
@@ -64,16 +64,6 @@ fn wrong_actions_are_refused_and_step_nothing() {
 }
 
 #[test]
-fn settings_that_would_end_the_process_are_errors() {
-    let Some(engine) = engine() else { return };
-    let mut memory = options(Game::Bigfish);
-    memory.distribution_mode = DistributionMode::Memory;
-    let text = VecGame::new(engine, &memory).err().unwrap().to_string();
-    let why = "bigfish has no distribution mode \"memory\"";
-    assert!(text.contains(why), "{text}");
-}
-
-#[test]
 fn every_game_steps_and_a_state_put_back_repeats_the_trajectory_in_any_environment() {
     let Some(engine) = engine() else { return };
     for game in Game::ALL {
@@ -114,24 +104,6 @@ fn every_game_steps_and_a_state_put_back_repeats_the_trajectory_in_any_environme
     assert!(error.contains("a state of maze"), "{error}");
     let error = coinrun.state(4).unwrap_err().to_string();
     assert!(error.contains("environment 4 of 4"), "{error}");
-}
-
-#[test]
-fn the_reset_action_ends_the_episode_and_draws_a_level_of_the_set() {
-    let Some(engine) = engine() else { return };
-    let options = Options {
-        num_levels: 3,
-        start_level: 40,
-        ..options(Game::Maze)
-    };
-    let mut envs = VecGame::new(engine, &options).unwrap();
-    let mut drawn = std::collections::BTreeSet::new();
-    for _ in 0..30 {
-        envs.act(&[RESET, 4, 4, RESET]).unwrap();
-        assert_eq!(envs.first(), [1, 0, 0, 1]);
-        drawn.insert(envs.level_seed()[0]);
-    }
-    assert_eq!(drawn.into_iter().collect::<Vec<_>>(), [40, 41, 42]);
 }
 
 /// `first` stays 0, the level's number goes up by 997, and so leaves a set of 500 levels at once.

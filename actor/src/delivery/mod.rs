@@ -15,7 +15,7 @@ use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown, lock};
 use state::{DeliveryState, Progress};
 use worker::DeliveryWorker;
 
-pub use state::{DeliveryError, DeliveryLimits};
+pub use state::DeliveryLimits;
 
 /// How long an actor may wait for newer weights while the rate limiter holds its chunks.
 const FRESH_WEIGHTS_WAIT_MAX: Duration = Duration::from_millis(200);
@@ -25,7 +25,7 @@ pub struct Delivery {
     queue: mpsc::Sender<Chunk>,
     chunks_max: usize,
     state: Arc<DeliveryState>,
-    thread: JoinHandle<Result<u64, DeliveryError>>,
+    thread: JoinHandle<anyhow::Result<u64>>,
 }
 
 impl Delivery {
@@ -98,9 +98,12 @@ impl Delivery {
     }
 
     /// Waits until the last chunk is settled and `Leave` is sent. Returns the number of transitions that the run no longer wanted.
-    pub fn finish(self) -> Result<u64, DeliveryError> {
+    ///
+    /// # Errors
+    /// The replay server was unreachable for too long, rejected a chunk, or did not store it in time after a shutdown.
+    pub fn finish(self) -> anyhow::Result<u64> {
         drop(self.queue);
-        let panicked = |_| DeliveryError::Failed("the delivery thread panicked".into());
+        let panicked = |_| anyhow::anyhow!("the delivery thread panicked");
         self.thread.join().map_err(panicked)?
     }
 }

@@ -6,8 +6,6 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::session::SessionError;
-
 use crate::config::Config;
 
 /// Limits of one delivery.
@@ -53,18 +51,4 @@ pub(crate) struct Progress {
     pub(super) is_held: bool,
     /// Chunks that were queued and are not yet settled.
     pub(super) in_flight: usize,
-}
-
-/// Why chunks could not be delivered.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "each message says it")]
-pub enum DeliveryError {
-    #[error("the replay server was unreachable for {within:?}")]
-    Unreachable {
-        within: Duration,
-        source: SessionError,
-    },
-    /// Anything else: the replay server rejected a chunk, or did not store it in time after a shutdown.
-    #[error("{0}")]
-    Failed(String),
 }

@@ -8,17 +8,19 @@ use std::{
     time::{Duration, Instant},
 };
 
+use anyhow::bail;
 use driml_protocol::{
     BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
     RunClient, Shutdown, Silence, fail_point, lock, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
-use super::state::{DeliveryError, DeliveryLimits, DeliveryState};
+use super::state::{DeliveryLimits, DeliveryState};
 
 /// How long the queued chunks may take to be stored after `Shutdown`.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
-/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`].
+/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`]. Of a longer time
+/// between two tries, in which this process was stopped, only twice as much counts.
 const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
@@ -62,7 +64,8 @@ pub(super) struct DeliveryWorker {
     silence: Silence,
     /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
-    draining_since: Option<Instant>,
+    /// The time since the shutdown.
+    draining: Option<Silence>,
     retry_log: LogLimiter,
     wait_log: LogLimiter,
 }
@@ -85,14 +88,14 @@ impl DeliveryWorker {
             window: 1,
             silence: Silence::with_try_timeout(limits.ack_timeout),
             held_since: None,
-            draining_since: None,
+            draining: None,
             retry_log: LogLimiter::default(),
             wait_log: LogLimiter::default(),
         }
     }
 
     /// Delivers chunks until the queue closes. Returns the number of transitions that the run did not want.
-    pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> Result<u64, DeliveryError> {
+    pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> anyhow::Result<u64> {
         let mut sender = None;
         let mut produced = 0;
         let mut unwanted = 0;
@@ -160,14 +163,12 @@ impl DeliveryWorker {
     }
 
     /// Sends the chunks that the window allows and settles the first by its reply.
-    fn settle_first(&mut self) -> Result<Outcome, DeliveryError> {
+    fn settle_first(&mut self) -> anyhow::Result<Outcome> {
         let sequence = self.outgoing[0].header.sequence;
         if self.shutdown.is_set() {
-            let since = *self.draining_since.get_or_insert_with(Instant::now);
-            if since.elapsed() > DRAIN_MAX {
-                return Err(DeliveryError::Failed(format!(
-                    "chunk {sequence} was not stored within {DRAIN_MAX:?} of the end"
-                )));
+            let begin = || Silence::with_gap_max(2 * DRAIN_ACK_TIMEOUT);
+            if self.draining.get_or_insert_with(begin).record_failure() > DRAIN_MAX {
+                bail!("chunk {sequence} was not stored within {DRAIN_MAX:?} of the end");
             }
         }
         let reply = self.send_window().and_then(|()| self.wait_for_first());
@@ -215,9 +216,7 @@ impl DeliveryWorker {
             }
             // The reply is from when an earlier chunk waited; all earlier chunks are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.prepare_resend()),
-            Ok(InsertReply::Refused { why }) => Err(DeliveryError::Failed(format!(
-                "the replay server rejected a chunk: {why}"
-            ))),
+            Ok(InsertReply::Refused { why }) => bail!("the replay server rejected a chunk: {why}"),
             Err(SessionError::Recovering(recovering)) => {
                 self.silence.record_answer();
                 if let Some(suppressed) = self.retry_log.admit() {
@@ -232,7 +231,8 @@ impl DeliveryWorker {
             Err(e) => {
                 let within = self.limits.unreachable_max;
                 if self.silence.record_failure() > within {
-                    return Err(DeliveryError::Unreachable { within, source: e });
+                    let text = format!("the replay server was unreachable for {within:?}");
+                    return Err(anyhow::Error::new(e).context(text));
                 }
                 if let Some(suppressed) = self.retry_log.admit() {
                     tracing::warn!("retrying chunk {sequence}: {e}{suppressed}");
@@ -339,7 +339,7 @@ impl DeliveryWorker {
     }
 
     fn send_leave(&self, leave: Leave) {
-        let (began, mut silence) = (Instant::now(), Silence::default());
+        let (began, mut silence) = (Instant::now(), Silence::with_gap_max(2 * LEAVE_TIMEOUT));
         while let Err(e) = self.client.ask(&leave, LEAVE_TIMEOUT) {
             // The process that told the actor to stop does not wait for long.
             let may_wait = !self.shutdown.is_set() || began.elapsed() <= DRAIN_MAX;

@@ -12,9 +12,7 @@ pub struct AffinityUpdate {
     pub learner: u64,
     /// Counts up from 1. The replay server ignores a version older than this learner's newest.
     pub version: u64,
-    /// Number of raw actions of the world, n: the side of the matrix.
-    pub num_actions: u32,
-    /// The probabilities [n, n].
+    /// The probabilities [n, n] of the n raw actions of the world.
     pub matrix: Vec<f32>,
 }
 
@@ -22,10 +20,9 @@ impl AffinityUpdate {
     /// Checks the size and that every entry is a probability.
     pub fn validate(&self, num_actions: u32) -> Result<(), CodecError> {
         let n = num_actions as usize;
-        if self.num_actions != num_actions || self.matrix.len() != n * n {
+        if self.matrix.len() != n * n {
             return Err(CodecError::Header(format!(
-                "an affinity of {} actions with {} entries; this run has {num_actions} actions",
-                self.num_actions,
+                "an affinity with {} entries; this run has {num_actions} actions",
                 self.matrix.len()
             )));
         }

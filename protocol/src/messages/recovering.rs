@@ -62,24 +62,3 @@ impl Recovering {
         check_no_payload(payload)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn it_says_how_far_it_is_and_since_when() {
-        let recovering = Recovering {
-            progress: RecoveryProgress {
-                bytes_read: 3 << 30,
-                bytes: 11 << 30,
-                since_s: 33.7,
-            },
-            config_toml: String::new(),
-        };
-        assert_eq!(
-            recovering.to_string(),
-            "the replay server reads its replay back from disk, 3072 of 11264 MiB after 34 s"
-        );
-    }
-}

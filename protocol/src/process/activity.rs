@@ -32,20 +32,3 @@ impl Activity {
         (now.0.clone(), now.1.elapsed())
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_same_activity_keeps_its_start() {
-        let activity = Activity::new("plays");
-        std::thread::sleep(Duration::from_millis(20));
-        activity.begin("plays");
-        assert!(activity.get().1 >= Duration::from_millis(20));
-        activity.clone().begin("waits");
-        let (doing, since) = activity.get();
-        assert_eq!(doing, "waits");
-        assert!(since < Duration::from_millis(20));
-    }
-}

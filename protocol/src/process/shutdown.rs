@@ -146,17 +146,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waiting_ends_when_the_flag_is_raised() {
-        let shutdown = Shutdown::default();
-        assert!(!shutdown.wait_timeout(Duration::from_millis(1)));
-        let other = shutdown.clone();
-        let waiter = std::thread::spawn(move || other.wait());
-        shutdown.set();
-        waiter.join().unwrap();
-        assert!(shutdown.is_set());
-    }
-
-    #[test]
     fn work_that_takes_too_long_is_left_when_the_flag_is_raised() {
         let shutdown = Shutdown::default();
         assert_eq!(shutdown.run_unless_set("work", || 5).unwrap(), Some(5));

@@ -8,8 +8,8 @@ const GAP_MAX: Duration = Duration::from_secs(15);
 
 /// The time for which another process has not answered.
 ///
-/// While this process is stopped (Ctrl-Z, a paused container), at most 15 s and one attempt's time-out count: it could not ask, and the
-/// other process may have been stopped too.
+/// While this process is stopped (Ctrl-Z, a paused container), at most 15 s and one attempt's time-out count, or the limit that was given:
+/// it could not ask, and the other process may have been stopped too.
 #[derive(Clone, Copy, Debug)]
 pub struct Silence {
     length: Duration,
@@ -27,10 +27,15 @@ impl Default for Silence {
 impl Silence {
     /// A silence that begins now, for attempts with a time-out of at most `try_timeout`.
     pub fn with_try_timeout(try_timeout: Duration) -> Self {
+        Self::with_gap_max(GAP_MAX + try_timeout)
+    }
+
+    /// A silence that begins now. Of the time between two attempts, at most `gap_max` counts.
+    pub fn with_gap_max(gap_max: Duration) -> Self {
         Self {
             length: Duration::ZERO,
             last_attempt: Instant::now(),
-            gap_max: GAP_MAX + try_timeout,
+            gap_max,
         }
     }
 
@@ -62,8 +67,12 @@ mod tests {
 
     #[test]
     fn of_the_time_in_which_this_process_was_stopped_little_counts() {
-        for (try_s, lengths) in [(0, [10, 20, 35, 46]), (120, [10, 20, 155, 166])] {
-            let mut silence = Silence::with_try_timeout(Duration::from_secs(try_s));
+        let (default, seconds) = (Silence::default(), Duration::from_secs);
+        for (mut silence, lengths) in [
+            (default, [10, 20, 35, 46]),
+            (Silence::with_try_timeout(seconds(120)), [10, 20, 155, 166]),
+            (Silence::with_gap_max(seconds(2)), [2, 4, 6, 8]),
+        ] {
             let begin = silence.last_attempt;
             for (now, length) in [10, 20, 500, 511].into_iter().zip(lengths) {
                 let now = begin + Duration::from_secs(now);

@@ -13,7 +13,7 @@ use super::{
 };
 
 /// The version of every message in this crate; processes of different versions reject each other.
-pub const PROTOCOL_VERSION: u16 = 8;
+pub const PROTOCOL_VERSION: u16 = 9;
 
 /// Length of the fixed prefix, bytes: the sum of the widths of its fields.
 pub const PREFIX_BYTES: usize = 32;

@@ -150,7 +150,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
         assert_eq!(read(lengths), expected);
     }
     // The header claims more elements than any header has room for.
-    let header = [&[1u8, 1, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
+    let header = [&[1u8, 1, 253][..], &u64::MAX.to_le_bytes()].concat();
     let bytes = forge_whole(Kind::Affinity as u16, &header, &[]);
     let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     let first = "UnexpectedEnd { additional: 4 }";

@@ -315,7 +315,6 @@ pub(crate) fn samples() -> Vec<Sample> {
     let affinity = AffinityUpdate {
         learner: 5,
         version: 2,
-        num_actions: 3,
         matrix: [0.25, 0.5, 0.25].repeat(3),
     };
     let run_info = RunInfo {

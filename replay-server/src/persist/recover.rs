@@ -120,7 +120,7 @@ pub(super) fn recover(
     let mut next_log = Instant::now() + LOG_PERIOD;
     for (at, &number) in numbers.iter().enumerate() {
         if Instant::now() > next_log {
-            next_log += LOG_PERIOD;
+            next_log = Instant::now() + LOG_PERIOD;
             tracing::info!("reads the replay in {dir}: {}", control.progress());
         }
         if control.stop.is_set() {

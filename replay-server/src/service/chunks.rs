@@ -66,11 +66,14 @@ impl Service {
             fail_point::reach("admit");
             let mut state = self.state();
             let now = Instant::now();
+            let parked = state.chunks.queue.len();
             let mut replies = state.store_parked(now);
+            let has_stored = state.chunks.queue.len() < parked;
             for query in state.chunks.take_overdue(now, self.hold_max) {
                 replies.push((query, state.replay.wait_reply(true)));
             }
-            if replies.is_empty() {
+            // A chunk may be stored while its actor does not ask for it: a request may wait for that chunk.
+            if replies.is_empty() && !has_stored {
                 let due_in = state.chunks.due_in(now, self.hold_max);
                 self.wait_changed(state, due_in);
                 continue;
@@ -155,7 +158,7 @@ impl State {
     }
 
     /// Stores or rejects the parked chunks in order, up to the first that still has to wait.
-    fn store_parked(&mut self, now: Instant) -> Replies {
+    pub(super) fn store_parked(&mut self, now: Instant) -> Replies {
         let mut replies = Replies::new();
         while let Some(parked) = self.chunks.queue.front() {
             // The actor may have restarted meanwhile, or the run may have ended.

@@ -44,17 +44,9 @@ impl Service {
         incoming.into_responder().reply(&run_info);
     }
 
-    pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
-        self.join(incoming, State::join_actor);
-    }
-
-    pub(super) fn join_learner(&self, incoming: Incoming<LearnerJoin>) {
-        self.join(incoming, State::join_learner);
-    }
-
     /// Answers a process that joins: its number of earlier incarnations, or why it is rejected. No reply while the disk cannot
     /// record it.
-    fn join<J: Request<Reply = JoinReply>>(
+    pub(super) fn join<J: Request<Reply = JoinReply>>(
         &self,
         incoming: Incoming<J>,
         join: impl Fn(&mut State, J) -> Result<u32, JoinReply>,
@@ -101,7 +93,7 @@ impl State {
         }
     }
 
-    fn join_actor(&mut self, join: ActorJoin) -> Result<u32, JoinReply> {
+    pub(super) fn join_actor(&mut self, join: ActorJoin) -> Result<u32, JoinReply> {
         let ActorJoin { actor, incarnation } = join;
         let known = self.replay.actor_incarnation(actor);
         let other = known.filter(|&other| other != incarnation);
@@ -126,7 +118,7 @@ impl State {
         Ok(earlier_incarnations)
     }
 
-    fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, JoinReply> {
+    pub(super) fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, JoinReply> {
         let (learner, updates) = (join.learner, join.updates);
         let served = self.replay.learner_id();
         let other = served.filter(|&other| other != learner);

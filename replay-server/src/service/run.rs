@@ -2,7 +2,6 @@
 //! The files named after the messages handle them.
 
 use std::{
-    collections::{HashMap, VecDeque},
     path::PathBuf,
     sync::{Arc, Condvar, Mutex, OnceLock, mpsc},
     thread::JoinHandle,
@@ -22,10 +21,7 @@ use zenoh::{Wait, pubsub::Subscriber, query::Queryable, sample::SampleKind};
 
 use super::{
     limits::{HEAD_BYTES_MAX, MessageLimits, read_u32, shared_memory_bytes},
-    parked::ParkedChunks,
-    participants::Participants,
     server::{Service, ServiceGate, State},
-    timings::Timings,
     weights_store::WeightsStore,
 };
 use crate::{
@@ -160,14 +156,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         hold_max: QUERY_HOLD_MAX.min(ack_timeout / 4),
         pool,
         packer: replay.packer(),
-        state: Mutex::new(State {
-            replay,
-            participants: Participants::new(Instant::now()),
-            chunks: ParkedChunks::new(),
-            requests: VecDeque::new(),
-            timings: Timings::default(),
-            log_limiters: HashMap::new(),
-        }),
+        state: Mutex::new(State::new(replay, Instant::now())),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
         client: client.clone(),
@@ -282,8 +271,12 @@ impl<'a> Queries<'a> {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
         this.answer("run-info", 1, small, Service::run_info)?;
-        this.answer("join-actor", 1, small, Service::join_actor)?;
-        this.answer("join-learner", 1, small, Service::join_learner)?;
+        this.answer("join-actor", 1, small, |it, join| {
+            it.join(join, State::join_actor)
+        })?;
+        this.answer("join-learner", 1, small, |it, join| {
+            it.join(join, State::join_learner)
+        })?;
         this.answer("leave", 1, small, Service::leave)?;
         this.answer("weights-upload", 1, limits.weights, Service::store_weights)?;
         this.answer("weights", WEIGHTS_THREADS, small, Service::send_weights)?;

@@ -24,6 +24,8 @@ use crate::{persist::RecoveryControl, replay::Replay, storage::pack::Packer};
 
 /// How long a thread sleeps when nothing is parked; it is woken when something is.
 const IDLE_MAX: Duration = Duration::from_secs(60);
+/// A longer time without access to the state means that this process was stopped: one thread accesses the state every second.
+const STOP_MIN: Duration = Duration::from_secs(15);
 
 pub(super) struct Service {
     pub(super) limits: MessageLimits,
@@ -54,6 +56,7 @@ pub(super) struct State {
     pub(super) timings: Timings,
     /// Rate limiters for log lines about rejected messages, by kind. Without them a foreign process could fill the log.
     pub(super) log_limiters: HashMap<&'static str, LogLimiter>,
+    last_access: Instant,
 }
 
 /// A query about a chunk that was not answered yet.
@@ -64,7 +67,9 @@ pub(super) struct PendingQuery {
 
 impl Service {
     pub(super) fn state(&self) -> MutexGuard<'_, State> {
-        lock(&self.state)
+        let mut state = lock(&self.state);
+        state.leave_out_stop(Instant::now());
+        state
     }
 
     /// Counts and logs a message of kind `R` that cannot be read.
@@ -108,6 +113,33 @@ impl Service {
 }
 
 impl State {
+    pub(super) fn new(replay: Replay, now: Instant) -> Self {
+        Self {
+            replay,
+            participants: Participants::new(now),
+            chunks: ParkedChunks::new(),
+            requests: VecDeque::new(),
+            timings: Timings::default(),
+            log_limiters: HashMap::new(),
+            last_access: now,
+        }
+    }
+
+    /// If this process was stopped until `now`, moves the beginnings of all waits by that time, so that it does not count as waiting.
+    fn leave_out_stop(&mut self, now: Instant) {
+        let stop = now.saturating_duration_since(std::mem::replace(&mut self.last_access, now));
+        if stop < STOP_MIN {
+            return;
+        }
+        for parked in &mut self.chunks.queue {
+            parked.arrived += stop;
+            parked.queried_at += stop;
+            parked.query.iter_mut().for_each(|it| it.arrived += stop);
+        }
+        self.requests.iter_mut().for_each(|it| it.arrived += stop);
+        self.timings.leave_out_stop(stop);
+    }
+
     fn update_waiting(&mut self, now: Instant) {
         let waiting = self.replay.waiting();
         self.participants.set_waiting(waiting, now);
@@ -149,5 +181,46 @@ impl ServiceGate {
             progress: self.recovery.progress(),
             config_toml: self.config_toml.clone(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::borrow::Cow;
+
+    use driml_protocol::{ActorJoin, Chunk, ChunkHeader, RunSpec};
+
+    use super::*;
+    use crate::{config::Config, service::parked::ParkedChunk};
+
+    #[test]
+    fn the_time_in_which_the_process_was_stopped_is_no_waiting() {
+        let (begin, second, stop) = (Instant::now(), Duration::from_secs(1), 240 * STOP_MIN);
+        let mut replay = Replay::new(&RunSpec::smallest(), &Config::unlimited(9), 1).unwrap();
+        let (actor, incarnation) = (0, 1);
+        replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+        let chunk = Chunk::zeroed(ChunkHeader {
+            incarnation,
+            streams: 1,
+            steps: 1,
+            frame_bytes: 1,
+            ..ChunkHeader::default()
+        });
+        let packed = replay.packer().pack(Cow::Owned(chunk));
+        let mut state = State::new(replay, begin);
+        state.chunks.queue.push_back(ParkedChunk {
+            packed,
+            query: None,
+            arrived: begin,
+            queried_at: begin,
+        });
+        state.leave_out_stop(begin + second);
+        state.leave_out_stop(begin + second + stop);
+        state.store_parked(begin + 2 * second + stop);
+        let status = state.replay.status();
+        assert_eq!(
+            (status.transitions_inserted, status.actors_waited_s),
+            (1, 2.0)
+        );
     }
 }

@@ -7,7 +7,8 @@ use std::{
 
 use driml_protocol::{
     Ack, AffinityUpdate, EpisodesRequest, Incoming, Leave, PriorityUpdate, ProcessName,
-    ProcessesStatus, ReplayStatus, Report, Request, Shutdown, Warning, fail_point, last_warning,
+    ProcessesStatus, ReplayStatus, Report, Request, Shutdown, Silence, Warning, fail_point,
+    last_warning,
 };
 
 use super::server::{Service, State};
@@ -135,9 +136,10 @@ impl Service {
     }
 
     /// Waits for a shutdown, or until the run is over or `drain` is raised and the other processes have left, for a limited time. With
-    /// `keep_alive` the end of the run does not count.
+    /// `keep_alive` the end of the run does not count. While this process is stopped, hardly any time counts: the others may have been
+    /// stopped too.
     pub(super) fn wait_until_over(&self, drain: &Shutdown, keep_alive: bool) {
-        let mut waits: Option<(bool, Instant)> = None;
+        let mut waits: Option<(bool, Silence)> = None;
         while !self.shutdown.wait_timeout(CHECK_PERIOD) {
             // Read once, as it may be raised at any moment.
             let is_draining = drain.is_set();
@@ -153,12 +155,12 @@ impl Service {
                 true => ("this process was told to stop", ORPHANED_WAIT_MAX),
                 false => ("the run is over", LEAVE_WAIT_MAX),
             };
-            let since = match waits {
-                Some((before, since)) if before == is_draining => since,
-                _ => Instant::now(),
+            let waited = match waits {
+                Some((before, waited)) if before == is_draining => waited,
+                _ => Silence::with_gap_max(2 * CHECK_PERIOD),
             };
-            waits = Some((is_draining, since));
-            if connected == 0 || since.elapsed() > wait_max {
+            let (_, waited) = waits.insert((is_draining, waited));
+            if connected == 0 || waited.record_failure() > wait_max {
                 return tracing::info!("{why}; processes still connected: {connected}");
             }
         }

@@ -85,6 +85,11 @@ impl Timings {
             .push_back((weights.version, weights.updates, now));
     }
 
+    /// Moves the arrivals of weights by the length of a stop of this process.
+    pub(super) fn leave_out_stop(&mut self, stop: Duration) {
+        self.versions.iter_mut().for_each(|(.., at)| *at += stop);
+    }
+
     /// Returns the seconds since the newest weights arrived.
     pub(super) fn weights_age_s(&self, now: Instant) -> Option<f64> {
         let (_, _, arrived) = self.versions.back()?;

@@ -78,11 +78,10 @@ pub(crate) const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave 
     }
 }
 
-pub(crate) const fn affinity(version: u64, num_actions: u32, matrix: Vec<f32>) -> AffinityUpdate {
+pub(crate) const fn affinity(version: u64, matrix: Vec<f32>) -> AffinityUpdate {
     AffinityUpdate {
         learner: 1,
         version,
-        num_actions,
         matrix,
     }
 }

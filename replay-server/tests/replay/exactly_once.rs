@@ -262,7 +262,7 @@ fn rows_that_were_not_learned_from_do_not_count() {
         replay.sample(8).unwrap();
     }
     assert_eq!(replay.sample(8), Err(NotReady::Finished));
-    let affinity = |version, p| affinity(version, 5, vec![p; 25]);
+    let affinity = |version, p| affinity(version, vec![p; 25]);
     replay.set_affinity(&affinity(9, 0.5)).unwrap();
     replay.set_progress(learned(8, 5, 72)).unwrap();
 

@@ -24,12 +24,12 @@ fn random_affinity(num_actions: u32, spread: f32, rng: &mut ChaCha8Rng) -> Affin
         let sum: f32 = row.iter().sum();
         matrix.extend(row.iter().map(|e| e / sum));
     }
-    affinity(1, num_actions, matrix)
+    affinity(1, matrix)
 }
 
 /// Returns P(k = 1), .., P(k = H): (1 - A_i) prod_{j<i} A_j for i < H, and prod_{j<H} A_j.
 fn nhg_law(update: &AffinityUpdate, actions: &[u8]) -> Vec<f64> {
-    let n = update.num_actions as usize;
+    let n = update.matrix.len().isqrt();
     let at = |i: usize| usize::from(actions[i - 1]) * n + usize::from(actions[i]);
     let a = |i: usize| f64::from(update.matrix[at(i)]);
     let h = actions.len();
@@ -49,7 +49,7 @@ fn an_older_or_broken_affinity_is_not_taken() {
         (4, vec![0.5, f32::NAN, 0.5, 0.5], false),
         (4, vec![0.5, 1.5, 0.5, 0.5], false),
     ] {
-        let taken = current.update(&affinity(version, 2, matrix));
+        let taken = current.update(&affinity(version, matrix));
         assert_eq!(taken.is_ok(), is_valid, "{taken:?}");
         assert_eq!((current.version(), current.get(1, 0)), (3, 0.25));
     }
@@ -61,7 +61,7 @@ fn the_k_served_follow_the_law() {
     let mut rng = ChaCha8Rng::seed_from_u64(15);
     for config in [Config::unlimited(150), prioritised(150, 0.5)] {
         let (mut replay, history) = filled(Horizon::Nhg { k_max: 5 }, &config, &mut rng);
-        let equal = affinity(0, 5, vec![0.2; 25]);
+        let equal = affinity(0, vec![0.2; 25]);
         check_ks(&mut replay, &history, |actions| nhg_law(&equal, actions));
         let update = random_affinity(5, 2.0, &mut rng);
         replay.set_affinity(&update).unwrap();

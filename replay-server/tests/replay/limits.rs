@@ -159,7 +159,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
         replay.sample(8).unwrap();
     }
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
-    let foreign = affinity(1, 4, vec![0.25; 16]);
+    let foreign = affinity(1, vec![0.25; 16]);
     assert!(replay.set_affinity(&foreign).is_err());
     assert_eq!(replay.status().messages_refused, 2);
 }
@@ -228,7 +228,7 @@ fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
     let mut replay = small_replay(&Config::unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.sample(8).unwrap();
-    let affinity = |version| affinity(version, 5, vec![0.2; 25]);
+    let affinity = |version| affinity(version, vec![0.2; 25]);
     // 2^32 more than the rows.
     let most: u64 = 8 + (1 << 32);
     for version in [most + 1, u64::MAX] {
@@ -422,13 +422,4 @@ fn the_least_capacity_works_and_a_smaller_one_is_refused() {
             }
         }
     }
-}
-
-#[test]
-fn unknown_and_missing_keys_are_refused() {
-    let text = "capacity_transitions = 10\nshards = 1\nreplay_ratio = 8\nwarmup_transitions = 1\nslack_transitions = 2\n";
-    let read = |text: &str| toml::from_str::<Config>(text);
-    assert_eq!(read(text).unwrap().transitions_max, None);
-    assert!(read(&format!("{text}slack = 3\n")).is_err());
-    assert!(read(&text.replace("warmup_transitions = 1\n", "")).is_err());
 }

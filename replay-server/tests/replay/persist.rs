@@ -165,7 +165,7 @@ impl StoredReplay {
                 let matrix = (0..25)
                     .map(|at| if at % 5 == 0 { 0.6 } else { 0.1 })
                     .collect();
-                let update = affinity(self.versions, 5, matrix);
+                let update = affinity(self.versions, matrix);
                 self.replay.set_affinity(&update).unwrap();
             }
             17 => {

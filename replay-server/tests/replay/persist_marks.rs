@@ -7,7 +7,7 @@ use driml_protocol::Batch;
 use driml_replay_server::{Config, Mark, PersistArgs, PersistError, Replay};
 
 use crate::{
-    persist::{ROWS, StoredReplay, copy, open, segments, test_spec},
+    persist::{ROWS, StoredReplay, copy, open, segments},
     rows::prioritised,
 };
 
@@ -133,10 +133,4 @@ fn a_log_with_marks_holds_no_more_than_these_need() {
     }
     let now = segments(folder.path()).len();
     assert!(now <= 2 * most, "{now} segments after {most}");
-}
-
-#[test]
-fn a_replay_in_memory_has_no_marks() {
-    let mut replay = Replay::new(&test_spec(), &Config::unlimited(60), ROWS).unwrap();
-    assert_eq!(replay.mark().unwrap(), None);
 }

@@ -104,7 +104,7 @@ const KINDS: [(Kind, ReadFn); 24] = [
 fn read_affinity(bytes: &[u8]) {
     read::<AffinityUpdate>(bytes);
     if let Ok((update, _)) = codec::decode::<AffinityUpdate>(bytes, Some(SPEC_HASH)) {
-        let _ = update.validate(update.num_actions.min(255));
+        let _ = update.validate(update.matrix.len().isqrt() as u32);
     }
 }
 

@@ -147,7 +147,6 @@ fn send_message(replay: &mut Replay, numbers: &mut NumberReader<'_>) -> Option<(
             let affinity = AffinityUpdate {
                 learner: 1,
                 version: numbers.count()?,
-                num_actions: 3,
                 matrix: (0..9)
                     .map(|_| numbers.byte().map(|byte| f32::from(byte) / 250.0))
                     .collect::<Option<_>>()?,

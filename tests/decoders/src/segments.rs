@@ -284,7 +284,6 @@ fn write_log(chunks: u64) -> Vec<u8> {
     let mut affinity = AffinityUpdate {
         learner: 7,
         version: 1,
-        num_actions: ACTIONS,
         matrix: vec![0.5; (ACTIONS * ACTIONS) as usize],
     };
     let (mut frame, mut id) = (1, RequestId::first(5));

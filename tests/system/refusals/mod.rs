@@ -82,7 +82,6 @@ fn affinity(learner: u64, version: u64, num_actions: u32) -> AffinityUpdate {
     AffinityUpdate {
         learner,
         version,
-        num_actions,
         matrix: vec![0.5; (num_actions * num_actions) as usize],
     }
 }

@@ -146,11 +146,10 @@ impl WorldProcess {
     }
 
     pub(super) fn read_line(&mut self) -> Result<Vec<u8>, EnvError> {
-        let deadline = Instant::now() + self.exchange.timeout;
-        let mut line = Vec::new();
+        let (mut left, mut line) = (self.exchange.timeout, Vec::new());
         loop {
             // Reads a byte at a time, as later bytes do not belong to the line.
-            match self.read_byte_until(deadline)? {
+            match self.read_byte_within(&mut left)? {
                 b'\n' => return Ok(line),
                 _ if line.len() == LINE_BYTES_MAX => return Ok(line),
                 byte => line.push(byte),
@@ -159,12 +158,14 @@ impl WorldProcess {
     }
 
     pub(super) fn read_byte(&mut self) -> Result<u8, EnvError> {
-        self.read_byte_until(Instant::now() + self.exchange.timeout)
+        let mut left = self.exchange.timeout;
+        self.read_byte_within(&mut left)
     }
 
-    fn read_byte_until(&mut self, deadline: Instant) -> Result<u8, EnvError> {
+    /// Reads a byte within the time `left`, and takes the time that this took from it.
+    fn read_byte_within(&mut self, left: &mut Duration) -> Result<u8, EnvError> {
         let mut byte = [0];
-        match self.read_until(&mut byte, deadline) {
+        match self.read_within(&mut byte, left) {
             Ok(0) => Err(self.exit_error()),
             Ok(_) => Ok(byte[0]),
             Err(e) if e.kind() == ErrorKind::TimedOut => {
@@ -179,15 +180,18 @@ impl WorldProcess {
         }
     }
 
-    fn read_until(&mut self, bytes: &mut [u8], deadline: Instant) -> io::Result<usize> {
+    fn read_within(&mut self, bytes: &mut [u8], left: &mut Duration) -> io::Result<usize> {
         loop {
-            let wait = deadline.saturating_duration_since(Instant::now());
-            let wait = PollTimeout::try_from(wait.min(POLL_MAX)).unwrap_or(PollTimeout::ZERO);
+            let (began, wait) = (Instant::now(), POLL_MAX.min(*left));
+            let timeout = PollTimeout::try_from(wait).unwrap_or(PollTimeout::ZERO);
             let mut polled = [PollFd::new(self.stdout.as_fd(), PollFlags::POLLIN)];
-            match poll(&mut polled, wait) {
+            let found = poll(&mut polled, timeout);
+            // The time in which this process was stopped does not count: the world may have been stopped too.
+            *left -= wait.min(began.elapsed());
+            match found {
                 // The process has ended; one that it started may still hold its stdout open.
                 Ok(0) if matches!(self.child.try_wait(), Ok(Some(_))) => return Ok(0),
-                Ok(0) if Instant::now() >= deadline => return Err(ErrorKind::TimedOut.into()),
+                Ok(0) if left.is_zero() => return Err(ErrorKind::TimedOut.into()),
                 Ok(0) | Err(nix::errno::Errno::EINTR) => {}
                 Ok(_) => return self.stdout.read(bytes),
                 Err(e) => return Err(e.into()),

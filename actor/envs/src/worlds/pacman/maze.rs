@@ -207,16 +207,6 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn walls_and_food_mirror_left_and_right() {
-        for row in LAYOUT {
-            for column in 0..WIDTH {
-                let symmetric = |c: u8| if c.is_ascii_digit() { b' ' } else { c };
-                assert_eq!(symmetric(row[column]), symmetric(row[WIDTH - 1 - column]));
-            }
-        }
-    }
-
-    #[test]
     fn only_the_house_has_dead_ends_and_only_the_tunnel_leaves_the_rim() {
         let house = MAZE.ghost_starts;
         for place in MAZE.places() {

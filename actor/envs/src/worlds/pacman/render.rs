@@ -69,16 +69,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn colours_are_distinct() {
-        let mut colours = vec![WALL, FLOOR, PELLET, BOOST, AGENT, AGENT_BOOSTED, FUCHSIA];
-        colours.extend(GHOST_COLOURS);
-        let count = colours.len();
-        colours.sort_unstable();
-        colours.dedup();
-        assert_eq!(colours.len(), count);
-    }
-
-    #[test]
     fn the_agent_is_over_the_ghosts_and_the_first_ghost_over_the_rest() {
         let mut frame = background();
         paint_actors([5, 5, 7, 7], 7, false, &mut frame);

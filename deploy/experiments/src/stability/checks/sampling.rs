@@ -69,7 +69,6 @@ fn affinity_from(num_actions: u32, matrix: Vec<f32>) -> anyhow::Result<Affinity>
     affinity.update(&AffinityUpdate {
         learner: 1,
         version: 1,
-        num_actions,
         matrix,
     })?;
     Ok(affinity)
