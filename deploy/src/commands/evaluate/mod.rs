@@ -219,7 +219,7 @@ fn compare_with_best(ranked: &RankedEvaluation) -> String {
 
 fn describe_returns(name: &str, returns: &[f64]) -> String {
     let (mean, deviation) = mean_and_deviation(returns);
-    let deviation = describe_deviation(deviation, returns.len());
+    let deviation = describe_deviation(deviation);
     format!("{name:12} mean return {mean:8.3}{deviation}\n")
 }
 
