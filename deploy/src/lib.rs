@@ -6,6 +6,8 @@
 mod cli;
 mod commands;
 #[cfg(test)]
+mod recipes;
+#[cfg(test)]
 mod reference;
 mod registry;
 
