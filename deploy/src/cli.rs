@@ -1,6 +1,6 @@
 //! The list of commands. Each has its flags and its code in a file of `commands`, or in the crate that it is named for.
 
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{Arg, CommandFactory, Parser, Subcommand};
 use driml_bench::flags::BenchArgs;
 use driml_experiments::{
     flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
@@ -75,6 +75,19 @@ pub(crate) enum Command {
     Completions(completions::CompletionsArgs),
     /// Write the manual pages
     Man(completions::ManArgs),
+}
+
+/// The command line. A negative number after a flag is the flag's value, which its own check rejects.
+pub(crate) fn command_line() -> clap::Command {
+    fn take_negative_numbers(command: clap::Command) -> clap::Command {
+        let takes = |arg: &Arg| arg.get_long().is_some() && arg.get_action().takes_values();
+        let args = command.mut_args(|arg| match takes(&arg) {
+            true => arg.allow_negative_numbers(true),
+            false => arg,
+        });
+        args.mut_subcommands(take_negative_numbers)
+    }
+    take_negative_numbers(Cli::command())
 }
 
 impl Command {

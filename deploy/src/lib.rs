@@ -6,12 +6,14 @@
 mod cli;
 mod commands;
 #[cfg(test)]
+mod recipes;
+#[cfg(test)]
 mod reference;
 mod registry;
 
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::FromArgMatches;
 use driml_launch::{console, panics};
 use driml_machine::{
     error::{EXIT_INTERRUPTED, EXIT_USAGE, Interrupted, Usage},
@@ -20,7 +22,7 @@ use driml_machine::{
 
 pub use crate::registry::Registry;
 
-use crate::cli::{Cli, Command};
+use crate::cli::{Cli, Command, command_line};
 
 /// Runs the program. The exit code is 0 on success, 64 for a call that cannot work or whose output cannot be written, 130 after an
 /// interrupt, and 1 for other errors.
@@ -32,7 +34,8 @@ pub fn main() -> ExitCode {
 pub fn main_with(registry: Registry) -> ExitCode {
     registry.register();
     panics::abort_on_panic();
-    let cli = match Cli::try_parse() {
+    let matched = command_line().try_get_matches();
+    let cli = match matched.and_then(|it| Cli::from_arg_matches(&it)) {
         Ok(cli) => cli,
         Err(e) => {
             // If printing fails, the terminal is gone.

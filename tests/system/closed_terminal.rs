@@ -198,6 +198,7 @@ fn a_run_that_was_stopped_for_long_resumes() {
         let learner = client.learner_status();
         learner.is_some_and(|it| it.updates > before.updates + 500)
     });
-    process.stop(130);
+    let ended = process.stop(130);
+    assert!(!ended.stderr.contains("no answer for 15 s"), "{ended:#?}");
     system.run_folder("run").check(Outcome::Interrupted);
 }

@@ -339,6 +339,9 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
     fs::write(&path, &whole).unwrap();
     let one = system.run_ok(call).stdout;
     assert!(one.contains("1 episode each") && !one.contains("deviation"));
+    let one = system.run_json(&format!("{call} --json"));
+    let one = &one["policies"]["driml-fix"];
+    assert!(one["mean_return"].is_f64() && one["standard_deviation"].is_null());
 
     let text = system.read("run/config.toml");
     let other = text.replace("seed = 1", "seed = 2");

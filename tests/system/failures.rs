@@ -57,10 +57,30 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     let system = system();
     let process = start_run(&system, 100);
     fs::rename(system.path("run"), system.path("elsewhere")).unwrap();
-    let ended =
-        process.fails("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
+    let ended = process.fails("missing: run/config.toml, run/metrics.csv, run/episodes.csv");
     assert!(!ended.stderr.contains("resumes it"), "{}", ended.stderr);
     assert_eq!(system.running_processes(), []);
+}
+
+/// A file lies where the last checkpoint is written.
+#[test]
+fn a_run_in_lockstep_that_cannot_save_leaves_its_summary() {
+    let system = system();
+    system.run_ok(&format!(
+        "local --lockstep --agent c51 {SHORT} --run-dir run"
+    ));
+    fs::write(
+        system.path("run/checkpoints/checkpoint-000000000860.tmp"),
+        "",
+    )
+    .unwrap();
+    system
+        .fails(
+            "local --resume run --frames 1920",
+            "checkpoint-000000000860.tmp",
+        )
+        .expect_stderr("`driml train --resume run` resumes it");
+    system.check_outcome(Outcome::Failed);
 }
 
 #[test]

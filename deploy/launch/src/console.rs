@@ -348,13 +348,6 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_is_gone_is_told_from_a_full_disk() {
-        let error = io::Error::from_raw_os_error;
-        assert!(is_closed(&error(nix::libc::EPIPE)) && is_closed(&error(nix::libc::EIO)));
-        assert!(!is_closed(&error(nix::libc::ENOSPC)));
-    }
-
-    #[test]
     fn a_level_alone_is_for_driml_s_own_crates() {
         for (wanted, driml) in [("debug", "debug"), (" TRACE", "trace"), ("error", "error")] {
             let filter = filter_for(wanted);

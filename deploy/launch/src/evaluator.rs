@@ -16,6 +16,7 @@ use crate::{
     console::Screen,
     evaluate::{Levels, Player, PolicyKind, stop_when, world_with_levels},
     managed_process::ManagedProcess,
+    output::check_file,
     run_folder::{Candidate, EvaluationRow, RunFolder},
     stats::mean_and_deviation,
 };
@@ -49,6 +50,7 @@ pub fn evaluate_and_keep(
     is_stopped: &dyn Fn() -> bool,
 ) -> anyhow::Result<RankedEvaluation> {
     let path = checkpoint_path(folder, choice)?;
+    check_file("the table", &folder.evaluations())?;
     let candidate = Candidate::read(&path)?;
     let evaluate = |path: &Path| -> anyhow::Result<EvaluationRow> {
         let player = Player::load_checkpoint(read_config(folder)?, path, WeightsChoice::default())?;

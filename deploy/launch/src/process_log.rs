@@ -36,7 +36,9 @@ struct LogState {
 }
 
 impl ProcessLog {
+    /// Opens the log in the folder `logs`, which is made if it is missing.
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
+        std::fs::create_dir_all(logs).with_context(|| format!("making {}", logs.display()))?;
         let path = logs.join(format!("{name}.log"));
         let state = LogState {
             file: AppendLog::open(&path, format!("the log of {name}"), "line", WAITING_MAX)?,

@@ -64,6 +64,38 @@ pub fn print_resume_hint(world: &WorldConfig, folder: &RunFolder) {
     }
 }
 
+/// Reports how a run `ended`, whose summary was `written` or not. After a failure, the caller reports that error last.
+///
+/// # Errors
+/// The run's own error, or the summary could not be written.
+pub(crate) fn report_end(
+    ended: anyhow::Result<Outcome>,
+    written: anyhow::Result<()>,
+    summary: &Summary,
+    resumed: Option<ResumePoint>,
+    world: &WorldConfig,
+    folder: &RunFolder,
+) -> anyhow::Result<()> {
+    if let Err(failed) = ended {
+        if let Err(e) = written {
+            console::eprintln(&console::describe_error(&e));
+        }
+        // A resumed run that did no update most likely failed because of what it was resumed from, and would fail again.
+        if resumed.is_none_or(|point| summary.updates > point.updates) {
+            print_resume_hint(world, folder);
+        }
+        return Err(failed);
+    }
+    console::print_wrapped(&summary.describe(folder), 2)?;
+    written.with_context(|| {
+        format!(
+            "the run is over and its checkpoint saved, but the summary could not be written: make room on the disk, or make the folder \
+             writable, then run `driml train --resume {}`",
+            folder.quoted()
+        )
+    })
+}
+
 /// Prints what the user can do after a run has ended: commands, or how to resume it.
 ///
 /// # Errors

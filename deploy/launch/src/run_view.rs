@@ -120,6 +120,8 @@ pub(crate) struct Speed {
 }
 
 const RATE_WINDOW: Duration = Duration::from_secs(20);
+/// No answers for so long are a pause: this process or the others were stopped. The speed does not count it.
+pub(crate) const PAUSE_MIN: Duration = Duration::from_secs(15);
 
 /// The time of a sample, and the frames and updates counted by then.
 type Sample = (Instant, u64, u64);
@@ -129,6 +131,9 @@ struct Rates(VecDeque<Sample>);
 
 impl Rates {
     fn add(&mut self, now: Instant, frames: u64, updates: u64) {
+        if self.0.back().is_some_and(|it| now - it.0 >= PAUSE_MIN) {
+            self.0.clear();
+        }
         self.0.push_back((now, frames, updates));
         while self.0.len() > 2 && now - self.0[1].0 >= RATE_WINDOW {
             self.0.pop_front();
@@ -227,7 +232,10 @@ impl RunView {
         (self.recorded_s, self.rss_mib) = (None, Vec::new());
         let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
         self.rates.add(Instant::now(), frames, updates);
-        self.speed = self.rates.speed();
+        // After a pause, the speed before it is shown until the next sample.
+        if self.rates.0.len() > 1 {
+            self.speed = self.rates.speed();
+        }
     }
 
     /// The replay servers that read their replay back from disk, each with its progress.
@@ -357,5 +365,11 @@ mod tests {
         assert!(long.0.len() <= 22);
         let warmed_up = rates([(0, 0, 7), (10, 10, 7), (12, 12, 47)]).speed();
         assert_eq!((warmed_up.frames, warmed_up.updates), (1.0, 20.0));
+        let paused = [(0, 0, 0), (1, 10, 1), (5_000, 20, 2), (5_001, 50, 8)];
+        let [at_once, later] = [3, 4].map(|samples| rates(paused[..samples].to_vec()).speed());
+        assert_eq!(
+            (at_once.frames, later.frames, later.updates),
+            (0.0, 30.0, 6.0)
+        );
     }
 }

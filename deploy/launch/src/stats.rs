@@ -18,24 +18,18 @@ pub fn student_quantile(freedom: usize) -> f64 {
     in_table.unwrap_or_else(|| 1.960 + 2.372 / freedom + 2.822 / freedom.powi(2))
 }
 
-/// Mean and sample standard deviation (n - 1). The deviation of a single value is 0; the mean of no values is NaN.
-pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
+/// Mean and sample standard deviation (n - 1). A single value has no deviation; the mean of no values is NaN.
+pub fn mean_and_deviation(values: &[f64]) -> (f64, Option<f64>) {
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    let deviation = match values.len() {
-        0 | 1 => 0.0,
-        _ => (squares / (count - 1.0)).sqrt(),
-    };
+    let deviation = (count > 1.0).then(|| (squares / (count - 1.0)).sqrt());
     (mean, deviation)
 }
 
-/// Describes the standard deviation of `count` values after their mean; empty for a single value, which has none.
-pub fn describe_deviation(deviation: f64, count: usize) -> String {
-    match count {
-        0 | 1 => String::new(),
-        _ => format!(", standard deviation {deviation:.3}"),
-    }
+/// Describes the standard deviation after a mean; empty if there is none.
+pub fn describe_deviation(deviation: Option<f64>) -> String {
+    deviation.map_or(String::new(), |it| format!(", standard deviation {it:.3}"))
 }
 
 /// A mean and its 95% confidence interval, if the values are normally distributed.
@@ -53,8 +47,9 @@ pub struct Interval {
 pub fn interval(values: &[f64]) -> Option<Interval> {
     let freedom = values.len().checked_sub(1)?;
     let (mean, deviation) = mean_and_deviation(values);
-    let half_width = student_quantile(freedom) * deviation / (values.len() as f64).sqrt();
-    let ends = (freedom > 0).then_some((mean - half_width, mean + half_width));
+    let half_width = |it| student_quantile(freedom) * it / (values.len() as f64).sqrt();
+    let ends = deviation.map(half_width);
+    let ends = ends.map(|it| (mean - it, mean + it));
     Some(Interval { mean, ends })
 }
 
@@ -98,9 +93,10 @@ mod tests {
 
     #[test]
     fn the_deviation_is_the_samples() {
-        assert_eq!(mean_and_deviation(&[1.0, 3.0]), (2.0, 2.0_f64.sqrt()));
-        assert_eq!(mean_and_deviation(&[4.0]), (4.0, 0.0));
-        let texts = [1, 2].map(|count| describe_deviation(0.5, count));
+        let two = (2.0, Some(2.0_f64.sqrt()));
+        assert_eq!(mean_and_deviation(&[1.0, 3.0]), two);
+        assert_eq!(mean_and_deviation(&[4.0]), (4.0, None));
+        let texts = [None, Some(0.5)].map(describe_deviation);
         assert_eq!(texts, ["", ", standard deviation 0.500"]);
     }
 }

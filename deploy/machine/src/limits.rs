@@ -31,10 +31,6 @@ fn open_files() -> Option<String> {
         Err(e) if e.raw_os_error() == Some(Errno::EMFILE as i32) => max,
         Err(_) => return None,
     };
-    scarce_files(used, max)
-}
-
-fn scarce_files(used: u64, max: u64) -> Option<String> {
     (used.saturating_add(FILES_SPARE) > max)
         .then(|| format!("{used} of at most {max} files are open: raise the limit (`ulimit -n`)"))
 }
@@ -71,16 +67,4 @@ fn memory_maps() -> Option<String> {
 fn memory() -> Option<String> {
     let free = Machine::detect().memory_bytes;
     (free < MEMORY_SPARE).then(|| format!("{} MiB of memory are free", free >> 20))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn open_files_are_scarce_where_a_library_may_want_more() {
-        let said = "53 of at most 60 files are open: raise the limit (`ulimit -n`)";
-        let found = [52, 53].map(|used| scarce_files(used, 60));
-        assert_eq!(found, [None, Some(said.to_owned())]);
-    }
 }

@@ -20,11 +20,13 @@ const REPLAY_SERVER_VARIABLE: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
 /// # Errors
 /// The program cannot be started again. It may continue without the variables, only slower.
 pub fn ensure_environment(is_replay_server: bool) -> io::Result<()> {
-    let missing = missing_variables(is_replay_server, |name| env::var_os(name).is_some());
-    if missing.is_empty() {
-        return Ok(());
+    let server_variable = is_replay_server.then_some(REPLAY_SERVER_VARIABLE);
+    let needed = COMMON_VARIABLES.into_iter().chain(server_variable);
+    let missing: Vec<_> = needed.filter(|it| env::var_os(it.0).is_none()).collect();
+    match missing.is_empty() {
+        true => Ok(()),
+        false => restart_with(missing),
     }
-    restart_with(missing)
 }
 
 /// Restarts this program in the same process, with the same arguments and with these variables added. Returns only if that
@@ -40,15 +42,6 @@ pub fn restart_with<'a>(variables: impl IntoIterator<Item = (&'a str, &'a str)>)
 pub fn program_path() -> PathBuf {
     let file = env::current_exe().ok().filter(|it| it.exists());
     file.unwrap_or_else(|| "/proc/self/exe".into())
-}
-
-fn missing_variables(
-    is_replay_server: bool,
-    is_set: impl Fn(&str) -> bool,
-) -> Vec<(&'static str, &'static str)> {
-    let server_variable = is_replay_server.then_some(REPLAY_SERVER_VARIABLE);
-    let needed = COMMON_VARIABLES.into_iter().chain(server_variable);
-    needed.filter(|(name, _)| !is_set(name)).collect()
 }
 
 #[cfg(test)]
@@ -79,14 +72,5 @@ mod tests {
             Some(_) if fs::remove_file(env::current_exe().unwrap()).is_err() => {}
             Some(_) => assert!(status(program_path()).success()),
         }
-    }
-
-    #[test]
-    fn what_is_missing_is_added_and_what_is_set_stays() {
-        assert_eq!(missing_variables(false, |_| false), COMMON_VARIABLES);
-        assert_eq!(missing_variables(false, |_| true), []);
-        let server = missing_variables(true, |name| name == "CANDLE_NUM_THREADS");
-        let [_, mmap, trim] = COMMON_VARIABLES;
-        assert_eq!(server, [mmap, trim, REPLAY_SERVER_VARIABLE]);
     }
 }

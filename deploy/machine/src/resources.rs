@@ -46,9 +46,10 @@ impl Machine {
     pub fn detect() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
         let share = std::env::var(MEMORY_SHARE_ENV).ok();
+        let share = share.and_then(|it| it.parse().ok()).unwrap_or(u64::MAX);
         Self {
             cores,
-            memory_bytes: bounded(free_memory_bytes().unwrap_or(4 << 30), share.as_deref()),
+            memory_bytes: free_memory_bytes().unwrap_or(4 << 30).min(share),
             fast_bf16: driml_model::is_bf16_fast(),
         }
     }
@@ -97,35 +98,24 @@ pub struct MachineInfo {
 impl MachineInfo {
     /// Describes this machine and its load now. `gpu` is the GPU that computes, or none for the processor.
     pub fn detect(gpu: Option<String>) -> Self {
+        let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
+        let load = load.split_whitespace().next();
         Self {
             processor: processor_name(),
             cores: Machine::detect().cores,
-            load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
+            load: load.and_then(|it| it.parse().ok()).unwrap_or(0.0),
             gpu,
         }
     }
 }
 
-fn load(loadavg: &str) -> Option<f64> {
-    loadavg.split_whitespace().next()?.parse().ok()
-}
-
 /// The processor's name; "unknown" if the kernel does not report it.
 pub fn processor_name() -> String {
     let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    parse_processor(&cpuinfo).unwrap_or("unknown").to_owned()
-}
-
-fn parse_processor(cpuinfo: &str) -> Option<&str> {
     let mut lines = cpuinfo.lines();
-    let line = lines.find(|line| line.starts_with("model name"))?;
-    let (_, name) = line.split_once(':')?;
-    Some(name.trim())
-}
-
-fn bounded(bytes: u64, share: Option<&str>) -> u64 {
-    let share = share.and_then(|it| it.parse().ok());
-    share.map_or(bytes, |share| bytes.min(share))
+    let line = lines.find_map(|line| line.strip_prefix("model name"));
+    let name = line.and_then(|line| line.split_once(':'));
+    name.map_or("unknown", |(_, name)| name.trim()).to_owned()
 }
 
 /// The kernel's estimate of available memory, or what the control groups leave, whichever is less.
@@ -174,20 +164,6 @@ fn cgroup_bytes_left(mount: &Path, groups: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn load_and_processor_are_read_from_the_kernel_s_tables() {
-        assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
-        let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
-        assert_eq!(parse_processor(cpuinfo), Some("AMD EPYC 9999"));
-        assert_eq!(parse_processor(""), None);
-    }
-
-    #[test]
-    fn a_share_is_a_bound() {
-        let found = [None, Some("16"), Some("64"), Some("x")].map(|share| bounded(33, share));
-        assert_eq!(found, [33, 16, 33, 33]);
-    }
 
     #[test]
     fn control_groups_leave_what_the_tightest_leaves_and_cached_files_are_free() {

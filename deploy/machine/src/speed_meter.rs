@@ -93,14 +93,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_median_is_in_the_middle() {
-        assert_eq!(median(&[3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(&[4.0, 1.0, 2.0, 3.0]), 2.5);
-        assert_eq!(median(&[7.0]), 7.0);
-        assert!(median(&[]).is_nan());
-    }
-
-    #[test]
     fn works_take_turns_and_calls_are_counted_after_the_warm_up() {
         let meter = SpeedMeter {
             warmup_calls: 2,

@@ -44,6 +44,14 @@ pub fn within(
     }
 }
 
+/// [`within`] for a flag of 32 bits.
+pub fn within_u32(
+    range: RangeInclusive<u32>,
+) -> impl Fn(&str) -> Result<u32, String> + Clone + Send + Sync + 'static {
+    let read = within(u64::from(*range.start())..=u64::from(*range.end()));
+    move |text| Ok(read(text)? as u32)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -49,19 +49,19 @@ pub struct RunFlags {
 #[derive(Clone, Debug, Default, Args)]
 pub struct Flags {
     /// Actor processes [default: by number of cores]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=256))]
     pub actors: Option<u32>,
     /// Replay servers, each with a share of the actors and memory [default: 1]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=256))]
     pub replay_shards: Option<u32>,
     /// Environments per actor [default: as the preset says]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=4096))]
     pub envs: Option<u32>,
     /// Frames of the run; it is finished when they are stored and their updates are done
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = whole_number::within(1..=i64::MAX as u64))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
     pub frames: Option<u64>,
     /// Seed of the run
-    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = whole_number::within(0..=i64::MAX as u64))]
+    #[arg(long, value_name = "S", value_parser = whole_number::within(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use driml_launch::endpoint::check_connect_endpoints;
-use driml_machine::error::usage;
+use driml_machine::{error::usage, whole_number};
 use driml_protocol::{Shutdown, tls::Role};
 use driml_settings::presets;
 
@@ -18,7 +18,7 @@ pub(crate) struct ActorArgs {
     #[arg(long, value_name = "N", default_value = "0", value_parser = actor_id)]
     pub(crate) id: u32,
     /// Environments [default: from the run's settings]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=4096))]
     pub(crate) envs: Option<u32>,
     /// Command or library of the run's world on this machine, if it is exec:COMMAND or libenv:PATH:GAME; an actor never runs what
     /// a replay server sends

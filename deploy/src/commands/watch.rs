@@ -7,7 +7,7 @@ use driml_launch::{
     endpoint::{DEFAULT_NAMESPACE, check_connect_endpoints},
     run_folder::RunFolder,
     view::Poller,
-    watch::{self, OrUnreachable, WatchFlags, read_endpoints},
+    watch::{self, UnreachableRun, WatchFlags, read_endpoints},
 };
 use driml_protocol::tls::Role;
 
@@ -55,37 +55,35 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    match args.selection.open()? {
-        Ok(mut poller) => {
-            let folder = args.selection.folder();
-            watch::print_status(&mut poller, folder.as_ref(), args.watch, args.json)
-        }
-        Err(unreachable) => unreachable.print(args.json),
+    let selection = &args.selection;
+    let shown = selection.open().and_then(|mut poller| {
+        let folder = selection.folder();
+        watch::print_status(&mut poller, folder.as_ref(), args.watch, args.json)
+    });
+    match shown.map_err(|e| e.downcast::<UnreachableRun>()) {
+        Err(Ok(unreachable)) => unreachable.print(args.json),
+        Err(Err(e)) => Err(e),
+        Ok(()) => Ok(()),
     }
 }
 
 impl RunSelection {
-    /// Opens a connection to the run, or returns the run's state if it cannot be asked.
-    fn open(&self) -> anyhow::Result<OrUnreachable<Poller>> {
+    /// Opens a connection to the run. The error may be an [`UnreachableRun`].
+    fn open(&self) -> anyhow::Result<Poller> {
         check_connect_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
-        let endpoints = match self.endpoints()? {
-            Ok(endpoints) => endpoints,
-            Err(unreachable) => return Ok(Err(unreachable)),
-        };
+        let endpoints = self.endpoints()?;
         let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
-        // The run may have ended meanwhile.
-        if opened.is_err()
-            && let Err(unreachable) = self.endpoints()?
-        {
-            return Ok(Err(unreachable));
+        if opened.is_err() {
+            // The run may have ended meanwhile.
+            self.endpoints()?;
         }
-        opened.map(Ok)
+        opened
     }
 
-    fn endpoints(&self) -> anyhow::Result<OrUnreachable<Vec<String>>> {
+    fn endpoints(&self) -> anyhow::Result<Vec<String>> {
         let of_folder = self.folder().map(|it| read_endpoints(&it));
-        of_folder.unwrap_or_else(|| Ok(Ok(self.connect.clone())))
+        of_folder.unwrap_or_else(|| Ok(self.connect.clone()))
     }
 
     fn folder(&self) -> Option<RunFolder> {

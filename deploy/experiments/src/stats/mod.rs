@@ -28,7 +28,7 @@ impl Spread {
         let (mean, sd) = mean_and_deviation(&values);
         Some(Self {
             mean,
-            sd,
+            sd: sd.unwrap_or(0.0),
             min: values.iter().copied().fold(f64::INFINITY, f64::min),
             max: values.iter().copied().fold(f64::NEG_INFINITY, f64::max),
             count: values.len(),

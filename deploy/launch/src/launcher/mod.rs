@@ -17,7 +17,7 @@ use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
 use crate::{
-    console::{self, print_wrapped},
+    console,
     endpoint::wait_until_listening,
     evaluator::Evaluator,
     last_play,
@@ -123,26 +123,7 @@ pub fn run(
             tracing::debug!("removing {}: {e}", path.display());
         }
     }
-    // A resumed run that did no update most likely failed because of what it was resumed from, and would fail again.
-    let has_learned = resumed.is_none() || summary.updates > resume_point.updates;
-    if let Err(failed) = result {
-        // The caller reports `failed` last. A summary that could not be written, as on a full disk, is reported before.
-        if let Err(e) = written {
-            console::eprintln(&console::describe_error(&e));
-        }
-        if has_learned {
-            resume::print_resume_hint(&config.world, run_dir);
-        }
-        return Err(failed);
-    }
-    print_wrapped(&summary.describe(run_dir), 2)?;
-    written.with_context(|| {
-        format!(
-            "the run is over and its checkpoint saved, but the summary could not be written: make room on the disk, then run \
-             `driml train --resume {}`",
-            run_dir.quoted()
-        )
-    })?;
+    resume::report_end(result, written, &summary, resumed, &config.world, run_dir)?;
     if outcome == Outcome::Finished {
         let is_stopped = || launch.shutdown.drain.is_set();
         last_play::play(&mut summary, config, run_dir, &is_stopped);
@@ -152,8 +133,6 @@ pub fn run(
 
 impl Launch<'_> {
     fn start_and_watch(&mut self) -> anyhow::Result<Outcome> {
-        let logs = self.run_dir.logs();
-        std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         self.start_up_to(self.endpoints.len())?;
         let hash = self.config.run.hash();
         let mut connections = Vec::new();

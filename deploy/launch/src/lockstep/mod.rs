@@ -16,7 +16,7 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     checkpoint_choice::CheckpointChoice,
-    console::{self, print_wrapped},
+    console,
     evaluator::{EvaluationSchedule, evaluate_and_keep},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
@@ -71,59 +71,63 @@ pub fn run(
     let mut row_number = lockstep.replay.inserted_total() / row_frames;
     let folder = run_dir.checkpoints();
 
-    let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| (point.updates, point.frames));
     let mut save_tried_at = updates;
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
-    while lockstep.run_round()? {
-        let updates = lockstep.learner.updates();
-        if updates / period > save_tried_at / period {
-            save_tried_at = updates;
-            // A failed save does not end the training, but at the end of the run it is an error.
-            if let Err(e) = lockstep.save(&folder) {
-                let updates = count(updates, "update");
-                screen.print_line(&format!(
-                    "no checkpoint after {updates}, retrying at the next period: {e:#}"
-                ));
-            } else {
-                saved = Some((updates, lockstep.replay.inserted_total()));
-                evaluate(updates, false);
+    let mut train = || {
+        let outcome = loop {
+            if is_stopped() {
+                break Outcome::Interrupted;
             }
-        }
-        let show = shown_at.elapsed() >= POLL;
-        if show || lockstep.replay.inserted_total() / row_frames > row_number {
-            row_number = lockstep.replay.inserted_total() / row_frames;
-            screen.print_lines(record(&mut recorder, &mut view, &mut lockstep));
-            if show {
-                shown_at = Instant::now();
-                display.show(&view);
+            if !lockstep.run_round()? {
+                break Outcome::Finished;
             }
+            let updates = lockstep.learner.updates();
+            if updates / period > save_tried_at / period {
+                save_tried_at = updates;
+                // A failed save does not end the training, but at the end of the run it is an error.
+                if let Err(e) = lockstep.save(&folder) {
+                    let updates = count(updates, "update");
+                    screen.print_line(&format!(
+                        "no checkpoint after {updates}, retrying at the next period: {e:#}"
+                    ));
+                } else {
+                    saved = Some((updates, lockstep.replay.inserted_total()));
+                    evaluate(updates, false);
+                }
+            }
+            let show = shown_at.elapsed() >= POLL;
+            if show || lockstep.replay.inserted_total() / row_frames > row_number {
+                row_number = lockstep.replay.inserted_total() / row_frames;
+                screen.print_lines(record(&mut recorder, &mut view, &mut lockstep));
+                if show {
+                    shown_at = Instant::now();
+                    display.show(&view);
+                }
+            }
+        };
+        // Frames may have been stored since the last update.
+        let reached = Some((lockstep.learner.updates(), lockstep.replay.inserted_total()));
+        if saved != reached || outcome == Outcome::Interrupted {
+            lockstep.save(&folder)?;
         }
-        if is_stopped() {
-            outcome = Outcome::Interrupted;
-            break;
-        }
-    }
-    // Frames may have been stored since the last update.
-    if saved != Some((lockstep.learner.updates(), lockstep.replay.inserted_total()))
-        || outcome == Outcome::Interrupted
-    {
-        lockstep.save(&folder)?;
-    }
-    // Only after the last save: a longer run must continue from a state in which the actors have not left.
-    lockstep.finish()?;
+        // Only after the last save: a longer run must continue from a state in which the actors have not left.
+        lockstep.finish().map(|()| outcome)
+    };
+    let ended = train();
     screen.clear();
     record(&mut recorder, &mut view, &mut lockstep);
-    if outcome == Outcome::Finished {
+    if matches!(ended, Ok(Outcome::Finished)) {
         evaluate(lockstep.learner.updates(), true);
     }
     let missing = console::join_losses(recorder.loss_messages());
     missing.iter().for_each(|line| console::eprintln(line));
-    run_dir.check_intact()?;
+    let ended = ended.and_then(|outcome| run_dir.check_intact().map(|()| outcome));
+    let outcome = *ended.as_ref().unwrap_or(&Outcome::Failed);
     let summary = recorder.summarise(outcome, &mut view);
-    print_wrapped(&summary.describe(run_dir), 2)?;
-    summary.write(run_dir)?;
+    let written = summary.write(run_dir);
+    resume::report_end(ended, written, &summary, resumed, &config.world, run_dir)?;
     resume::print_next_steps(&summary, &config.world, run_dir)
 }
 

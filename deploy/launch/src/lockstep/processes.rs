@@ -210,22 +210,19 @@ impl Lockstep {
             // An empty companion says that the run is in lockstep, and cannot be resumed.
             return Ok(self.learner.save(folder, Some(&[]))?);
         };
-        let saved = self.save_with_mark(mark, folder);
+        let doing = "saving the worlds for a checkpoint, which worked at the start of the run";
+        let saved = self.actor_states().context(doing).and_then(|actors| {
+            let state = SavedState {
+                actors,
+                replay: mark,
+                turn: self.turn.clone(),
+            };
+            Ok(self.learner.save(folder, Some(&state.to_bytes()?))?)
+        });
         if saved.is_err() {
             self.replay.discard_mark(mark);
         }
         saved
-    }
-
-    /// [`Lockstep::save`] for a run whose replay has a mark in its log.
-    fn save_with_mark(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
-        let doing = "saving the worlds for a checkpoint, which worked at the start of the run";
-        let saved = SavedState {
-            actors: self.actor_states().context(doing)?,
-            replay: mark,
-            turn: self.turn.clone(),
-        };
-        Ok(self.learner.save(folder, Some(&saved.to_bytes()?))?)
     }
 
     /// Stores one chunk of the next actor, then does every update that it allows. Returns false once all updates are done.

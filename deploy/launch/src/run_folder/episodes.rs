@@ -137,10 +137,7 @@ impl TrainingEpisodes {
                 };
                 let missing = reply.before - received;
                 if missing > 0 {
-                    warnings.extend((self.lost == 0).then(|| {
-                        let missing = count(missing, "episode");
-                        format!("episodes.csv lacks {missing}: more ended between two requests than the replay server keeps")
-                    }));
+                    warnings.extend((self.lost == 0).then(|| describe_lost(missing)));
                     self.lost += missing;
                     self.newest += missing;
                 }
@@ -211,14 +208,16 @@ impl TrainingEpisodes {
     }
 
     pub(super) fn loss_messages(&self) -> Vec<String> {
-        let lost = (self.lost > 0).then(|| {
-            format!(
-                "episodes.csv lacks {}: more ended between two requests than the replay server keeps",
-                count(self.lost, "episode")
-            )
-        });
+        let lost = (self.lost > 0).then(|| describe_lost(self.lost));
         self.table.loss_message().into_iter().chain(lost).collect()
     }
+}
+
+fn describe_lost(lost: u64) -> String {
+    let lost = count(lost, "episode");
+    format!(
+        "episodes.csv lacks {lost}: more ended between two requests than the replay server keeps"
+    )
 }
 
 #[cfg(test)]

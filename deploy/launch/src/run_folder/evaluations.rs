@@ -30,9 +30,9 @@ pub struct EvaluationRow {
     /// Mean undiscounted return of the episodes.
     #[serde(rename = "evaluated_return")]
     pub mean_return: f64,
-    /// Standard deviation of the return over episodes; 0 for one episode.
+    /// Standard deviation of the return over episodes; none for one episode.
     #[serde(rename = "evaluated_return_sd")]
-    pub deviation: f64,
+    pub deviation: Option<f64>,
 }
 
 impl EvaluationRow {
@@ -61,7 +61,7 @@ impl EvaluationRow {
         folder: &RunFolder,
         updates: u64,
         episodes: u32,
-        (mean_return, deviation): (f64, f64),
+        (mean_return, deviation): (f64, Option<f64>),
     ) -> Self {
         let metrics = Table::read(&folder.metrics()).unwrap_or_default();
         let updates_at = |row: &_| metrics.value::<u64>(row, "updates");
@@ -84,7 +84,7 @@ impl EvaluationRow {
             "evaluated after {}: mean return {:.3}{} over {}",
             count(self.updates, "update"),
             self.mean_return,
-            crate::stats::describe_deviation(self.deviation, self.episodes as usize),
+            crate::stats::describe_deviation(self.deviation),
             count(self.episodes, "episode")
         )
     }
@@ -101,7 +101,7 @@ impl EvaluationRow {
             self.updates.to_string(),
             self.episodes.to_string(),
             rounded(self.mean_return).to_string(),
-            rounded(self.deviation).to_string(),
+            cell(self.deviation.map(rounded)),
         ]);
         let head = is_new.then(|| csv_row(HEADER.split(',')));
         // A whole row in one write, as others may read meanwhile.
@@ -179,7 +179,7 @@ mod tests {
         fs::write(path.join("weights"), updates.to_string()).unwrap();
         let candidate = Candidate::read(&path).unwrap();
         fs::remove_dir_all(path).unwrap();
-        let row = EvaluationRow::new(folder, updates, episodes, (mean, 0.5));
+        let row = EvaluationRow::new(folder, updates, episodes, (mean, Some(0.5)));
         candidate.keep_if_best(folder, &row)
     }
 
@@ -248,11 +248,11 @@ mod tests {
         let folder = RunFolder::new(root.path());
         let metrics = "seconds,frames,updates\n1.0,300,120\n2.0,500,240\n";
         fs::write(folder.metrics(), metrics).unwrap();
-        let row = EvaluationRow::new(&folder, 100, 1, (2.0, 0.0));
+        let row = EvaluationRow::new(&folder, 100, 1, (2.0, None));
         assert_eq!((row.frames, row.seconds), (Some(300), Some(1.0)));
 
         fs::remove_file(folder.metrics()).unwrap();
-        let row = EvaluationRow::new(&folder, 5, 1, (2.0, 0.0));
+        let row = EvaluationRow::new(&folder, 5, 1, (2.0, None));
         assert_eq!((row.frames, row.seconds), (None, None));
         row.append_to(&folder).unwrap();
         assert_eq!(EvaluationRow::all(&folder).unwrap(), [row]);

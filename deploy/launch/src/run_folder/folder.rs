@@ -6,7 +6,6 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::Context;
 use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{
     error::{Usage, usage},
@@ -144,9 +143,11 @@ impl RunFolder {
     /// Another launcher holds the lock, or the file system failed.
     pub fn lock(&self) -> anyhow::Result<File> {
         let path = self.lock_file();
-        let doing = || format!("locking {}", path.display());
-        let lock = lock_file::acquire(&path, "start no other run there").with_context(doing)?;
         let folder = self.display();
+        let lock = lock_file::acquire(&path, "start no other run there");
+        let lock = lock.map_err(|e| {
+            usage!("the run folder {folder} cannot be written: {e}; make it writable, or choose another")
+        })?;
         lock.ok_or_else(|| {
             usage!("the run in {folder} is still running: stop it first, or wait").into()
         })
@@ -159,12 +160,11 @@ impl RunFolder {
     }
 
     pub(crate) fn check_intact(&self) -> anyhow::Result<()> {
-        // A run in lockstep has no logs.
-        let files = [self.config(), self.metrics(), self.episodes(), self.logs()];
+        let files = [self.config(), self.metrics(), self.episodes()];
         let missing = files.iter().filter(|it| !it.exists());
         let missing: Vec<_> = missing.map(|it| it.display().to_string()).collect();
         anyhow::ensure!(
-            files[..3].iter().all(|it| it.exists()),
+            missing.is_empty(),
             "the run folder was removed or moved during the run; missing: {}",
             missing.join(", ")
         );

@@ -230,12 +230,4 @@ mod tests {
         ];
         assert_eq!(said, expected);
     }
-
-    #[test]
-    fn a_plain_line_begins_with_the_time() {
-        let texts = ["frames 1/2", "return 3"].map(str::to_owned);
-        let said = plain_line(Duration::from_secs(83), &texts);
-        assert_eq!(said, "1 min 23 s  frames 1/2  return 3");
-        assert!(indicatif::ProgressStyle::with_template(PROGRESS_TEMPLATE).is_ok());
-    }
 }

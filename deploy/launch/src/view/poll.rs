@@ -1,7 +1,7 @@
 //! The poller: asks the processes of a run for their status, as any client could, and keeps the answers in a [`RunView`].
 //! This module judges nothing and changes nothing.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Usage, usage};
@@ -16,7 +16,7 @@ use zenoh::{Session, Wait};
 
 use crate::{
     endpoint::DEFAULT_NAMESPACE,
-    run_view::{Plan, RunView, ServerAnswer},
+    run_view::{PAUSE_MIN, Plan, RunView, ServerAnswer},
 };
 
 /// How long an answer may take; a process that is busy may answer the next poll.
@@ -38,6 +38,8 @@ pub struct Poller {
     /// The state of the run, by the answers of its processes.
     pub view: RunView,
     servers: Vec<ServerConnection>,
+    /// The end of the last poll.
+    polled: Instant,
 }
 
 impl Poller {
@@ -47,6 +49,7 @@ impl Poller {
             view: RunView::new(Plan::new(config)),
             config: config.clone(),
             servers,
+            polled: Instant::now(),
         }
     }
 
@@ -102,8 +105,11 @@ impl Poller {
             None => _ = view.replay_silence.record_failure(),
         }
         view.servers = servers;
-        if view.recovering().next().is_some() {
-            // The server is alive, but no other process can be asked through it.
+        let poll_max = 2 * ANSWER_MAX * self.servers.len() as u32;
+        let was_stopped = self.polled.elapsed() > PAUSE_MIN + poll_max;
+        self.polled = Instant::now();
+        if was_stopped || view.recovering().next().is_some() {
+            // This process could not ask, or the server is alive and no other process can be asked through it.
             view.replay_silence.record_answer();
             view.learner_silence.record_answer();
         }
@@ -219,4 +225,21 @@ fn fetch_settings(
         "the replay server's settings",
         &config_toml,
     )?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::config;
+
+    #[test]
+    fn a_pause_of_this_process_is_no_silence_of_the_others() {
+        let mut poller = Poller::new(&config("smoke", "chain", "c51", &[]), Vec::new());
+        for (pause_s, is_silent) in [(1, true), (60, false)] {
+            let pause = Duration::from_secs(pause_s);
+            poller.polled = Instant::now().checked_sub(pause).unwrap();
+            let silence = poller.poll().learner_silence.length();
+            assert_eq!(silence > Duration::ZERO, is_silent, "after {pause_s} s");
+        }
+    }
 }

@@ -44,9 +44,6 @@ pub struct WatchFlags {
     prometheus: Option<PathBuf>,
 }
 
-/// A connection to a run, or the run's state if no process of it can be asked.
-pub type OrUnreachable<T> = Result<T, Box<UnreachableRun>>;
-
 const POLL: Duration = Duration::from_secs(1);
 /// The time between polls once all frames are stored: shorter, as the learner may exit soon after its last status.
 const LAST_POLL: Duration = Duration::from_millis(200);
@@ -56,7 +53,7 @@ const PAGE_PERIOD: Duration = Duration::from_secs(2);
 /// any more, the run's `folder`, if it is known, tells how the run ended.
 ///
 /// # Errors
-/// [`Interrupted`] if Ctrl-C came before the first page.
+/// [`UnreachableRun`]; [`Interrupted`] if Ctrl-C came before the first page.
 pub fn print_status(
     poller: &mut Poller,
     folder: Option<&RunFolder>,
@@ -71,10 +68,8 @@ pub fn print_status(
     }
     loop {
         let view = poller.poll();
-        if let Some(folder) = folder.filter(|_| view.servers_ended())
-            && let Err(unreachable) = read_endpoints(folder)?
-        {
-            return unreachable.print(as_json);
+        if let Some(folder) = folder.filter(|_| view.servers_ended()) {
+            read_endpoints(folder)?;
         }
         let is_read = match as_json {
             true => console::print_unless_closed(&run_json(view)?)?,
@@ -93,17 +88,18 @@ pub fn print_status(
 /// # Errors
 /// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
 /// that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
-pub fn run(found: anyhow::Result<OrUnreachable<Poller>>, flags: &WatchFlags) -> anyhow::Result<()> {
-    if !matches!(found, Ok(Ok(_)))
+pub fn run(found: anyhow::Result<Poller>, flags: &WatchFlags) -> anyhow::Result<()> {
+    if found.is_err()
         && let Some(path) = &flags.prometheus
     {
         let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
         write_file("--prometheus", path, down)?;
     }
-    match found? {
+    match found {
         Ok(poller) if flags.once => check_once(poller, flags),
         Ok(poller) => watch(poller, flags),
-        Err(unreachable) => {
+        Err(e) => {
+            let unreachable = e.downcast::<UnreachableRun>()?;
             unreachable.print(flags.json)?;
             ensure!(
                 unreachable.is_well || !flags.once,
@@ -206,7 +202,8 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
 }
 
 /// The state of a run of which no process can be asked.
-#[derive(Serialize)]
+#[derive(Debug, Serialize, thiserror::Error)]
+#[error("{message}")]
 pub struct UnreachableRun {
     /// Whether the run is complete and its processes have ended.
     finished: bool,
@@ -236,13 +233,14 @@ impl UnreachableRun {
 /// Reads the endpoints of a run's replay servers from its folder.
 ///
 /// # Errors
-/// The folder has no settings: it is not a run's, or the processes of the run were started by hand.
-pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<String>>> {
+/// [`UnreachableRun`] if no process can be asked. The folder has no settings: it is not a run's, or the processes of the run were
+/// started by hand.
+pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<Vec<String>> {
     let config = read_config(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints()).unwrap_or_default();
     let mut lines = endpoints.lines();
     if lines.any(|it| reach::check_listening(it).is_ok()) {
-        return Ok(Ok(endpoints.lines().map(str::to_owned).collect()));
+        return Ok(endpoints.lines().map(str::to_owned).collect());
     }
     let run = folder.display();
     // A running launcher holds the lock, and so does a run in lockstep.
@@ -250,13 +248,13 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<St
     let counts =
         |it: Progress| [count(it.frames, "frame"), count(it.episodes, "episode")].join(" and ");
     let so_far = read_progress(folder).map_or("nothing".into(), counts);
-    let mut state = Box::new(UnreachableRun {
+    let mut state = UnreachableRun {
         finished: !is_locked && Summary::is_finished(folder),
         message: "the run is over".into(),
         summary: Summary::read(folder).ok(),
         details: String::new(),
         is_well: true,
-    });
+    };
     if is_locked && endpoints.is_empty() {
         state.message = format!(
             "one process writes {run}, in lockstep or as `driml watch`, and answers no requests. metrics.csv has {so_far} so far"
@@ -281,7 +279,7 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<OrUnreachable<Vec<St
             "no process runs in {run}, which holds {so_far}: {next}. For processes that were started by hand, use --connect ENDPOINT"
         );
     }
-    Ok(Err(state))
+    Err(state.into())
 }
 
 #[cfg(test)]
@@ -301,9 +299,9 @@ mod tests {
         let socket = root.path().join("s");
         let endpoint = format!("unixsock-stream/{}", socket.display());
         std::fs::write(folder.endpoints(), &endpoint).unwrap();
-        let found = || match read_endpoints(&folder).unwrap() {
+        let found = || match read_endpoints(&folder) {
             Ok(endpoints) => endpoints.join(" "),
-            Err(unreachable) => unreachable.message,
+            Err(e) => e.downcast::<UnreachableRun>().unwrap().message,
         };
         let listener = UnixListener::bind(&socket).unwrap();
         assert_eq!(found(), endpoint);

@@ -87,14 +87,6 @@ fn every_number_has_its_source_beside_it() {
 }
 
 #[test]
-fn later_layers_win_key_by_key() {
-    let mut lower: Table = "[a]\nx = 1\ny = 2\n[b]\nz = [1, 2]".parse().unwrap();
-    merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
-    let merged: Table = "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse().unwrap();
-    assert_eq!(lower, merged);
-}
-
-#[test]
 fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
     let of = |name| preset_or_default(None, world(name).unwrap()).unwrap().name;
     let found = ["coinrun", "mspacman", "chain"].map(of);

@@ -28,6 +28,7 @@ use driml_machine::{
     error::{Interrupted, usage},
     shell::quoted_path,
     units::count,
+    whole_number,
 };
 use driml_protocol::Shutdown;
 
@@ -41,13 +42,13 @@ pub(crate) struct EvaluateArgs {
     #[arg(long, value_name = "DIR", conflicts_with = "folder", hide = true)]
     pub(crate) run: Option<PathBuf>,
     /// Episodes to play
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = whole_number::within_u32(1..=1_000_000))]
     pub(crate) episodes: u32,
     /// Which levels to play
     #[arg(long, value_enum, default_value_t = Levels::Train)]
     pub(crate) levels: Levels,
     /// Seed of the worlds and of exploration
-    #[arg(long, value_name = "S", default_value_t = 0)]
+    #[arg(long, value_name = "S", default_value_t = 0, value_parser = whole_number::within(0..=u64::MAX))]
     pub(crate) seed: u64,
     /// Probability of a random action [default: 0.001]
     #[arg(long, value_name = "P", value_parser = probability)]
@@ -219,7 +220,7 @@ fn compare_with_best(ranked: &RankedEvaluation) -> String {
 
 fn describe_returns(name: &str, returns: &[f64]) -> String {
     let (mean, deviation) = mean_and_deviation(returns);
-    let deviation = describe_deviation(deviation, returns.len());
+    let deviation = describe_deviation(deviation);
     format!("{name:12} mean return {mean:8.3}{deviation}\n")
 }
 
@@ -274,16 +275,4 @@ fn progress(policy: &str, returns: &[f64], of: usize) -> String {
     };
     let of = count(of, "episode");
     format!("{policy}: {} of {of}{mean}", returns.len())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn progress_is_episodes_and_their_mean() {
-        assert_eq!(progress("c51", &[], 100), "c51: 0 of 100 episodes");
-        let text = progress("c51", &[1.0, 2.0], 100);
-        assert_eq!(text, "c51: 2 of 100 episodes, mean return 1.500");
-    }
 }

@@ -9,7 +9,10 @@ use driml_envs::StepEnd;
 use driml_figure::{FigureError, Film, Picture};
 use driml_launch::evaluate::Player;
 use driml_learner::insight::{Insight, NetworkOutputs};
-use driml_machine::error::{Usage, usage};
+use driml_machine::{
+    error::{Usage, usage},
+    whole_number,
+};
 use driml_protocol::Horizon;
 
 use super::tile::{Layout, Local, Shot};
@@ -26,13 +29,13 @@ pub(crate) struct RecordArgs {
     #[arg(long, requires = "record")]
     pub(crate) overlay: bool,
     /// Environments to film, side by side
-    #[arg(long, alias = "record-copies", value_name = "N", default_value_t = 1, requires = "record", value_parser = clap::value_parser!(u32).range(1..=8))]
+    #[arg(long, alias = "record-copies", value_name = "N", default_value_t = 1, requires = "record", value_parser = whole_number::within_u32(1..=8))]
     pub(crate) record_envs: u32,
     /// Episodes to film per environment; fewer if fewer are played
-    #[arg(long, value_name = "N", default_value_t = 2, requires = "record", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value_t = 2, requires = "record", value_parser = whole_number::within_u32(1..=1000))]
     pub(crate) record_episodes: u32,
     /// Steps to film at most; a Procgen frame takes 5 to 10 kB
-    #[arg(long, value_name = "N", default_value_t = 600, requires = "record", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    #[arg(long, value_name = "N", default_value_t = 600, requires = "record", value_parser = whole_number::within_u32(1..=10_000))]
     pub(crate) record_steps: u32,
 }
 
