@@ -11,7 +11,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_model::{Compute, DimHeads, Encoder, Parameters};
+use driml_model::{Compute, Encoder, Parameters};
 use driml_protocol::NO_ACTION;
 
 use case::Case;
@@ -247,12 +247,11 @@ fn case_agent(
     settings: UpdateSettings,
     compute: &Compute,
 ) -> Result<Agent, ParityError> {
-    let sizes = case.model(DimHeads::NONE);
-    let model = case.model(settings.dim_heads(sizes.num_actions));
+    let auxiliary = settings.make_auxiliary_loss()?;
+    let model = case.model(auxiliary.heads(settings.condition_on_action));
     let slow = model.without_dim();
     let device = &compute.device;
-    let key_tau = settings.make_auxiliary_loss()?.key_tau();
-    let key_encoder = key_tau.map(|_| {
+    let key_encoder = auxiliary.key_tau().map(|_| {
         let named = case.parameters("key.", &model);
         Parameters::part_from_tensors(&model, Encoder::has_parameter, named, device)
     });
