@@ -13,8 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batch::Batch,
     error::UpdateError,
-    evaluation::{Evaluation, Networks, UpdateReport, detached_logits},
-    noise::UpdateNoise,
+    evaluation::{Evaluation, Networks, UpdateNoise, UpdateReport, detached_logits},
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
