@@ -13,8 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batch::Batch,
     error::UpdateError,
-    evaluation::{Evaluation, Networks, UpdateReport, detached_logits},
-    noise::UpdateNoise,
+    evaluation::{Evaluation, Networks, UpdateNoise, UpdateReport, detached_logits},
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -90,14 +89,16 @@ impl Agent {
             action: model.dim.embeds_action(),
             ..model.dim
         };
-        let needed = settings.dim_heads(model.num_actions);
+        let auxiliary = settings.make_auxiliary_loss()?;
+        // A model of a single action may have its embedding, or leave it out.
+        let has_choice = model.num_actions > 1 || built.action;
+        let needed = auxiliary.heads(settings.condition_on_action && has_choice);
         if needed != built {
             return Err(UpdateError::Settings(format!(
                 "the auxiliary_loss uses {needed:?}, the model builds {built:?}"
             )));
         }
         let kernels = compute.kernels;
-        let auxiliary = settings.make_auxiliary_loss()?;
         let (needed, built) = (auxiliary.layers(&model), &model.loss_layers);
         if needed != *built {
             return Err(UpdateError::Settings(format!(

@@ -6,6 +6,7 @@ use std::ops::Range;
 use candle_core::Tensor;
 use driml_model::{Compute, Encoder, HeadNoise, ModelConfig, Network, Parameters, argmax};
 use driml_protocol::NO_ACTION;
+use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
 use crate::{
     auxiliary::loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
@@ -16,7 +17,6 @@ use crate::{
         c51::{kl_loss, row_kls, softmax},
         projection::project,
     },
-    noise::UpdateNoise,
     optimiser::gradients::Gradients,
     settings::UpdateSettings,
     tensors::{read_finite, states_tensor, to_vec_f32},
@@ -58,6 +58,35 @@ pub struct Evaluation {
     pub target_projection: Vec<f32>,
     /// Gradients of the total, before clipping.
     pub gradients: Gradients,
+}
+
+/// The noise of one update: a separate draw for each use of the head, shared by all rows of the batch. A field is `None` if the head has
+/// no noisy layers, or if they are to use their means.
+///
+/// Source: Fortunato et al. 2018, algorithm 1, with its third noise for the choice of the action by double DQN.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct UpdateNoise {
+    /// Noise of the online network in s_t.
+    pub online: Option<HeadNoise>,
+    /// Noise of the online network when it chooses an action in s_{t+n}, with double DQN.
+    pub double_dqn: Option<HeadNoise>,
+    /// Noise of the target network.
+    pub target: Option<HeadNoise>,
+}
+
+impl UpdateNoise {
+    /// Draws the noise of the update that follows `updates` updates. The same arguments give the same noise.
+    pub fn draw(model: &ModelConfig, seed: [u8; 32], updates: u64) -> Self {
+        // ChaCha is counter-based: its output is a function of seed, stream and position.
+        let mut rng = ChaCha8Rng::from_seed(seed);
+        rng.set_stream(updates);
+        let mut draw = || HeadNoise::draw(model, &mut rng);
+        Self {
+            online: draw(),
+            double_dqn: draw(),
+            target: draw(),
+        }
+    }
 }
 
 /// The networks that a batch passes through, and their settings.

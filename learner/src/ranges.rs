@@ -1,4 +1,4 @@
-//! Checks settings against their ranges, and defines the ranges that several tables share.
+//! Checks settings and saved numbers against their ranges, and defines the ranges that several tables share.
 //! The ranges are narrower than f64's because the computation is in f32.
 
 use std::ops::RangeInclusive;
@@ -18,8 +18,47 @@ pub(crate) fn check_range(
 }
 
 /// The error message for a setting that is outside its range.
-pub(crate) fn range_error(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
+fn range_error(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<String> {
     let (least, most) = (range.start(), range.end());
     let is_inside = range.contains(&value);
     (!is_inside).then(|| format!("{name} = {value:?} is not from {least:?} to {most:?}"))
+}
+
+/// Checks that each setting of an affinity is in its range.
+pub(crate) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(), UpdateError> {
+    let mut all = all.iter();
+    let why = all.find_map(|(name, value, range)| range_error(name, *value, range));
+    why.map_or(Ok(()), |why| Err(UpdateError::Affinity(why)))
+}
+
+/// Checks the length of an affinity's array, and that its numbers are finite. Errors contain `name`.
+pub(crate) fn check_array(name: &str, array: &[f64], len: usize) -> Result<(), UpdateError> {
+    if array.len() != len {
+        let found = array.len();
+        return Err(UpdateError::Affinity(format!(
+            "{name} has {found} numbers, not {len}"
+        )));
+    }
+    match array.iter().position(|value| !value.is_finite()) {
+        Some(at) => Err(UpdateError::Affinity(format!(
+            "{name} is not finite at index {at}"
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Like [`check_array`], and checks that every number is a probability.
+pub(crate) fn check_probabilities(
+    name: &str,
+    array: &[f64],
+    len: usize,
+) -> Result<(), UpdateError> {
+    check_array(name, array, len)?;
+    let probability = |value: &f64| (0.0..=1.0 + 1e-6).contains(value);
+    match array.iter().position(|value| !probability(value)) {
+        Some(at) => Err(UpdateError::Affinity(format!(
+            "{name} is not a probability at index {at}"
+        ))),
+        None => Ok(()),
+    }
 }

@@ -59,9 +59,8 @@ fn a_broken_file_is_a_clear_error() {
     let error_of = |bytes: &[u8]| {
         let file = folder.path().join("broken.safetensors");
         fs::write(&file, bytes).unwrap();
-        let error = check_file(&file, &Compute::CPU)
-            .expect_err("broken")
-            .to_string();
+        let error = check_file(&file, &Compute::CPU).expect_err("broken");
+        let error = format!("{error:#}");
         assert!(error.contains("broken.safetensors"), "{error}");
         error
     };

@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling, noisy*, weighted_rows.
+"""Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling, noisy*,
+one_action, weighted_rows.
 
 Needs PyTorch and safetensors; nothing in the project needs either. Everything is float64 and automatic differentiation, and
 written from the formulas in deploy/docs/src/reference/parity.md, not from the learner's code.
@@ -369,6 +370,11 @@ CASES = {
     "noisy_dueling": dict(
         seed=20, rows=8, height=36, width=44, objective="none", lambdas=[0.0, 0.0, 0.0, 0.0], double_dqn=True,
         head={"dueling": True, "noisy_sigma": 0.5},
+    ),
+    # A single action has an embedding too.
+    "one_action": dict(
+        seed=21, rows=3, height=36, width=36, objective="dim", lambdas=[1.0, 0.5, 0.5, 1.0], action=True,
+        double_dqn=True, actions=1,
     ),
     "weighted_rows": dict(
         seed=16, rows=8, height=36, width=44, objective="dim", lambdas=[0.0, 0.0, 0.0, 1.0], action=True, beta=0.4,

@@ -148,7 +148,11 @@ fn what_cannot_be_resumed() {
     system.run_ok("local --lockstep --config step/config.toml --run-dir new");
     assert!(since("step") && !since("new"));
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system.rejects("local --resume run --frames 2000", "there is no checkpoint");
+    let resume = "local --resume run --frames 3000";
+    system.rejects(resume, "there is no checkpoint");
+    let others = system.path("rainbow/checkpoints");
+    fs::rename(others, system.path("run/checkpoints")).unwrap();
+    system.rejects(resume, "belongs to a run with specification");
 }
 
 /// The launcher was killed after the last update: only the end of the run is missing, and the shards no longer hold anything.

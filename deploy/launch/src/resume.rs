@@ -180,8 +180,8 @@ pub struct ResumedRun {
     pub lockstep: bool,
 }
 
-/// Checks that the run in `folder` can change its settings from `before` to `config`. The check comes before `config` is written into
-/// the folder, as a run with settings that cannot work could not be resumed afterwards.
+/// Checks that the run in `folder` can change its settings from `before` to `config`, which its newest checkpoint must fit. The check
+/// comes before `config` is written into the folder, as a run with settings that cannot work could not be resumed afterwards.
 fn check_changes(
     folder: &RunFolder,
     before: &RunConfig,
@@ -192,14 +192,14 @@ fn check_changes(
         let why = usage!("world.{key} cannot change in a run: resume without this --set");
         bail!(why);
     }
-    let network_settings = |it: &RunConfig| (it.run.clone(), it.model.clone(), it.learner.clone());
-    if network_settings(before) != network_settings(config) {
-        let settings = LearnerConfig::from_toml(&config.to_toml())?;
-        let compute = DeviceName::Cpu.open(config.learner.precision)?;
-        let learner = Learner::new(settings, &compute)?;
-        let resumed = learner.resume(&folder.checkpoints());
-        resumed.map_err(|e| usage!("{e}"))?;
-    }
+    let compute = DeviceName::Cpu.open(config.learner.precision)?;
+    let learner = LearnerConfig::from_toml(&config.to_toml())
+        .and_then(|settings| Learner::new(settings, &compute))
+        .map_err(|e| usage!("{e}"))?;
+    match learner.resume(&folder.checkpoints()) {
+        Err(e @ (CheckpointError::Damaged { .. } | CheckpointError::Io { .. })) => bail!(e),
+        resumed => resumed.map_err(|e| usage!("{e}"))?,
+    };
     let (actors_before, actors) = (before.local.actors, config.local.actors);
     if lockstep && actors_before != actors {
         bail!(usage!(

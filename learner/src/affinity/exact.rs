@@ -5,11 +5,11 @@ use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
-use super::{
-    alphabet::Alphabet,
-    arrays::{check_array, check_probabilities, check_ranges},
+use super::alphabet::Alphabet;
+use crate::{
+    error::UpdateError,
+    ranges::{check_array, check_probabilities, check_ranges},
 };
-use crate::error::UpdateError;
 
 /// Decay and smoothing of the pair counts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

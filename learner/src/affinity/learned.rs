@@ -5,11 +5,11 @@ use rand::{Rng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    alphabet::Alphabet,
-    arrays::{check_array, check_probabilities, check_ranges},
+use super::alphabet::Alphabet;
+use crate::{
+    error::UpdateError,
+    ranges::{check_array, check_probabilities, check_ranges},
 };
-use crate::error::UpdateError;
 
 /// Sizes, optimiser and smoothing of the learned estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

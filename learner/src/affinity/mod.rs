@@ -2,7 +2,6 @@
 //! It does not draw k (the replay server does) and does not send A.
 
 pub mod alphabet;
-mod arrays;
 pub mod exact;
 pub mod learned;
 

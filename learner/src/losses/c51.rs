@@ -1,10 +1,11 @@
 //! The C51 loss: KL divergence of the prediction for the taken action from a projected target.
 //! It does not compute the target (`projection` does), and the target gets no gradient.
 
-use candle_core::{Result, Tensor, bail};
+use candle_core::{D, Result, Tensor, bail};
+use candle_nn::ops::log_softmax;
 use driml_model::Kernels;
 
-use super::{candle, scalar_op::scalar_op};
+use super::scalar_op::scalar_op;
 
 /// Largest relative error of a probability or of a derivative of the loss: half a unit in the last place of an f32. Below 1.2e-38,
 /// the least normal number, the error is relative to 1.2e-38.
@@ -140,11 +141,26 @@ pub fn kl_loss(
         bail!("logits of {rows} rows meet {} weights", weights.len());
     }
     if kernels == Kernels::Candle {
-        return candle::kl_loss(logits, target, weights);
+        return kl_by_candle(logits, target, weights);
     }
     scalar_op("c51-kl", logits, move |logits, gradient| {
         kl(logits, &target, weights.as_deref(), atoms, gradient)
     })
+}
+
+/// [`kl_loss`] by candle's own operations, for devices that this project has no kernels for.
+fn kl_by_candle(logits: &Tensor, target: Vec<f32>, weights: Option<Vec<f32>>) -> Result<Tensor> {
+    let (rows, atoms) = logits.dims2()?;
+    let device = logits.device();
+    let ln = |&p: &f32| if p > 0.0 { p.ln() } else { 0.0 };
+    let ln_target = Tensor::from_vec(target.iter().map(ln).collect(), (rows, atoms), device)?;
+    let target = Tensor::from_vec(target, (rows, atoms), device)?;
+    let log_ratio = (ln_target - log_softmax(logits, D::Minus1)?)?;
+    let mut entries = (target * log_ratio)?;
+    if let Some(weights) = weights {
+        entries = entries.broadcast_mul(&Tensor::from_vec(weights, (rows, 1), device)?)?;
+    }
+    entries.sum_all()?.affine(1.0 / rows as f64, 0.0)
 }
 
 #[cfg(test)]

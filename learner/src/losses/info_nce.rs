@@ -1,12 +1,12 @@
 //! The InfoNCE loss over a matrix of dot products, which it scales and softly clips to scores.
 //! It does not compute the dot products, and does not know which features they compare.
 
-use candle_core::{Result, Tensor, bail};
+use candle_core::{D, DType, Result, Tensor, bail};
+use candle_nn::ops::log_softmax;
 use driml_model::{Kernels, exp_minus_max, soft_clip};
 use rayon::prelude::*;
 
 use super::{
-    candle,
     scalar_op::scalar_op,
     scores::{DotProducts, ScoreClip},
 };
@@ -138,12 +138,41 @@ pub fn info_nce_loss(
         );
     }
     if kernels == Kernels::Candle {
-        return candle::info_nce_loss(dots, valid, clip);
+        return info_nce_by_candle(dots, valid, clip);
     }
     let valid = valid.to_vec();
     scalar_op("info-nce", dots, move |dots, gradient| {
         info_nce(dots, &valid, clip, gradient)
     })
+}
+
+/// [`info_nce_loss`] by candle's own operations, for devices that this project has no kernels for. Scores beyond about 8 times the clip
+/// have derivative 0, which is `1 - tanh^2` in f32.
+fn info_nce_by_candle(dots: &Tensor, valid: &[u8], clip: ScoreClip) -> Result<Tensor> {
+    let device = dots.device();
+    let rows = (0..).zip(valid);
+    let rows = rows.filter_map(|(row, &valid)| (valid != 0).then_some(row));
+    let rows: Vec<u32> = rows.collect();
+    let count = rows.len();
+    let locations = dots.dim(0)?;
+    if count == 0 || locations == 0 {
+        return Tensor::zeros((), DType::F32, device);
+    }
+    let dots = if count == valid.len() {
+        dots.clone()
+    } else {
+        let rows = Tensor::from_vec(rows, count, device)?;
+        let anchors = dots.contiguous()?.index_select(&rows, 1)?;
+        anchors.index_select(&rows, 2)?
+    };
+    let bound = clip.tanh_clip;
+    let scores = dots.affine(clip.scale / bound, 0.0)?.tanh()?;
+    let log_p = log_softmax(&scores.affine(bound, 0.0)?, D::Minus1)?;
+    let positive = Tensor::eye(count, DType::F32, device)?;
+    log_p
+        .broadcast_mul(&positive)?
+        .sum_all()?
+        .affine(-1.0 / (locations * count) as f64, 0.0)
 }
 
 #[cfg(test)]

@@ -2,7 +2,6 @@
 //! They know neither networks nor batches, nor which of them a run uses.
 
 pub mod c51;
-mod candle;
 pub mod info_nce;
 pub mod projection;
 mod scalar_op;

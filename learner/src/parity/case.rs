@@ -4,10 +4,9 @@
 use std::{
     cell::RefCell,
     collections::{BTreeMap, BTreeSet, HashMap},
-    fmt, io,
-    path::PathBuf,
 };
 
+use anyhow::{Context, Result, bail, ensure};
 use candle_core::{DType, Device, Tensor, WithDType};
 use driml_model::{ConvLayer, DimHeads, HeadConfig, HeadNoise, ModelConfig, TorsoName};
 use driml_protocol::NO_ACTION;
@@ -17,40 +16,11 @@ use serde::Deserialize;
 use crate::{
     auxiliary::{AuxiliaryKind, dim::DIM, positives::Positives, settings::Lambda},
     batch::{Batch, OwnedBatch},
-    error::UpdateError,
-    noise::UpdateNoise,
+    evaluation::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::UpdateSettings,
     tensors::to_vec_f64,
 };
-
-/// Why a case could not be checked.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "each message says it")]
-pub enum ParityError {
-    #[error("cannot read {file}: {source}")]
-    Read { file: PathBuf, source: io::Error },
-    #[error("{file}: {why}")]
-    InFile {
-        file: PathBuf,
-        why: Box<ParityError>,
-    },
-    /// The file is not a complete case, or has contents that this check does not know.
-    #[error("{0}")]
-    Case(String),
-    #[error(transparent)]
-    Update(#[from] UpdateError),
-    #[error(transparent)]
-    Model(#[from] driml_model::ModelError),
-    #[error(transparent)]
-    Candle(#[from] candle_core::Error),
-}
-
-impl ParityError {
-    fn tensor(name: &str, why: impl fmt::Display) -> Self {
-        Self::Case(format!("tensor {name}: {why}"))
-    }
-}
 
 /// The metadata key `config` of a case: sizes and settings of the update that the reference computed.
 #[derive(Debug, Deserialize)]
@@ -111,16 +81,14 @@ pub(super) struct Case {
 }
 
 impl Case {
-    pub(super) fn parse(bytes: &[u8]) -> Result<Self, ParityError> {
-        let cut = |why: String| ParityError::Case(format!("not a whole safetensors file: {why}"));
-        let invalid = |why: &str| ParityError::Case(format!("metadata key `config`: {why}"));
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| cut(e.to_string()))?;
+    pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
+        let cut = "not a whole safetensors file";
+        let (_, header) = SafeTensors::read_metadata(bytes).context(cut)?;
         let metadata = header.metadata().as_ref();
         let text = metadata.and_then(|metadata| metadata.get("config"));
-        let config: Config = serde_json::from_str(text.ok_or_else(|| invalid("it is missing"))?)
-            .map_err(|why| invalid(&why.to_string()))?;
-        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu);
-        let tensors = tensors.map_err(|e| cut(e.to_string()))?;
+        let text = text.context("the metadata key `config` is missing")?;
+        let config: Config = serde_json::from_str(text).context("metadata key `config`")?;
+        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu).context(cut)?;
         let tensors = Tensors(tensors.into_iter().collect());
         let settings = config.settings();
         let expectations = tensors.0.keys().filter(|name| name.starts_with("expect."));
@@ -157,12 +125,12 @@ impl Case {
     }
 
     /// The noise of the noisy layers, made from the normal numbers in the case.
-    pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise, ParityError> {
+    pub(super) fn noise(&self, model: &ModelConfig) -> Result<UpdateNoise> {
         let head_noise = |network: &str| {
             HeadNoise::from_normals(model, |layer, side, len| {
                 let name = format!("noise.{network}.{layer}.{side}");
                 let normals = self.tensors.read::<f32>(&name, DType::F32, &[len])?;
-                Ok::<_, ParityError>(normals.into_iter().map(f64::from).collect())
+                Ok::<_, anyhow::Error>(normals.into_iter().map(f64::from).collect())
             })
         };
         Ok(UpdateNoise {
@@ -197,24 +165,22 @@ impl Case {
     }
 
     /// The values of `expect.<name>`, as f64. Marks the expectation as used.
-    pub(super) fn expected(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>, ParityError> {
+    pub(super) fn expected(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
         let name = format!("expect.{name}");
         let tensor = self.tensors.get(&name)?;
-        if tensor.dims() != shape {
-            let why = format!("its shape is {:?}, not {shape:?}", tensor.dims());
-            return Err(ParityError::tensor(&name, why));
-        }
+        let found = tensor.dims();
+        ensure!(
+            found == shape,
+            "tensor {name}: its shape is {found:?}, not {shape:?}"
+        );
         self.unused.borrow_mut().remove(&name);
         Ok(to_vec_f64(tensor)?)
     }
 
     /// Checks that every expectation was used: one that nothing was compared with must not pass as met.
-    pub(super) fn check_all_expectations_used(&self) -> Result<(), ParityError> {
+    pub(super) fn check_all_expectations_used(&self) -> Result<()> {
         match self.unused.borrow().first() {
-            Some(name) => Err(ParityError::tensor(
-                name,
-                "this expectation is not known here",
-            )),
+            Some(name) => bail!("tensor {name}: this expectation is not known here"),
             None => Ok(()),
         }
     }
@@ -256,7 +222,7 @@ fn read_inputs(
     tensors: &Tensors,
     obs: &Observation,
     settings: &UpdateSettings,
-) -> Result<OwnedBatch, ParityError> {
+) -> Result<OwnedBatch> {
     let rows = tensors.get("input.action")?.elem_count();
     let state = [rows, obs.height, obs.width, obs.channels];
     let bytes = |name: &str, shape: &[usize]| tensors.read::<u8>(name, DType::U8, shape);
@@ -284,9 +250,8 @@ fn read_inputs(
         anchors,
         states_k,
         states_n: bytes("input.frames_n", &state)?,
-        action: action.ok_or_else(|| {
-            let why = format!("its actions {actions:?} are not all in 0..255");
-            ParityError::tensor("input.action", why)
+        action: action.with_context(|| {
+            format!("tensor input.action: its actions {actions:?} are not all in 0..255")
         })?,
         next_action: vec![NO_ACTION; rows],
         n_step_return: floats("input.n_step_return")?,
@@ -299,24 +264,19 @@ fn read_inputs(
 struct Tensors(BTreeMap<String, Tensor>);
 
 impl Tensors {
-    fn get(&self, name: &str) -> Result<&Tensor, ParityError> {
-        let missing = || ParityError::tensor(name, "it is missing");
-        self.0.get(name).ok_or_else(missing)
+    fn get(&self, name: &str) -> Result<&Tensor> {
+        let missing = || format!("tensor {name}: it is missing");
+        self.0.get(name).with_context(missing)
     }
 
     /// The values of a tensor of this type and shape.
-    fn read<T: WithDType>(
-        &self,
-        name: &str,
-        dtype: DType,
-        shape: &[usize],
-    ) -> Result<Vec<T>, ParityError> {
+    fn read<T: WithDType>(&self, name: &str, dtype: DType, shape: &[usize]) -> Result<Vec<T>> {
         let tensor = self.get(name)?;
         let (found, dims) = (tensor.dtype(), tensor.dims());
-        if found != dtype || dims != shape {
-            let why = format!("it is {found:?} {dims:?}, not {dtype:?} {shape:?}");
-            return Err(ParityError::tensor(name, why));
-        }
+        ensure!(
+            found == dtype && dims == shape,
+            "tensor {name}: it is {found:?} {dims:?}, not {dtype:?} {shape:?}"
+        );
         Ok(tensor.flatten_all()?.to_vec1()?)
     }
 }

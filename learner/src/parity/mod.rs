@@ -11,11 +11,11 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_model::{Compute, DimHeads, Encoder, Parameters};
+use anyhow::{Context, Result};
+use driml_model::{Compute, Encoder, Parameters};
 use driml_protocol::NO_ACTION;
 
 use case::Case;
-pub use case::ParityError;
 use tolerance::Tolerances;
 
 use crate::{
@@ -81,26 +81,15 @@ impl fmt::Display for ParityReport {
 ///
 /// # Errors
 /// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are lines of the report.
-pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityReport, ParityError> {
-    let path = path.as_ref();
-    let bytes = std::fs::read(path).map_err(|source| ParityError::Read {
-        file: path.to_owned(),
-        source,
-    })?;
-    let in_file = |why: ParityError| ParityError::InFile {
-        file: path.to_owned(),
-        why: Box::new(why),
-    };
-    let lines = Case::parse(&bytes)
-        .and_then(|case| check(&case, compute))
-        .map_err(in_file)?;
-    Ok(ParityReport {
-        file: path.to_owned(),
-        lines,
-    })
+pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityReport> {
+    let file = path.as_ref().to_owned();
+    let bytes = std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
+    let lines = Case::parse(&bytes).and_then(|case| check(&case, compute));
+    let lines = lines.with_context(|| file.display().to_string())?;
+    Ok(ParityReport { file, lines })
 }
 
-fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
+fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>> {
     let mut agent = case_agent(case, case.settings.clone(), compute)?;
     let forward = forward_losses(case, compute)?;
     let evaluation = agent.evaluate_with(&case.batch(), &case.noise(agent.model())?)?;
@@ -132,7 +121,7 @@ impl CaseCheck<'_> {
     }
 
     /// Compares values of s_t, greedy actions in s_{t+n} and projected targets.
-    fn targets(&mut self, agent: &Agent, evaluation: &Evaluation) -> Result<(), ParityError> {
+    fn targets(&mut self, agent: &Agent, evaluation: &Evaluation) -> Result<()> {
         let (case, allowed, model) = (self.case, self.allowed, agent.model());
         let batch = case.batch();
         let expected = case.expected("q_values_t", &[batch.rows, model.num_actions])?;
@@ -163,7 +152,7 @@ impl CaseCheck<'_> {
         Ok(())
     }
 
-    fn losses(&mut self, found: &Evaluation, forward: &[ForwardLoss]) -> Result<(), ParityError> {
+    fn losses(&mut self, found: &Evaluation, forward: &[ForwardLoss]) -> Result<()> {
         if !found.row_kls.is_empty() {
             let expected = self.case.expected("row_kl", &[found.row_kls.len()])?;
             let error = largest_error(&to_f64(&found.row_kls), &expected);
@@ -184,14 +173,14 @@ impl CaseCheck<'_> {
         self.loss("loss.total", found.total, total_saturates)
     }
 
-    fn loss(&mut self, name: &str, got: f32, is_saturated: bool) -> Result<(), ParityError> {
+    fn loss(&mut self, name: &str, got: f32, is_saturated: bool) -> Result<()> {
         let expected = self.case.expected(name, &[1])?[0];
         let tolerance = self.allowed.loss_tolerance(expected, is_saturated);
         self.add(name, (f64::from(got) - expected).abs(), tolerance);
         Ok(())
     }
 
-    fn gradients(&mut self, evaluation: &Evaluation) -> Result<(), ParityError> {
+    fn gradients(&mut self, evaluation: &Evaluation) -> Result<()> {
         let (case, allowed) = (self.case, self.allowed);
         let global_norm = case.expected("grad_norm", &[1])?[0];
         let (mut worst, mut angles) = (WorstByGroup::default(), WorstByGroup::default());
@@ -219,7 +208,7 @@ impl CaseCheck<'_> {
         Ok(())
     }
 
-    fn updated(&mut self, agent: &Agent) -> Result<(), ParityError> {
+    fn updated(&mut self, agent: &Agent) -> Result<()> {
         let (case, allowed) = (self.case, self.allowed);
         let tolerance = allowed.updated + allowed.updated_rates * case.settings.adam.lr;
         let (mut online, mut keys) = (WorstByGroup::default(), WorstByGroup::default());
@@ -242,17 +231,12 @@ impl CaseCheck<'_> {
 }
 
 /// An agent with the parameters of a case before its update.
-fn case_agent(
-    case: &Case,
-    settings: UpdateSettings,
-    compute: &Compute,
-) -> Result<Agent, ParityError> {
-    let sizes = case.model(DimHeads::NONE);
-    let model = case.model(settings.dim_heads(sizes.num_actions));
+fn case_agent(case: &Case, settings: UpdateSettings, compute: &Compute) -> Result<Agent> {
+    let auxiliary = settings.make_auxiliary_loss()?;
+    let model = case.model(auxiliary.heads(settings.condition_on_action));
     let slow = model.without_dim();
     let device = &compute.device;
-    let key_tau = settings.make_auxiliary_loss()?.key_tau();
-    let key_encoder = key_tau.map(|_| {
+    let key_encoder = auxiliary.key_tau().map(|_| {
         let named = case.parameters("key.", &model);
         Parameters::part_from_tensors(&model, Encoder::has_parameter, named, device)
     });
@@ -261,9 +245,8 @@ fn case_agent(
         target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
         key_encoder: key_encoder.transpose()?,
     };
-    Ok(Agent::from_parameters(
-        model, settings, compute, parameters,
-    )?)
+    let agent = Agent::from_parameters(model, settings, compute, parameters);
+    Ok(agent?)
 }
 
 /// The value of an auxiliary loss, from a forward pass alone.
@@ -275,7 +258,7 @@ struct ForwardLoss {
 }
 
 /// Computes the auxiliary losses of all pairs that the case contains, by a forward pass alone and whatever lambda is.
-fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>, ParityError> {
+fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>> {
     let settings = &case.settings;
     let mut all_pairs = UpdateSettings {
         lambda: Lambda::ONES,
@@ -294,7 +277,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>, Pa
     let networks = case_agent(case, all_pairs, compute)?.networks;
     let batch = case.batch();
     let losses = networks.auxiliary_losses(&batch, &networks.online_features(&batch)?)?;
-    let is_saturated = |it: &DotProducts| -> Result<bool, ParityError> {
+    let is_saturated = |it: &DotProducts| -> Result<bool> {
         let clip = ScoreClip::new(it.width, settings.tanh_clip);
         let mut dots = to_vec_f64(&it.values)?.into_iter();
         Ok(dots.any(|dot| dot.abs() * clip.scale > clip.tanh_clip))

@@ -134,26 +134,25 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     by_location(psi)?.broadcast_matmul(&phi)
 }
 
-/// Images [B, H, W, in] to [B, h, w, out], without ReLU.
+/// Images [B, H, W, in] to [B, h, w, out], without ReLU. Zeros complete the kernel to whole strides, and images to the patches' size.
 fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Result<Tensor> {
     let (batch, height, width, _) = images.dims4()?;
     let (outputs, _, kernel, _) = weight.dims4()?;
-    if !kernel.is_multiple_of(stride) {
-        // candle's backward pass computes the covered width from the height, so uncovered pixels are cut off first.
-        let covered = |side: usize| (side - kernel) / stride * stride + kernel;
-        let maps = images
-            .narrow(1, 0, covered(height))?
-            .narrow(2, 0, covered(width))?
-            .permute((0, 3, 1, 2))?
-            .contiguous()?
-            .conv2d(weight, 0, stride, 1, 1)?
-            .permute((0, 2, 3, 1))?;
-        return maps.broadcast_add(bias);
-    }
-    let out = |side: usize| (side - kernel) / stride + 1;
+    let (blocks, out) = (kernel.div_ceil(stride), |side| (side - kernel) / stride + 1);
     let (rows, cols) = (out(height), out(width));
-    let patches = patches(images, (rows, cols), kernel / stride, stride)?;
-    linear(&patches, &patch_weight(weight, stride)?, bias)?.reshape((batch, rows, cols, outputs))
+    let pad = |tensor: &Tensor, dims: [usize; 2], zeros: [usize; 2]| {
+        let padded = tensor.pad_with_zeros(dims[0], 0, zeros[0])?;
+        padded.pad_with_zeros(dims[1], 0, zeros[1])
+    };
+    let weight = pad(weight, [2, 3], [blocks * stride - kernel; 2])?;
+    let missing = |out: usize, side| ((out + blocks - 1) * stride).saturating_sub(side);
+    let images = pad(
+        images,
+        [1, 2],
+        [missing(rows, height), missing(cols, width)],
+    )?;
+    let patches = patches(&images, (rows, cols), blocks, stride)?;
+    linear(&patches, &patch_weight(&weight, stride)?, bias)?.reshape((batch, rows, cols, outputs))
 }
 
 /// Returns the patches [B * h * w, k * k * c] under each output of a convolution whose kernel is `blocks` strides wide.

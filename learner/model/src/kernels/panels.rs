@@ -421,7 +421,3 @@ fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], thread
             .for_each(|(values, data)| pack(values, data)),
     }
 }
-
-#[cfg(test)]
-#[path = "panels_tests.rs"]
-mod tests;

@@ -1,5 +1,5 @@
 //! Tests of `stack` and `stages`: convolutions of a task on every instruction set against candle's operations and derivatives in f64.
-//! Single layers are tested against candle in `tests/model`.
+//! `driml experiment stability` compares single layers with candle's.
 #![cfg(test)]
 
 use candle_core::{DType, Device, Result, Tensor, Var};
@@ -17,7 +17,7 @@ use crate::kernels::tasks::{parameters_len, split_parameters, unpack_weights};
 const COUNT: usize = 3;
 
 /// The 2-norm of the difference, relative to the 2-norm of `wanted`.
-pub(crate) fn relative_error<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
+fn relative_error<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
     assert_eq!(found.len(), wanted.len());
     let (mut error, mut size) = (0f64, 0f64);
     for (&found, &wanted) in found.iter().zip(wanted) {

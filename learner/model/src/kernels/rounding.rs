@@ -88,24 +88,3 @@ vectorized! {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::kernels::isa::{AnySimd, with_simd};
-    use crate::kernels::precision::Precision;
-
-    #[test]
-    fn every_instruction_set_turns_images_of_any_size() {
-        for [rows, cols] in [[1, 1], [16, 64], [17, 15], [3, 70], [33, 32], [5, 0]] {
-            let values: Vec<f32> = (0..rows * cols).map(|at| at as f32).collect();
-            for simd in Precision::ALL.into_iter().flat_map(AnySimd::all_available) {
-                let mut transposed = vec![f32::NAN; values.len()];
-                with_simd!(simd, simd => transpose(simd, &values, rows, cols, &mut transposed));
-                for (at, &value) in transposed.iter().enumerate() {
-                    assert_eq!(value, values[at % rows * cols + at / rows]);
-                }
-            }
-        }
-    }
-}

@@ -2,9 +2,8 @@
 //! They know nothing of losses, whose gradients the learner's tests check.
 #![allow(clippy::unwrap_used, missing_docs)]
 
-mod conv;
 mod head;
-mod linear;
+mod layers;
 mod network;
 mod policy;
 mod support;

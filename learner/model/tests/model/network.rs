@@ -8,8 +8,8 @@ use driml_model::{
 };
 
 use crate::support::{
-    assert_close, assert_layer, bits, configs, floats, frames, parameters, pool, residual, rng,
-    small, variable, with_biases,
+    assert_close, bits, configs, floats, frames, parameters, pool, residual, rng, small, variable,
+    with_biases,
 };
 
 /// Returns every output of the network for a batch, one after the other, and the gradients of their weighted sum.
@@ -23,10 +23,13 @@ fn outputs_and_gradients(
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
     let noise = HeadNoise::draw(config, &mut rng(3));
     let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
+    // Action 0 is taken by two rows that are not neighbours, and two of the five actions by none.
+    let taken = network.taken_logits(&features.f4, &[0, 4, 2, 2, 4, 0], noise.as_ref());
     let f3 = features.require_f3().unwrap();
     let outputs = vec![
         network.q_values(&logits).unwrap(),
         logits,
+        taken.unwrap(),
         network.psi3(f3, &actions).unwrap(),
         network.phi3(f3).unwrap(),
         network.psi4(&features.f4, &actions).unwrap(),
@@ -242,14 +245,18 @@ fn dot_products_and_their_gradients_are_candle_s() -> Result<()> {
         (&global, &local),
         (&global, &global),
     ] {
-        assert_layer(
-            &format!("dots of {psi:?} and {phi:?}"),
-            &[variable(psi, rng), variable(phi, rng)],
-            Precision::F32,
-            rng,
-            |args| Kernels::FUSED.dot_products(&args[0], &args[1]),
-            |args| Kernels::Candle.dot_products(&args[0], &args[1]),
-        )?;
+        let args = [variable(psi, rng), variable(phi, rng)];
+        let dots = |kernels: Kernels| kernels.dot_products(&args[0], &args[1]);
+        let [ours, theirs] = [dots(Kernels::FUSED)?, dots(Kernels::Candle)?];
+        let what = format!("dots of {psi:?} and {phi:?}");
+        assert_close(&what, &ours, &theirs, 1e-6);
+        let slope = floats(ours.dims(), rng);
+        let gradients = |dots: &Tensor| (dots * &slope)?.sum_all()?.backward();
+        let [ours, theirs] = [gradients(&ours)?, gradients(&theirs)?];
+        for arg in &args {
+            let [ours, theirs] = [&ours, &theirs].map(|it| it.get(arg).unwrap());
+            assert_close(&what, ours, theirs, 3e-6);
+        }
     }
     let (psi, phi) = (variable(&[5, 3, 7], rng), variable(&[5, 2, 7], rng));
     assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());

@@ -63,33 +63,6 @@ pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, toleranc
     );
 }
 
-/// Asserts that a layer of `args`, and the gradients of its weighted sum, match those of `reference` on the same `args` in f64.
-///
-/// The slopes are rounded to `precision`: where operands are rounded already, results are as exact in bf16 as in f32.
-pub(crate) fn assert_layer(
-    what: &str,
-    args: &[Var],
-    precision: Precision,
-    rng: &mut ChaCha8Rng,
-    layer: impl Fn(&[Var]) -> Result<Tensor>,
-    reference: impl Fn(&[Var]) -> Result<Tensor>,
-) -> Result<()> {
-    let y = layer(args)?;
-    let slope = rounded(&floats(y.dims(), rng), precision).as_detached_tensor();
-    let gradients = (&y * &slope)?.sum_all()?.backward()?;
-    let exact = args.iter().map(|arg| Var::from_tensor(&double(arg)?));
-    let exact = exact.collect::<Result<Vec<_>>>()?;
-    let wanted = reference(&exact)?;
-    let wanted_gradients = (&wanted * double(&slope)?)?.sum_all()?.backward()?;
-    assert_close(what, &y, &wanted, 1e-6);
-    for (index, (arg, exact)) in args.iter().zip(&exact).enumerate() {
-        let what = format!("{what}, gradient of argument {index}");
-        let wanted = wanted_gradients.get(exact).unwrap();
-        assert_close(&what, gradients.get(arg).unwrap(), wanted, 3e-6);
-    }
-    Ok(())
-}
-
 /// A small network with all heads, whose widths do not fill registers.
 pub(crate) fn small() -> ModelConfig {
     ModelConfig {
@@ -177,18 +150,6 @@ pub(crate) fn q_values(
     let mut values = vec![0.0; frames.len() / config.frame_len() * 5];
     policy.q_values(frames, &mut values).unwrap();
     values
-}
-
-/// Returns a variable with the values of `tensor` rounded to `precision`.
-pub(crate) fn rounded(tensor: &Tensor, precision: Precision) -> Var {
-    let rounded = match precision {
-        Precision::F32 => tensor.clone(),
-        Precision::Bf16 => {
-            let halves = tensor.to_dtype(DType::BF16).unwrap();
-            halves.to_dtype(DType::F32).unwrap()
-        }
-    };
-    Var::from_tensor(&rounded.detach()).unwrap()
 }
 
 /// Initial parameters with random biases, which would otherwise be 0 and not matter.

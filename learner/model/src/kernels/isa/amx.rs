@@ -11,8 +11,10 @@ use std::{
 
 use half::bf16;
 
-use super::amx_permission::{has_amx_bf16, request_permission};
-use super::amx_tiles::{ACCUMULATORS, HardwareTiles, TILE_ROWS, TILE_STEPS, TileRegisters};
+use super::amx_tiles::{
+    ACCUMULATORS, HardwareTiles, TILE_ROWS, TILE_STEPS, TileRegisters, has_amx_bf16,
+    request_permission,
+};
 use super::avx512::{Bf16, bf16_rounding};
 use super::avx512_rounding;
 use super::element::Rounding;

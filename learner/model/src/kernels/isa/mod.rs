@@ -2,7 +2,6 @@
 //! It knows neither matrices nor layers: an instruction set computes one tile, a few rows by a few columns, in registers.
 
 mod amx;
-mod amx_permission;
 mod amx_tiles;
 mod avx2;
 mod avx512;
