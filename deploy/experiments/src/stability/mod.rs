@@ -58,7 +58,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     });
     session.write_csv("promises", COLUMNS, promises)?;
     session.save_figure("worst", &figure::figure(&rows, &case_count(&rows)))?;
-    let page = session.folder().join("README.md");
+    let page = session.folder.join("README.md");
     session.write_page(include_str!("page.md.j2"), page_values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
     ensure!(is_kept, "{} See {}", verdict(&rows), page.display());

@@ -69,7 +69,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     if has_enough_seeds(&settings, &scored) {
         let play = settings.play_settings(Levels::TrainSingle);
         for it in &mut scored {
-            session.progress().add_work(play.units);
+            session.progress.add_work(play.units);
             let key = format!("{}-single", it.plan.name);
             let returns = play.play_greedy(&mut session, &key, &it.run)?;
             let score = returns.and_then(|it| mean(&it));
