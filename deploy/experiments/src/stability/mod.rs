@@ -28,8 +28,7 @@ const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,i
 
 /// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
-    settings.seeds = args.seeds.unwrap_or(settings.seeds);
+    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
     let table = checks::table(&settings);
     let units = table.len() as u64 * u64::from(settings.seeds);
     let mut session = Session::open(NAME, args, &settings, units, false)?;
@@ -117,6 +116,7 @@ fn page_values(rows: &[Row], settings: &Settings) -> Value {
 #[cfg(test)]
 mod tests {
     use super::{property::Tally, *};
+    use crate::flags::tests::length;
 
     /// Creates a row with these results.
     pub(super) fn row(cases: u64, worst: f64, input: &str) -> Row {
@@ -138,7 +138,7 @@ mod tests {
     fn the_page_and_the_verdict_name_what_is_broken() {
         let reported = |worst: f64, input: &str| {
             let rows = [row(1, worst, input)];
-            let values = page_values(&rows, &flags::read_settings(NAME, SETTINGS, true));
+            let values = page_values(&rows, &flags::read_settings(NAME, SETTINGS, &length(true)));
             let page = crate::page::render_page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)
         };
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn both_lengths_read() {
         for smoke in [false, true] {
-            let settings: Settings = flags::read_settings(NAME, SETTINGS, smoke);
+            let settings: Settings = flags::read_settings(NAME, SETTINGS, &length(smoke));
             assert!(settings.seeds > 0 && settings.draws > 0);
         }
     }

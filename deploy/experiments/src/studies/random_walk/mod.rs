@@ -25,8 +25,7 @@ const NAME: &str = "random-walk";
 const SETTINGS: &str = include_str!("config.toml");
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
-    settings.seeds = args.seeds.unwrap_or(settings.seeds);
+    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
     let pieces = settings.alphas.len() * Sampling::ALL.len() * settings.seeds as usize;
     let units = pieces as u64 * settings.updates;
     let mut session = Session::open(NAME, args, &settings, units, false)?;
@@ -160,11 +159,12 @@ fn page_values(results: &Results) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flags::tests::length;
 
     #[test]
     fn both_lengths_read_and_have_the_figure_s_alpha() {
         for smoke in [false, true] {
-            let settings: Settings = flags::read_settings(NAME, SETTINGS, smoke);
+            let settings: Settings = flags::read_settings(NAME, SETTINGS, &length(smoke));
             assert!(settings.alphas.contains(&settings.figure_alpha));
             assert!(settings.alphas.iter().all(|a| 0.0 < *a && *a < 1.0));
             assert!(settings.states >= 2 && settings.seeds > 0 && settings.updates > 0);
