@@ -2,7 +2,6 @@
 //! whole runs in which one such setting (a dial) changes at a time, and benchmarks single updates.
 //! `menu` has the dials, `plan` chooses what fits into a budget, `report` writes data, figures and page.
 
-mod figures;
 mod fixed_batch;
 mod measured;
 mod menu;
