@@ -51,10 +51,10 @@ struct StoredPiece<T> {
 /// The open folder of an experiment, with its progress and the time of its pieces.
 #[derive(Debug)]
 pub(crate) struct Session {
-    folder: PathBuf,
+    pub(crate) folder: PathBuf,
     smoke: bool,
-    report_only: bool,
-    progress: Progress,
+    pub(crate) report_only: bool,
+    pub(crate) progress: Progress,
     seconds: f64,
     /// How many runs were made at once; `seconds` is the sum over all of them.
     jobs: u32,
@@ -116,12 +116,7 @@ impl Session {
     }
 
     pub(crate) fn store<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
-        let piece = StoredPiece {
-            of: String::new(),
-            seconds: 0.0,
-            result,
-        };
-        self.write(key, &piece)
+        self.write(key, "", 0.0, &result)
     }
 
     fn read<T: DeserializeOwned>(&self, key: &str) -> Option<StoredPiece<T>> {
@@ -129,25 +124,24 @@ impl Session {
         serde_json::from_slice(&text).ok()
     }
 
-    fn write<T: Serialize>(&self, key: &str, piece: &StoredPiece<T>) -> anyhow::Result<()> {
-        let text = serde_json::to_vec(piece).context("encoding a piece")?;
+    fn write(
+        &self,
+        key: &str,
+        source: &str,
+        seconds: f64,
+        result: &impl Serialize,
+    ) -> anyhow::Result<()> {
+        let piece = StoredPiece {
+            of: source.to_owned(),
+            seconds,
+            result,
+        };
+        let text = serde_json::to_vec(&piece).context("encoding a piece")?;
         Ok(output::write_file("--out", &self.piece_path(key), &text)?)
     }
 
     fn piece_path(&self, key: &str) -> PathBuf {
         self.folder.join(PIECES).join(format!("{key}.json"))
-    }
-
-    pub(crate) fn folder(&self) -> &Path {
-        &self.folder
-    }
-
-    pub(crate) const fn progress(&mut self) -> &mut Progress {
-        &mut self.progress
-    }
-
-    pub(crate) const fn report_only(&self) -> bool {
-        self.report_only
     }
 
     /// Counts runs, which `sweep::runs` keeps: the time of all of them together, how many were made at once, and the names of the
@@ -199,18 +193,14 @@ impl Session {
         self.progress.set_task(key);
         let (started, before) = (Instant::now(), self.progress.done());
         let result = make(&mut self.progress).inspect_err(report_stop)?;
-        let piece = StoredPiece {
-            of: source.into(),
-            seconds: started.elapsed().as_secs_f64(),
-            result,
-        };
-        self.write(key, &piece)?;
-        self.seconds += piece.seconds;
+        let seconds = started.elapsed().as_secs_f64();
+        self.write(key, source, seconds, &result)?;
+        self.seconds += seconds;
         // Counts the units that `make` did not count. This comes after the write, so that an interrupt here does not lose the piece.
         let rest = units.saturating_sub(self.progress.done() - before);
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
         counted.inspect_err(report_stop)?;
-        Ok(piece.result)
+        Ok(result)
     }
 
     /// Like [`Session::load_or_make`] for what this program computes from `inputs`. For a report, pieces of other programs are valid too.
@@ -295,17 +285,15 @@ pub(crate) fn program_id() -> anyhow::Result<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use driml_machine::error::Usage;
+
+    use super::*;
+    use crate::flags::tests::parse;
 
     #[test]
     fn a_piece_is_made_once_and_other_settings_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let flags = ExperimentFlags {
-            smoke: true,
-            out: Some(folder.path().join("walk")),
-            seeds: None,
-        };
+        let flags = parse(&format!("--smoke --out {}/walk", folder.path().display()));
         let open = |settings: &str| Session::open("walk", &flags, &settings, 40, false);
         let report = |settings: &str| Session::open("walk", &flags, &settings, 40, true);
         assert!(report("a").unwrap_err().is::<Usage>());

@@ -1,10 +1,14 @@
 //! The command line of `driml experiment`.
 //! Each experiment interprets its own values; this module also reads the built-in settings of the full or smoke length.
 
-use std::{collections::BTreeSet, path::PathBuf};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    path::PathBuf,
+};
 
 use clap::{Args, Subcommand};
 use driml_machine::{error::Usage, shell::quoted, whole_number};
+use driml_settings::presets;
 use serde::de::DeserializeOwned;
 
 /// The paper's experiments.
@@ -26,7 +30,7 @@ pub enum ExperimentCommand {
 pub(crate) const SEEDS_MAX: u32 = 1000;
 
 /// What every experiment takes.
-#[derive(Clone, Debug, Args)]
+#[derive(Clone, Debug, Default, Args)]
 pub struct ExperimentFlags {
     /// A test in seconds: shows only that the command works
     #[arg(long)]
@@ -155,13 +159,20 @@ pub struct SweepArgs {
     pub(crate) out: Option<PathBuf>,
 }
 
-/// Reads the table `full` or `smoke` of an experiment's built-in settings.
-pub(crate) fn read_settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
-    let length = if smoke { "smoke" } else { "full" };
+/// Reads an experiment's built-in settings: the table `full`, over it the table `smoke` for that length, and `--seeds`.
+pub(crate) fn read_settings<T: DeserializeOwned>(
+    name: &str,
+    text: &str,
+    flags: &ExperimentFlags,
+) -> T {
     let read = || -> Result<T, toml::de::Error> {
-        let mut file: toml::Table = text.parse()?;
-        let table = file.remove(length).unwrap_or(toml::Table::new().into());
-        table.try_into()
+        let mut lengths: BTreeMap<String, toml::Table> = toml::from_str(text)?;
+        let mut settings = lengths.remove("full").unwrap_or_default();
+        let shorter = lengths.remove("smoke").filter(|_| flags.smoke);
+        presets::merge(&mut settings, shorter.unwrap_or_default());
+        let seeds = flags.seeds.map(|seeds| ("seeds".to_owned(), seeds.into()));
+        settings.extend(seeds);
+        settings.try_into()
     };
     read().unwrap_or_else(|e| {
         panic!("the settings of {name} are built in, and a test reads them: {e}")
@@ -205,6 +216,11 @@ pub(crate) mod tests {
     struct CommandLine<T: Args> {
         #[command(flatten)]
         args: T,
+    }
+
+    /// Returns the flags of the full or the smoke length.
+    pub(crate) fn length(smoke: bool) -> ExperimentFlags {
+        parse(if smoke { "--smoke" } else { "" })
     }
 
     pub(crate) fn parse<T: Args>(words: &str) -> T {

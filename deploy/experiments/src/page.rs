@@ -2,6 +2,7 @@
 //! The text is a minijinja template beside the experiment. All numbers come from the results, so that none can be stale.
 
 use driml_machine::units::{count, rough_duration};
+use indicatif::HumanCount;
 use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context};
 
 use crate::{
@@ -67,6 +68,7 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
         or_dash(&value, |it| format!("x{it:.2}"))
     });
     environment.add_filter("duration", |value: Value| or_dash(&value, rough_duration));
+    environment.add_filter("thousands", |number: u64| HumanCount(number).to_string());
     environment.add_filter("counted", |number: u64, noun: &str| count(number, noun));
     environment.add_filter("mean", |list: Value| reduce(&list, mean));
     environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
@@ -184,6 +186,7 @@ mod tests {
             ),
             (vec![1.0], "{{ it | interval }}", "1.00 (one seed)\n"),
             (vec![1.0], "{{ it | length | counted('run') }}", "1 run\n"),
+            (vec![], "{{ 1234567 | thousands }}", "1,234,567\n"),
             (
                 vec![2.0],
                 "{{ it | mean | factor }} {{ none | mean | sci }}",

@@ -215,15 +215,4 @@ mod tests {
             assert_eq!(found, (in_card, in_plain), "{word}");
         }
     }
-
-    #[test]
-    fn text_is_drawn_without_a_font_of_the_machine() {
-        let canvas = |text: &str| {
-            let mut canvas = Canvas::new(80.0, 30.0, Letters::Outlines);
-            canvas.text((4.0, 20.0), text, TextStyle::new(16.0, INK, Anchor::Start));
-            render::png(&canvas.svg(), 1.0).unwrap()
-        };
-        assert_ne!(canvas("alpha"), canvas(""));
-        assert_ne!(canvas("\u{3b1}"), canvas("\u{3c1}"));
-    }
 }

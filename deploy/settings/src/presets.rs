@@ -270,7 +270,7 @@ impl Layer {
 }
 
 /// Merges `upper` over `lower`, table by table; other values are replaced.
-fn merge(lower: &mut Table, upper: Table) {
+pub fn merge(lower: &mut Table, upper: Table) {
     for (key, value) in upper {
         match (lower.get_mut(&key), value) {
             (Some(Value::Table(lower)), Value::Table(upper)) => merge(lower, upper),

@@ -2,7 +2,7 @@
 //! This module does not judge any value.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     path::{Path, PathBuf},
 };
 
@@ -31,9 +31,8 @@ pub(crate) struct Run {
     pub(super) seed: Option<i64>,
     /// The settings without the seed and without those that depend on the machine; `None` if they cannot be read.
     pub(crate) settings: Option<Settings>,
-    columns: Table,
-    /// The evaluations of the run's checkpoints. This table also has the columns `frames`, `updates` and `seconds`.
-    evaluations: Table,
+    /// The metrics and the evaluations of the run's checkpoints, with their files. Both have the columns `frames`, `updates`, `seconds`.
+    tables: [(PathBuf, Table); 2],
 }
 
 impl Run {
@@ -41,14 +40,16 @@ impl Run {
         let path = folder.metrics();
         let text = std::fs::read(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
-        let columns = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+        let metrics = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
         ensure!(
-            columns.column_index("frames").is_some(),
+            metrics.column_index("frames").is_some(),
             usage!(
                 "{} has no column \"frames\": it is not a run's",
                 path.display()
             )
         );
+        let evaluations = folder.evaluations();
+        let evaluated = Table::read(&evaluations)?;
         let (settings, seed) = read_settings(&folder.config()).unzip();
         let word = |name: &str| settings.as_ref()?.get(name);
         let world_agent = word("run.world").zip(word("run.agent"));
@@ -59,8 +60,7 @@ impl Run {
             settings,
             seed: seed.flatten(),
             folder: folder.clone(),
-            columns,
-            evaluations: Table::read(&folder.evaluations())?,
+            tables: [(path, metrics), (evaluations, evaluated)],
         })
     }
 
@@ -68,7 +68,7 @@ impl Run {
     ///
     /// Rows with the same x become one point, their mean: a row is written each second, and a second may bring no new frame.
     pub(crate) fn values(&self, x: &str, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        let (table, path) = self.table_of(column);
+        let (path, table) = self.table_of(column);
         let x = self.column_index(table, x)?;
         let place = self.column_index(table, column)?;
         let mut values = Vec::new();
@@ -91,14 +91,11 @@ impl Run {
         Ok(values.chunk_by(|a, b| a.0 == b.0).map(mean).collect())
     }
 
-    /// Returns the table that has the column, and its file; the metrics if neither table has the column.
-    fn table_of(&self, column: &str) -> (&Table, PathBuf) {
-        let in_metrics = self.columns.column_index(column).is_some();
-        if !in_metrics && self.evaluations.column_index(column).is_some() {
-            (&self.evaluations, self.folder.evaluations())
-        } else {
-            (&self.columns, self.folder.metrics())
-        }
+    /// Returns the first table that has the column, with its file; the metrics if neither table has the column.
+    fn table_of(&self, column: &str) -> &(PathBuf, Table) {
+        let has_column = |(_, table): &&(_, Table)| table.column_index(column).is_some();
+        let found = self.tables.iter().find(has_column);
+        found.unwrap_or(&self.tables[0])
     }
 
     /// Returns the index of a numeric column.
@@ -106,10 +103,9 @@ impl Run {
         let place = table.column_index(column);
         place.filter(|_| !TEXTS.contains(&column)).ok_or_else(|| {
             let numbers = || {
-                let more = self.evaluations.header.iter();
-                let more = more.filter(|name| self.columns.column_index(name).is_none());
-                let all = self.columns.header.iter().chain(more);
-                all.map(String::as_str).filter(|name| !TEXTS.contains(name))
+                let mut seen = BTreeSet::from(TEXTS);
+                let all = self.tables.iter().flat_map(|(_, table)| &table.header);
+                all.map(String::as_str).filter(move |it| seen.insert(it))
             };
             usage!(
                 "{} has no column of numbers {column:?}{}; it has {}",
@@ -122,15 +118,16 @@ impl Run {
 
     /// Returns the columns of auxiliary losses: the columns between the C51 loss and the total loss.
     pub(super) fn auxiliary_losses(&self) -> &[String] {
-        let ends = [C51_LOSS, TOTAL_LOSS].map(|name| self.columns.column_index(name));
+        let metrics = &self.tables[0].1;
+        let ends = [C51_LOSS, TOTAL_LOSS].map(|name| metrics.column_index(name));
         match ends {
-            [Some(first), Some(last)] if first < last => &self.columns.header[first + 1..last],
+            [Some(first), Some(last)] if first < last => &metrics.header[first + 1..last],
             _ => &[],
         }
     }
 
     pub(crate) fn has_values(&self, column: &str) -> bool {
-        let (table, _) = self.table_of(column);
+        let (_, table) = self.table_of(column);
         let place = table.column_index(column);
         place.is_some_and(|place| table.rows.iter().any(|row| !row[place].is_empty()))
     }

@@ -1,14 +1,15 @@
 //! Checks every numeric routine at the extremes of its range: its promised error bounds, and the worst errors found against a reference.
-//! `checks` has the promises and the inputs; most bounds are constants of the routines themselves.
+//! `checks` has the promises and the inputs; most bounds are constants of the routines themselves. This module has the data, the figure
+//! and the page.
 
 mod checks;
 mod edges;
-mod figure;
 mod property;
 
 use std::collections::HashSet;
 
 use anyhow::ensure;
+use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_machine::resources;
 use driml_model::{Precision, describe_kernels};
 use indicatif::HumanCount;
@@ -28,8 +29,7 @@ const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,i
 
 /// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
-    settings.seeds = args.seeds.unwrap_or(settings.seeds);
+    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
     let table = checks::table(&settings);
     let units = table.len() as u64 * u64::from(settings.seeds);
     let mut session = Session::open(NAME, args, &settings, units, false)?;
@@ -57,8 +57,8 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         (check, found, kept, row.promise, &row.tally.input)
     });
     session.write_csv("promises", COLUMNS, promises)?;
-    session.save_figure("worst", &figure::figure(&rows, &case_count(&rows)))?;
-    let page = session.folder().join("README.md");
+    session.save_figure("worst", &figure(&rows))?;
+    let page = session.folder.join("README.md");
     session.write_page(include_str!("page.md.j2"), page_values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
     ensure!(is_kept, "{} See {}", verdict(&rows), page.display());
@@ -114,12 +114,73 @@ fn page_values(rows: &[Row], settings: &Settings) -> Value {
     }
 }
 
+/// The drawn value of a row without any error, because 0 has no place on a logarithmic axis.
+const LOW: f64 = 1e-6;
+/// The largest drawn value, for rows whose error exceeds the bound by more.
+const HIGH: f64 = 10.0;
+/// The number of routines in a chart, so that their names fit below it.
+const ROUTINES_PER_CHART: usize = 8;
+
+/// Returns the worst errors of the rows with drawn or listed inputs, each at x = index of its routine + `x_offset`.
+fn points(rows: &[Row], names: &[String], is_drawn: bool, x_offset: f64) -> Vec<(f64, f64)> {
+    let some = rows.iter().filter(|it| it.is_drawn == is_drawn);
+    let points = some.filter_map(|row| {
+        let at = names.iter().position(|name| *name == row.routine)? as f64;
+        let share = match row.tally.worst {
+            _ if row.tally.cases == 0 => HIGH,
+            0.0 => 0.0,
+            worst => worst / row.bound,
+        };
+        Some((at + x_offset, share.clamp(LOW, HIGH)))
+    });
+    points.collect()
+}
+
+/// Draws one chart for some of the routines.
+fn chart(rows: &[Row], names: &[String]) -> Chart {
+    let series_points = |is_drawn, x_offset| points(rows, names, is_drawn, x_offset);
+    let ends = vec![(-0.5, 1.0), (names.len() as f64 - 0.5, 1.0)];
+    let promise = Series::line("the promise", 0, ends).with_colour(GREY);
+    Chart::new(
+        &format!("{} to {}", names[0], names[names.len() - 1]),
+        Axis::names("", names),
+        Axis::log("worst error / promise").covering(&[LOW, HIGH]),
+        vec![
+            promise.with_mark(Mark::Dashed),
+            Series::line("listed extremes", 0, series_points(false, -0.1)).with_mark(Mark::Rings),
+            Series::line("drawn inputs", 1, series_points(true, 0.1)).with_mark(Mark::Rings),
+        ],
+    )
+}
+
+/// Draws all rows, split into several charts.
+fn figure(rows: &[Row]) -> Figure {
+    let mut names: Vec<String> = rows.iter().map(|row| row.routine.into()).collect();
+    names.dedup();
+    let charts = names.chunks(ROUTINES_PER_CHART);
+    let charts = charts.map(|some| Panel::Chart(chart(rows, some)));
+    Figure {
+        title: "The worst error of each routine, beside what it promises".into(),
+        notes: vec![
+            format!(
+                "{} cases. A ring a row; above the dashed line a promise is broken.",
+                case_count(rows)
+            ),
+            "At the bottom: no error at all, as where a promise allows none.".into(),
+        ],
+        columns: 1,
+        panel_size: (1_000.0, 270.0),
+        panels: charts.collect(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::{property::Tally, *};
+    use crate::flags::tests::length;
 
     /// Creates a row with these results.
-    pub(super) fn row(cases: u64, worst: f64, input: &str) -> Row {
+    fn row(cases: u64, worst: f64, input: &str) -> Row {
         Row {
             routine: "halving",
             extreme: "big".into(),
@@ -138,7 +199,7 @@ mod tests {
     fn the_page_and_the_verdict_name_what_is_broken() {
         let reported = |worst: f64, input: &str| {
             let rows = [row(1, worst, input)];
-            let values = page_values(&rows, &flags::read_settings(NAME, SETTINGS, true));
+            let values = page_values(&rows, &flags::read_settings(NAME, SETTINGS, &length(true)));
             let page = crate::page::render_page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)
         };
@@ -156,7 +217,7 @@ mod tests {
     #[test]
     fn both_lengths_read() {
         for smoke in [false, true] {
-            let settings: Settings = flags::read_settings(NAME, SETTINGS, smoke);
+            let settings: Settings = flags::read_settings(NAME, SETTINGS, &length(smoke));
             assert!(settings.seeds > 0 && settings.draws > 0);
         }
     }
@@ -164,5 +225,16 @@ mod tests {
     #[test]
     fn numbers_are_short() {
         assert_eq!([0.25, 3.1e-8].map(format_number), ["0.25", "3.1e-8"]);
+    }
+    #[test]
+    fn inputs_have_their_side_and_a_promise_that_was_not_tried_is_not_kept() {
+        let row = |is_drawn, cases, worst| Row {
+            is_drawn,
+            ..row(cases, worst, "")
+        };
+        let rows = [row(false, 1, 0.25), row(true, 1, 0.0), row(false, 0, 0.0)];
+        let names = ["halving".to_owned()];
+        assert_eq!(points(&rows, &names, false, 0.0), [(0.0, 0.5), (0.0, HIGH)]);
+        assert_eq!(points(&rows, &names, true, 0.0), [(0.0, LOW)]);
     }
 }

@@ -68,7 +68,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     install_worlds(&plans, args.report)?;
     let mut session = Session::open(NAME, &flags, &settings, 0, args.report)?;
     let finished = queue::run_all(&mut session, plans, args.jobs)?;
-    session.progress().clear();
+    session.progress.clear();
     let rows = table_rows(&cells, &finished);
     let names = axes.iter().map(|axis| axis.name.as_str());
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
@@ -79,7 +79,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let runs = finished.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {
         runs: runs.collect(),
-        out: session.folder().join(format!("{NAME}.svg")),
+        out: session.folder.join(format!("{NAME}.svg")),
         ..PlotArgs::default()
     })?;
     session.check_none_missing()

@@ -43,8 +43,8 @@ pub(crate) fn run_all<P>(
     plans: Vec<PointPlan<P>>,
     jobs: u32,
 ) -> anyhow::Result<Vec<PointRun<P>>> {
-    let (runs, report_only) = (Runs::open(session.folder())?, session.report_only());
-    let progress = session.progress();
+    let (runs, report_only) = (Runs::open(&session.folder)?, session.report_only);
+    let progress = &mut session.progress;
     progress.add_work(plans.iter().map(|(_, plan)| plan.units).sum());
     let mut queue = Queue {
         runs,

@@ -8,6 +8,7 @@ use std::collections::BTreeSet;
 use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_launch::{evaluate::Levels, metrics::rounded};
+use driml_machine::units::format_number;
 use driml_protocol::RETURNS_MAX;
 use minijinja::{Value, context};
 use serde::Serialize;
@@ -69,7 +70,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     if has_enough_seeds(&settings, &scored) {
         let play = settings.play_settings(Levels::TrainSingle);
         for it in &mut scored {
-            session.progress().add_work(play.units);
+            session.progress.add_work(play.units);
             let key = format!("{}-single", it.plan.name);
             let returns = play.play_greedy(&mut session, &key, &it.run)?;
             let score = returns.and_then(|it| mean(&it));
@@ -218,27 +219,10 @@ fn page_values(settings: &Settings, scored: &[Row]) -> Value {
         games => games.collect::<Vec<_>>(),
         iqms => iqms.collect::<Vec<_>>(),
         improvements => improvements.collect::<Vec<_>>(),
-        percent => percent(settings.frames as f64 / PAPER_FRAMES),
+        percent => format_number(100.0 * settings.frames as f64 / PAPER_FRAMES),
         errors => STANDARD_ERRORS,
         returns_of => RETURNS_MAX,
         episodes => CHECKPOINTS_PLAYED * settings.episodes,
         some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),
-    }
-}
-
-fn percent(share: f64) -> String {
-    let percent = 100.0 * share;
-    let decimals = (1.0 - percent.log10().floor()).clamp(0.0, 6.0) as usize;
-    format!("{percent:.decimals$}")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn small_shares_keep_two_digits() {
-        let texts = [0.002, 0.000012, 0.5, 1.0].map(percent);
-        assert_eq!(texts, ["0.20", "0.0012", "50", "100"]);
     }
 }

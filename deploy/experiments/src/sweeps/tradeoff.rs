@@ -2,7 +2,6 @@
 //! whole runs in which one such setting (a dial) changes at a time, and benchmarks single updates.
 //! `menu` has the dials, `plan` chooses what fits into a budget, `report` writes data, figures and page.
 
-mod figures;
 mod fixed_batch;
 mod measured;
 mod menu;
@@ -143,7 +142,7 @@ impl Tradeoff<'_> {
             } else {
                 let base = settings.common.config(settings.timing_base(point))?;
                 let config = settings.common.config(point)?;
-                self.session.progress().add_work(units);
+                self.session.progress.add_work(units);
                 let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
                 Some(self.session.load_or_make(&program, &key, units, measure)?)
             };
@@ -158,7 +157,7 @@ impl Tradeoff<'_> {
         if self.args.queue.report {
             return Ok(vec![false; levels.len()]);
         }
-        let runs = Runs::open(self.session.folder())?;
+        let runs = Runs::open(&self.session.folder)?;
         let mut budget = Budget::new(left);
         let (mut chosen, mut asked) = (vec![false; levels.len()], Vec::new());
         let all = levels.iter().zip(&mut chosen);
@@ -216,7 +215,7 @@ impl Tradeoff<'_> {
 
     /// Returns the runs of the chosen levels and their bases, and all runs that are already finished.
     fn planned_runs(&self, chosen: &[bool]) -> anyhow::Result<Vec<PointPlan<Point>>> {
-        let runs = Runs::open(self.session.folder())?;
+        let runs = Runs::open(&self.session.folder)?;
         let mut wanted: Vec<PointPlan<Point>> = Vec::new();
         // Ordered by seed, so that a stopped call has one seed of every point before two of any. The page also has further seeds that
         // another call made.
@@ -243,7 +242,7 @@ impl Tradeoff<'_> {
         install_worlds(&wanted, report)?;
         // The agent of each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
-        self.session.progress().add_work(units * plays);
+        self.session.progress.add_work(units * plays);
         let common = self.settings.common.clone();
         let made = queue::run_all(&mut self.session, wanted, common.jobs)?;
         let play = PlaySettings {
@@ -297,7 +296,7 @@ impl Tradeoff<'_> {
     fn measure_errors(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Numbers> {
         // Read the config of this run, whose seed may not be 1.
         let (units, config) = (self.piece_units(), read_config(&run.folder)?);
-        self.session.progress().add_work(units);
+        self.session.progress.add_work(units);
         let key = format!("exactness-{}", point.key);
         let (rows, states) = measured::sizes(&config);
         let weights = &run.summary.weights_sha256;

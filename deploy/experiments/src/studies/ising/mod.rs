@@ -42,8 +42,7 @@ fn new_task(settings: &Settings) -> anyhow::Result<Task> {
 }
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::read_settings(NAME, SETTINGS, args.smoke);
-    settings.seeds = args.seeds.unwrap_or(settings.seeds);
+    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
     let task = new_task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
     let mut session = Session::open(NAME, args, &task, units, false)?;
@@ -212,14 +211,18 @@ fn page_values(task: &Task, trained: &[Outcome]) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flags::tests::length;
 
     pub(super) fn smoke() -> Settings {
-        flags::read_settings(NAME, SETTINGS, true)
+        flags::read_settings(NAME, SETTINGS, &length(true))
     }
 
     #[test]
     fn both_lengths_read_and_ask_for_local_dim_alone() {
-        for settings in [smoke(), flags::read_settings(NAME, SETTINGS, false)] {
+        for settings in [
+            smoke(),
+            flags::read_settings(NAME, SETTINGS, &length(false)),
+        ] {
             let task = new_task(&settings).unwrap();
             // From the paper's table of parameters.
             let local = [true, false, false, false];

@@ -237,13 +237,13 @@ fn draw_state(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
 mod tests {
     use super::*;
     use crate::{
-        flags,
+        flags::{self, ExperimentFlags},
         studies::random_walk::{NAME, SETTINGS},
     };
     use driml_protocol::GracefulShutdown;
 
     fn settings() -> Settings {
-        flags::read_settings(NAME, SETTINGS, false)
+        flags::read_settings(NAME, SETTINGS, &ExperimentFlags::default())
     }
 
     #[test]

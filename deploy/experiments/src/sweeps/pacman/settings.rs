@@ -136,13 +136,12 @@ impl Settings {
 
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
-    let mut settings: Settings = flags::read_settings(NAME, text, args.flags.smoke);
+    let mut settings: Settings = flags::read_settings(NAME, text, &args.flags);
     if !args.agents.is_empty() {
         settings.agents = expand_unique(&args.agents, |name| {
             Ok(vec![presets::agent(name)?.name.to_owned()])
         })?;
     }
-    settings.seeds = args.flags.seeds.unwrap_or(settings.seeds);
     settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
     settings.sets.extend(args.queue.sets.iter().cloned());
     let predictability = &mut settings.predictability;

@@ -53,7 +53,7 @@ pub(super) struct Point {
 impl Settings {
     pub(super) fn from_args(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self =
-            flags::read_settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
+            flags::read_settings(NAME, include_str!("../procgen.toml"), &args.flags);
         if !args.games.is_empty() {
             settings.games.clone_from(&args.games);
         }
@@ -62,7 +62,6 @@ impl Settings {
         }
         settings.games = resolve_worlds(&settings.games)?;
         settings.agents = resolve_agents(&settings.agents)?;
-        settings.seeds = args.flags.seeds.unwrap_or(settings.seeds);
         settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
         settings.frames = args.frames.unwrap_or(settings.frames);
         settings.episodes = args.episodes.unwrap_or(settings.episodes);
@@ -144,9 +143,10 @@ fn resolve_agents(names: &[String]) -> Result<Vec<String>, Usage> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::flags::tests::length;
 
     fn settings(smoke: bool) -> Settings {
-        flags::read_settings(NAME, include_str!("../procgen.toml"), smoke)
+        flags::read_settings(NAME, include_str!("../procgen.toml"), &length(smoke))
     }
 
     #[test]

@@ -19,6 +19,8 @@ use super::{fixed_batch, results::Numbers};
 const ROWS_MAX: usize = 64;
 /// The number of states for each of these rows whose values and greedy actions are compared.
 const STATES_PER_ROW: usize = 16;
+/// The share of random actions in the episodes from which they are drawn.
+const EPSILON: f64 = 0.1;
 
 struct TimedWork {
     update: Work<'static>,
@@ -30,7 +32,6 @@ struct TimedWork {
 }
 
 fn timed_work(config: &RunConfig) -> anyhow::Result<TimedWork> {
-    let fixed = fixed_batch::sample(config, None, config.learner.batch_size as usize)?;
     let (model, update) = (config.model.clone(), config.learner.update.clone());
     let compute = Compute::cpu(config.learner.precision);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
@@ -38,6 +39,8 @@ fn timed_work(config: &RunConfig) -> anyhow::Result<TimedWork> {
         .with_deduplication(config.learner.deduplicate_states);
     let weights = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
+    // All actions are random, so that the weights do not decide the rows.
+    let fixed = fixed_batch::sample(config, &weights, 1.0, config.learner.batch_size as usize)?;
     let envs = config.actor.envs as usize;
     let frames = fixed.states_t.iter().copied().cycle();
     let frames: Vec<u8> = frames.take(envs * config.model.frame_len()).collect();
@@ -102,11 +105,12 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<N
         .with_deduplication(config.learner.deduplicate_states);
     let weights = agent.weights()?;
     let (rows, states) = sizes(config);
-    let fixed = fixed_batch::sample(config, Some(&weights), rows)?;
+    let sample = |rows| fixed_batch::sample(config, &weights, EPSILON, rows);
+    let fixed = sample(rows)?;
     let found = UpdateDeviation::new(&agent, &fixed.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
-    let fixed = fixed_batch::sample(config, Some(&weights), states)?;
+    let fixed = sample(states)?;
     let mut actor_values = vec![0.0; fixed.action.len() * model.num_actions];
     policy.q_values(&fixed.states_t, &mut actor_values)?;
     let expected = reference.q_values_t(&fixed.batch())?;
