@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
-use driml_tests::{TestSystem, check_has, checkpoint_updates, wait_until};
+use driml_tests::{Outcome, TestSystem, check_has, checkpoint_updates, wait_until};
 
 use crate::{SHORT, system};
 
@@ -215,6 +215,13 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
         .run_ok("local --resume run --set local.evaluation.episodes=2")
         .expect_stderr("the run continues without an evaluation: ");
     system.run_folder("run").check_finished();
+    // A file in place of the last checkpoint ends the run, which leaves its summary.
+    let last = system.path("run/checkpoints/checkpoint-000000000860.tmp");
+    fs::write(last, "").unwrap();
+    system
+        .fails("local --resume run --frames 1920", "000860.tmp")
+        .expect_stderr("`driml train --resume run` resumes it");
+    system.check_outcome(Outcome::Failed);
 }
 
 /// A checkpoint is compared with the best one over at least as many episodes as the best was played for.
@@ -339,8 +346,7 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
     fs::write(&path, &whole).unwrap();
     let one = system.run_ok(call).stdout;
     assert!(one.contains("1 episode each") && !one.contains("deviation"));
-    let one = system.run_json(&format!("{call} --json"));
-    let one = &one["policies"]["driml-fix"];
+    let one = &system.run_json(&format!("{call} --json"))["policies"]["driml-fix"];
     assert!(one["mean_return"].is_f64() && one["standard_deviation"].is_null());
 
     let text = system.read("run/config.toml");

@@ -62,27 +62,6 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     assert_eq!(system.running_processes(), []);
 }
 
-/// A file lies where the last checkpoint is written.
-#[test]
-fn a_run_in_lockstep_that_cannot_save_leaves_its_summary() {
-    let system = system();
-    system.run_ok(&format!(
-        "local --lockstep --agent c51 {SHORT} --run-dir run"
-    ));
-    fs::write(
-        system.path("run/checkpoints/checkpoint-000000000860.tmp"),
-        "",
-    )
-    .unwrap();
-    system
-        .fails(
-            "local --resume run --frames 1920",
-            "checkpoint-000000000860.tmp",
-        )
-        .expect_stderr("`driml train --resume run` resumes it");
-    system.check_outcome(Outcome::Failed);
-}
-
 #[test]
 fn dead_processes_end_the_run_and_leave_no_shared_memory() {
     for (dead, named) in [

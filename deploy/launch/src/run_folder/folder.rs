@@ -210,6 +210,11 @@ mod tests {
         for name in ["empty", "a/b/c"] {
             assert!(RunFolder::new(path(name)).check_free().is_ok(), "{name}");
         }
+        // A lock that cannot be made is a wrong call, too.
+        fs::create_dir(path("empty/.lock")).unwrap();
+        let said = RunFolder::new(path("empty")).lock().unwrap_err();
+        let said = said.downcast::<Usage>().unwrap().0;
+        assert!(said.contains("cannot be written: Is a directory"), "{said}");
     }
 
     #[test]
