@@ -338,6 +338,17 @@ mod tests {
         assert!(rounded(f64::NAN).is_nan() && rounded(f64::INFINITY).is_infinite());
     }
 
+    #[test]
+    fn a_name_is_one_metric_s_and_none_hides_another() {
+        for (at, it) in COLUMNS.iter().enumerate() {
+            assert_eq!(find_column(it.name).map(|it| it.name), Some(it.name));
+            assert!(COLUMNS[..at].iter().all(|other| other.name != it.name));
+            assert!(it.help.ends_with('.') && !it.unit.is_empty(), "{}", it.name);
+        }
+        assert_eq!(find_column("rss_mib_actor_7").unwrap().name, "rss_mib");
+        assert!(find_column("dim_4t4").is_none());
+    }
+
     /// `UPDATE_EXPECT=1` rewrites the page.
     #[test]
     fn the_page_has_every_metric() {
