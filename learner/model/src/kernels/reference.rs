@@ -1,4 +1,4 @@
-//! Tests of `stack` and `stages`: convolutions of a task on every instruction set against candle's operations and derivatives in f64.
+//! Tests of `conv` and `impala`: convolutions of a task on every instruction set against candle's operations and derivatives in f64.
 //! `driml experiment stability` compares single layers with candle's.
 #![cfg(test)]
 
