@@ -33,7 +33,6 @@ mod compute;
 mod config;
 mod cost;
 mod error;
-mod features;
 mod geometry;
 mod gradients;
 mod heads;

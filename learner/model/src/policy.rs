@@ -11,10 +11,9 @@ use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::heads::acting::merge;
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
-use crate::heads::streams::HeadLayer;
+use crate::heads::streams::{HeadLayer, merge_values};
 use crate::kernels::dense::{ReluLayer, build_relu_layer};
 use crate::kernels::precision::Precision;
 use crate::parameters::{decode, is_dim};
@@ -70,7 +69,7 @@ impl PolicyNetwork {
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         let weights = &mut self.weights;
         if let Some(noisy) = &weights.noisy_layers {
-            weights.head = build_relu_layer(self.precision, merge(noisy, noise));
+            weights.head = build_relu_layer(self.precision, merge_values(noisy, noise));
         }
     }
 
@@ -172,7 +171,7 @@ impl Weights {
         let Ok(head_layers) = HeadLayer::collect(config, take);
         Ok(Self {
             torso: torso.for_actor(precision, torso_parameters),
-            head: build_relu_layer(precision, merge(&head_layers, None)),
+            head: build_relu_layer(precision, merge_values(&head_layers, None)),
             noisy_layers: config.head.noisy_sigma.map(|_| head_layers),
         })
     }

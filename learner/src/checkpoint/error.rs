@@ -63,8 +63,6 @@ pub enum CheckpointError {
     Update(#[from] UpdateError),
     #[error("another learner saves in {}: wait until it has exited, or choose another folder", .0.display())]
     InUse(PathBuf),
-    #[error("at least one checkpoint must be kept")]
-    KeepNone,
 }
 
 /// Makes the error of an operation `what`, such as "read", on `path`.

@@ -6,11 +6,9 @@ mod description;
 mod error;
 mod folder;
 mod load;
-mod save;
 
-pub use contents::{AVERAGE, LearnerState, check_state};
+pub use contents::{AVERAGE, Extras, LearnerState, check_state, save};
 pub use description::{METADATA_KEY, describe, read_description};
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock, prune, store};
 pub use load::{load, load_latest, read_affinity, read_companion, read_run_counts};
-pub use save::{Extras, save};

@@ -203,26 +203,6 @@ mod tests {
         Ok(())
     }
 
-    #[test]
-    fn weights_are_of_the_rows_own_losses() -> Result<()> {
-        let weights = [0.25f32, 1.0];
-        let rows = row_kls(&LOGITS, &TARGET, ATOMS);
-        let weighted = (0.25 * rows[0] + rows[1]) / 2.0;
-        let (mut slopes, mut plain) = ([0f32; 6], [0f32; 6]);
-        let loss = kl(&LOGITS, &TARGET, Some(&weights), ATOMS, &mut slopes);
-        assert!((loss - weighted).abs() < 1e-14);
-        let unweighted = kl(&LOGITS, &TARGET, None, ATOMS, &mut plain);
-        assert!((unweighted - (rows[0] + rows[1]) / 2.0).abs() < 1e-14);
-        for (i, (slope, plain)) in slopes.iter().zip(plain).enumerate() {
-            let expected = plain * weights[i / ATOMS];
-            assert!((slope - expected).abs() < 1e-7, "logit {i}");
-        }
-        let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
-        let one = Some(vec![1.0]);
-        assert!(kl_loss(&logits, TARGET.to_vec(), one, Kernels::FUSED).is_err());
-        Ok(())
-    }
-
     /// Without its weight the derivative is 5.5e-42, of which an f32 holds three digits.
     #[test]
     fn a_weight_does_not_magnify_what_rounding_lost() {

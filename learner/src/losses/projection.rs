@@ -71,38 +71,3 @@ pub fn project(
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    const ATOMS: usize = 51;
-
-    fn projected(probs: &[f32], reward: f32, discount: f32) -> Vec<f32> {
-        let mut out = vec![f32::NAN; probs.len()];
-        project(probs, &[reward], &[discount], -10.0, 10.0, &mut out);
-        out
-    }
-
-    fn one_hot(at: usize) -> Vec<f32> {
-        (0..ATOMS).map(|i| f32::from(u8::from(i == at))).collect()
-    }
-
-    #[test]
-    fn whole_steps_of_one_atom_shift_the_distribution() {
-        // 21 atoms on [-10, 10] are one unit apart, so that a reward of 2 is exact.
-        let probs: Vec<f32> = (0..21).map(|i| if i < 4 { 0.25 } else { 0.0 }).collect();
-        let out = projected(&probs, 2.0, 1.0);
-        let expected: Vec<f32> = (0..21)
-            .map(|i| if (2..6).contains(&i) { 0.25 } else { 0.0 })
-            .collect();
-        assert_eq!(out, expected);
-    }
-
-    #[test]
-    fn returns_beyond_the_support_are_clamped_to_its_ends() {
-        assert_eq!(projected(&one_hot(20), 1e30, 0.0), one_hot(ATOMS - 1));
-        assert_eq!(projected(&one_hot(20), -1e30, 0.99), one_hot(0));
-        assert_eq!(projected(&one_hot(ATOMS - 1), 5.0, 1.0), one_hot(ATOMS - 1));
-    }
-}

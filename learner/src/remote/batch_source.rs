@@ -7,13 +7,11 @@ use std::{
     time::{Duration, Instant},
 };
 
+use anyhow::bail;
 use driml_protocol::{RunClient, Shutdown, join_within};
 
 pub use super::fetcher::{Counters, NextBatch, Requests, ServedBatch};
-use super::{
-    error::BatchError,
-    fetcher::{Fetched, Fetcher, SharedState},
-};
+use super::fetcher::{Fetched, Fetcher, SharedState};
 
 /// How long the threads may take to end.
 const JOIN_TIMEOUT: Duration = Duration::from_secs(2);
@@ -64,7 +62,7 @@ impl BatchSource {
     ///
     /// # Errors
     /// The replay server was unreachable for too long, or rejects a request.
-    pub fn next(&mut self, timeout: Duration) -> Result<NextBatch, BatchError> {
+    pub fn next(&mut self, timeout: Duration) -> anyhow::Result<NextBatch> {
         let deadline = Instant::now() + timeout;
         while self.running_threads > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -72,7 +70,7 @@ impl BatchSource {
                 Ok(Ok(NextBatch::Finished)) => self.running_threads -= 1,
                 Ok(fetched) => return fetched,
                 Err(mpsc::RecvTimeoutError::Disconnected) if !self.shared.shutdown.is_set() => {
-                    return Err(BatchError::ThreadsEnded);
+                    bail!("the threads that fetch batches have ended");
                 }
                 Err(_) => return Ok(NextBatch::NotYet(self.shared.waiting())),
             }

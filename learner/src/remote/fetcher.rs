@@ -10,6 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use anyhow::{Context, bail};
 use driml_protocol::{
     Batch, BatchReply, BatchRequest, BufferPool, LearnerProgress, LogLimiter, NotReady,
     PendingReply, ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting,
@@ -18,10 +19,7 @@ use driml_protocol::{
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{
-    error::BatchError,
-    shards::{PartialBatch, ShardState},
-};
+use super::shards::{PartialBatch, ShardState};
 use crate::run_counts::{BatchPart, RunCounts};
 
 /// Time-out of a request. A replay server replies within a second, if only that it has no batch yet.
@@ -105,7 +103,12 @@ pub enum NextBatch {
 }
 
 /// What a fetching thread sends: a batch, or why it ends.
-pub(super) type Fetched = Result<NextBatch, BatchError>;
+pub(super) type Fetched = anyhow::Result<NextBatch>;
+
+/// The replay server rejects the request, and would reject a retry.
+#[derive(Debug, thiserror::Error)]
+#[error("the replay server rejects the learner: {0}")]
+struct Rejected(String);
 
 pub(super) struct SharedState {
     clients: Vec<RunClient>,
@@ -175,9 +178,9 @@ impl Fetcher {
                     silence.record_answer();
                     continue;
                 }
-                Ok(_) | Err(BatchError::Refused(_)) => fetched,
-                Err(e) => {
-                    if e.is_recovering() {
+                Err(e) if !e.is::<Rejected>() => {
+                    // A server that recovers its replay from disk is reachable, and will serve batches later.
+                    if let Some(SessionError::Recovering(_)) = e.downcast_ref() {
                         silence.record_answer();
                     }
                     let unreachable_max = self.shared.requests.unreachable_max;
@@ -186,16 +189,14 @@ impl Fetcher {
                         if !self.shared.shutdown.is_set()
                             && let Some(more) = self.log_limiter.admit()
                         {
-                            tracing::warn!("retrying the request for a batch: {e}{more}");
+                            tracing::warn!("retrying the request for a batch: {e:#}{more}");
                         }
                         self.shared.shutdown.wait_timeout(RETRY_PAUSE);
                         continue;
                     }
-                    Err(BatchError::Unreachable {
-                        unreachable_max,
-                        source: Box::new(e),
-                    })
+                    Err(e.context(format!("no batch and no answer for {unreachable_max:?}")))
                 }
+                fetched => fetched,
             };
             let is_last = !matches!(fetched, Ok(NextBatch::Ready(_)));
             if let Ok(NextBatch::Ready(served)) = &fetched {
@@ -229,7 +230,7 @@ impl Fetcher {
             }
             Err(NotReady::Wait(waiting)) => Ok(NextBatch::NotYet(waiting)),
             Err(NotReady::Finished) => Ok(NextBatch::Finished),
-            Err(NotReady::Refused { why }) => Err(BatchError::Refused(why)),
+            Err(NotReady::Refused { why }) => Err(Rejected(why).into()),
         }
     }
 
@@ -294,7 +295,7 @@ impl Fetcher {
                 }
                 Err(NotReady::Wait(waiting)) => partial.record_waiting(waiting),
                 Err(NotReady::Finished) => finished = true,
-                Err(NotReady::Refused { why }) => return Err(BatchError::Refused(why)),
+                Err(NotReady::Refused { why }) => bail!(Rejected(why)),
             }
         }
         if let Some(e) = failed {
@@ -303,7 +304,7 @@ impl Fetcher {
         if partial.is_complete() {
             let allocate = |bytes| self.shared.pool.take_private(bytes);
             let batch = Batch::merge(&partial.parts, allocate);
-            let batch = batch.ok_or(BatchError::DifferentShards)?;
+            let batch = batch.context("the shards' parts do not fit together")?;
             partial.parts.clear();
             let parts = std::mem::take(&mut partial.sources);
             partial.since_last_batch.record_answer();
@@ -341,13 +342,14 @@ impl Fetcher {
         &self,
         partial: &mut PartialBatch,
         is_due: impl Fn(&ShardState, Instant) -> bool,
-    ) -> Result<(), BatchError> {
+    ) -> anyhow::Result<()> {
         let (now, mut all_stored) = (Instant::now(), false);
         for (client, state) in self.shared.clients.iter().zip(&mut partial.shards) {
             if !is_due(state, now) {
                 continue;
             }
-            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
+            let status = client.fetch::<ReplayStatus>(REQUEST_TIMEOUT);
+            let status = status.context("a shard's status")?;
             let counts = ShardCounts {
                 inserted: status.transitions_inserted,
                 rows_sampled: status.rows_sampled,
@@ -365,7 +367,7 @@ impl Fetcher {
         id: RequestId,
         rows: u32,
         other_shards: Option<ShardCounts>,
-    ) -> Result<(PendingReply<BatchReply>, bool), BatchError> {
+    ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
         let request = BatchRequest {
             learner: self.shared.requests.learner_id,
             id,
@@ -383,7 +385,7 @@ impl Fetcher {
     fn receive_reply(
         &mut self,
         (pending, shared_memory): (PendingReply<BatchReply>, bool),
-    ) -> Result<Result<Batch, NotReady>, BatchError> {
+    ) -> anyhow::Result<Result<Batch, NotReady>> {
         // A process that may not map shared memory never receives the reply: the request looks unanswered.
         let (reply, payload) = pending.receive(&self.shared.pool).inspect_err(|e| {
             let is_lost = matches!(

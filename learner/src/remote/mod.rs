@@ -2,10 +2,7 @@
 //! It does not know what is learned, or how: `learner` does.
 
 pub mod batch_source;
-mod error;
 mod fetcher;
 mod publish;
 pub mod run;
 mod shards;
-
-pub use error::BatchError;

@@ -197,7 +197,7 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
 }
 
 #[test]
-fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
+fn the_newest_are_kept_and_what_a_cut_off_save_left_is_gone_after_the_next() {
     let parent = tempdir().unwrap();
     let folder = parent.path().join("checkpoints");
     assert!(load(&folder).unwrap().is_none(), "no folder, no checkpoint");
@@ -207,9 +207,16 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
         save(&run, &folder, 2);
     }
     save(&run, &folder, 2);
-    fs::create_dir(folder.join("checkpoint-000000000009.tmp")).unwrap();
+    for name in ["checkpoint-000000000009.tmp", "checkpoint-000000000002.tmp"] {
+        fs::create_dir(folder.join(name)).unwrap();
+        fs::write(folder.join(name).join("online.safetensors"), "half").unwrap();
+    }
     assert_eq!(listed_updates(&folder), [2, 3]);
     assert_eq!(load(&folder).unwrap().unwrap().agent.updates(), 3);
+    learn(&mut run, 1);
+    save(&run, &folder, 2);
+    assert_eq!(listed_updates(&folder), [3, 4]);
+    assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
 }
 
 /// A failure to remove an old checkpoint does not concern the new one.
@@ -226,22 +233,6 @@ fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
         let left = listed_updates(folder.path());
         assert_eq!(left, [updates], "no half of it passes for a checkpoint");
     }
-}
-
-#[test]
-fn what_a_cut_off_save_left_is_gone_after_the_next() {
-    let folder = tempdir().unwrap();
-    let mut run = initial_state();
-    learn(&mut run, 1);
-    save(&run, folder.path(), 3);
-    for name in ["checkpoint-000000000009.tmp", "checkpoint-000000000001.tmp"] {
-        fs::create_dir(folder.path().join(name)).unwrap();
-        fs::write(folder.path().join(name).join("online.safetensors"), "half").unwrap();
-    }
-    learn(&mut run, 1);
-    save(&run, folder.path(), 3);
-    assert_eq!(listed_updates(folder.path()), [1, 2]);
-    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
 }
 
 #[test]

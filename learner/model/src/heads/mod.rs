@@ -1,6 +1,5 @@
 //! The heads on the torso: C51 for return distributions, and DIM for the vectors that are compared.
 
-pub(crate) mod acting;
 pub(crate) mod c51;
 pub(crate) mod config;
 pub(crate) mod dim;

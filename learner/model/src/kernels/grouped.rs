@@ -186,27 +186,3 @@ impl Operation<3> for GroupedLinear {
         Ok([grad_x.transpose()?, grad_w, grad_b])
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use candle_core::Device;
-
-    use super::*;
-
-    #[test]
-    fn a_group_that_is_not_there_is_refused() -> Result<()> {
-        let x = Tensor::zeros((2, 3), candle_core::DType::F32, &Device::Cpu)?;
-        let w = Tensor::zeros((4, 3), candle_core::DType::F32, &Device::Cpu)?;
-        let b = Tensor::zeros(4, candle_core::DType::F32, &Device::Cpu)?;
-        assert!(grouped_linear(&x, &w, &b, &[0, 1], 2, Precision::F32).is_ok());
-        for (groups, out) in [
-            (&[0, 2][..], 2),
-            (&[0][..], 2),
-            (&[0, 0][..], 3),
-            (&[0, 0], 0),
-        ] {
-            assert!(grouped_linear(&x, &w, &b, groups, out, Precision::F32).is_err());
-        }
-        Ok(())
-    }
-}

@@ -2,11 +2,11 @@
 //!
 //! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`] and [`dots`] are operations with
 //! gradients. [`operation`] turns them into candle's. These operations split their work over the rayon pool, and images into
-//! [`tasks`]. [`stack`] passes a task's images through all convolutions, and [`convolution`] computes one of them. [`stages`]
-//! does so for an IMPALA torso, with [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's
-//! linear layer. All of them use operands from [`panels`] and tiles for an instruction set of [`isa`], where all unsafe code of
-//! the crate is. [`rounding`] rounds operands, [`exponentials`] computes what losses need, [`buffer`] recycles memory,
-//! [`tensors`] reads candle's tensors, and [`precision`] is the setting. [`candle`] needs none of these modules.
+//! [`tasks`]. [`convolution`] computes a layer of [`conv`], [`bordered`] and [`pool`] those of [`impala`]. [`product`] computes a
+//! matrix product, [`dense`] an actor's linear layer. All of them use operands from [`panels`] and tiles for an instruction set
+//! of [`isa`], where all unsafe code of the crate is. [`rounding`] rounds operands, [`exponentials`] computes what losses need,
+//! [`buffer`] recycles memory, [`tensors`] reads candle's tensors, and [`precision`] is the setting. [`candle`] needs none of
+//! these modules.
 
 pub(crate) mod bordered;
 pub(crate) mod buffer;
@@ -29,8 +29,6 @@ pub(crate) mod product;
 mod reference;
 pub(crate) mod residual;
 pub(crate) mod rounding;
-pub(crate) mod stack;
-pub(crate) mod stages;
 pub(crate) mod tasks;
 pub(crate) mod tensors;
 pub(crate) mod torso;

@@ -1,4 +1,4 @@
-//! Tests of `stack` and `stages`: convolutions of a task on every instruction set against candle's operations and derivatives in f64.
+//! Tests of `conv` and `impala`: convolutions of a task on every instruction set against candle's operations and derivatives in f64.
 //! `driml experiment stability` compares single layers with candle's.
 #![cfg(test)]
 
@@ -6,11 +6,11 @@ use candle_core::{DType, Device, Result, Tensor, Var};
 
 use crate::geometry::{ConvLayer, ConvShape, stage_shapes};
 use crate::kernels::candle;
+use crate::kernels::conv::Stack;
 use crate::kernels::images::Pixels;
+use crate::kernels::impala::Stages;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
-use crate::kernels::stack::Stack;
-use crate::kernels::stages::Stages;
 use crate::kernels::tasks::{parameters_len, split_parameters, unpack_weights};
 
 /// Images of a task.

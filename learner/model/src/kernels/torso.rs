@@ -9,14 +9,13 @@ use candle_core::{Result, Tensor, bail};
 use crate::gradients::accumulate_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
-use crate::kernels::conv::{ConvStack, flatten_layers};
+use crate::kernels::conv::{ConvStack, SavedActivations, flatten_layers};
 use crate::kernels::isa::{AnySimd, Element, Mode, Simd, with_simd};
 use crate::kernels::linear::{add_to_sum, group_sums, transpose_images};
 use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
-use crate::kernels::stack::SavedActivations;
 use crate::kernels::tensors::{Input, cpu_storage, values_of};
 
 /// Computes [B, outputs] of `images` [B, H, W, C] u8: bit for bit

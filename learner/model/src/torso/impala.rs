@@ -10,11 +10,11 @@ use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stage_shapes};
 use crate::init::Initializer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::Dense;
+use crate::kernels::impala::Stages;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::linear::add_rows;
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
-use crate::kernels::stages::Stages;
 use crate::layers::LayerSpec;
 
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [

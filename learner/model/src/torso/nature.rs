@@ -8,11 +8,11 @@ use crate::compute::Kernels;
 use crate::geometry::{ConvLayer, ConvShape};
 use crate::init::Initializer;
 use crate::kernels::buffer::Buffer;
+use crate::kernels::conv::Stack;
 use crate::kernels::dense::{Dense, pad_rows};
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
-use crate::kernels::stack::Stack;
 use crate::kernels::torso::torso;
 use crate::layers::LayerSpec;
 

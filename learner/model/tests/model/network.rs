@@ -156,6 +156,9 @@ fn inputs_that_do_not_fit_are_errors() {
     let actions = Tensor::new(&[0i64, 1, 2], &Device::Cpu).unwrap();
     let of_three = network.psi4(&features.f4, &actions);
     assert!(of_three.is_err(), "three actions for two rows");
+    for taken in [&[0, 5][..], &[0]] {
+        assert!(network.taken_logits(&features.f4, taken, None).is_err());
+    }
     let narrow = features.f4.narrow(1, 0, 5).unwrap();
     assert!(network.logits(&narrow, None).is_err());
 }
