@@ -68,12 +68,11 @@ impl Service {
             let now = Instant::now();
             let parked = state.chunks.queue.len();
             let mut replies = state.store_parked(now);
-            let has_stored = state.chunks.queue.len() < parked;
             for query in state.chunks.take_overdue(now, self.hold_max) {
                 replies.push((query, state.replay.wait_reply(true)));
             }
             // A chunk may be stored while its actor does not ask for it: a request may wait for that chunk.
-            if replies.is_empty() && !has_stored {
+            if replies.is_empty() && state.chunks.queue.len() == parked {
                 let due_in = state.chunks.due_in(now, self.hold_max);
                 self.wait_changed(state, due_in);
                 continue;

@@ -145,7 +145,7 @@ pub(super) fn park_request<Q>(queue: &mut VecDeque<ParkedRequest<Q>>, parked: Pa
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use std::borrow::Cow;
 
     use driml_protocol::{Chunk, RequestId};
@@ -155,7 +155,7 @@ mod tests {
 
     const SECOND: Duration = Duration::from_secs(1);
 
-    fn chunk(actor: u32, sequence: u64, frame_bytes: u32) -> PackedChunk<'static> {
+    pub(crate) fn chunk(actor: u32, sequence: u64, frame_bytes: u32) -> PackedChunk<'static> {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor,
             incarnation: 9,

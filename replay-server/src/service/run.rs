@@ -302,7 +302,10 @@ impl<'a> Queries<'a> {
         };
         let gate = self.gate.clone();
         let reject_long = move |bytes| match gate.service.get() {
-            Some(service) => service.reject_too_long(name, bytes, bytes_max),
+            Some(service) => {
+                let why = format!("it has {bytes} bytes, and in this run at most {bytes_max}");
+                service.state().reject(name, &why);
+            }
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };
         let (queryable, workers) =

@@ -136,8 +136,7 @@ impl Service {
     }
 
     /// Waits for a shutdown, or until the run is over or `drain` is raised and the other processes have left, for a limited time. With
-    /// `keep_alive` the end of the run does not count. While this process is stopped, hardly any time counts: the others may have been
-    /// stopped too.
+    /// `keep_alive` the end of the run does not count. A time in which this process was stopped hardly counts.
     pub(super) fn wait_until_over(&self, drain: &Shutdown, keep_alive: bool) {
         let mut waits: Option<(bool, Silence)> = None;
         while !self.shutdown.wait_timeout(CHECK_PERIOD) {

@@ -223,24 +223,6 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     replay.check_valid();
 }
 
-#[test]
-fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
-    let mut replay = small_replay(&Config::unlimited(1000));
-    insert(&mut replay, header(0, 1, 0, 0));
-    replay.sample(8).unwrap();
-    let affinity = |version| affinity(version, vec![0.2; 25]);
-    // 2^32 more than the rows.
-    let most: u64 = 8 + (1 << 32);
-    for version in [most + 1, u64::MAX] {
-        let why = replay.set_affinity(&affinity(version)).unwrap_err();
-        let expected = "of the affinity, in a run that has served 8 rows";
-        assert!(why.contains(expected), "{why}");
-    }
-    assert_eq!(replay.status().affinity_version, 0);
-    replay.set_affinity(&affinity(most)).unwrap();
-    assert_eq!(replay.status().affinity_version, most);
-}
-
 proptest! {
     #[test]
     fn neither_side_waits_for_ever_and_the_ratio_is_kept(

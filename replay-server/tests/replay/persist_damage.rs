@@ -9,7 +9,6 @@ use driml_protocol::{
     Buffer, Chunk, ChunkHeader, InsertReply, PROTOCOL_VERSION, RequestId, RunSpec,
 };
 use driml_replay_server::{Config, PersistArgs, RecoveryReport, Replay};
-
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
