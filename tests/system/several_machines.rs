@@ -33,8 +33,10 @@ impl Run {
     /// Starts a run. If the network cannot be made, returns `None` and reports the test as skipped.
     fn start(system: TestSystem, actors: usize, frames: u64, ratio: u64) -> Option<Self> {
         let network = Network::new(&MACHINES[..2 + actors])?;
+        // Without shared memory, which namespaces share, everything goes through the links.
         let flags = format!(
-            "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio}"
+            "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio} \
+             --set transport.shared_memory=false"
         );
         let mut run = Self {
             system,
