@@ -9,13 +9,8 @@
     reason = "a bench"
 )]
 
-use std::{
-    hint::black_box,
-    sync::Mutex,
-    time::{Duration, Instant},
-};
+use std::{hint::black_box, time::Instant};
 
-use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use driml_actor::ChunkRecorder;
 use driml_envs::{ProcgenEngine, StepEnd};
 use driml_machine::resources::Machine;
@@ -84,31 +79,21 @@ fn chunks(config: &RunConfig, runs_right: bool) -> Vec<Chunk> {
 }
 
 /// Stores the next chunk; the chunks repeat endlessly.
-fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: &mut usize) {
-    let chunk = &mut chunks[*sequence % CHUNKS];
-    chunk.header.sequence = *sequence as u64;
-    chunk.header.first_transition = *sequence as u64 * TRANSITIONS / CHUNKS as u64;
+fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: usize) {
+    let chunk = &mut chunks[sequence % CHUNKS];
+    chunk.header.sequence = sequence as u64;
+    chunk.header.first_transition = sequence as u64 * TRANSITIONS / CHUNKS as u64;
     assert!(matches!(replay.insert(chunk), InsertReply::Stored { .. }));
-    *sequence += 1;
 }
 
-/// Makes `batches` batches on two threads, as the replay server does: drawn with the replay locked, unpacked without the lock.
-fn time_on_two_threads(replay: &Mutex<Replay>, batches: u64) -> Duration {
-    let make = |count| {
-        for _ in 0..count {
-            let draft = replay.lock().unwrap().draw(ROWS, Buffer::zeroed).unwrap();
-            black_box(draft.unpack());
-        }
-    };
+/// Returns the mean time of `work`, in microseconds.
+fn mean_us(mut work: impl FnMut(usize)) -> f64 {
     let started = Instant::now();
-    std::thread::scope(|scope| {
-        scope.spawn(|| make(batches / 2));
-        make(batches.div_ceil(2));
-    });
-    started.elapsed()
+    (0..CHUNKS).for_each(&mut work);
+    started.elapsed().as_secs_f64() * 1e6 / CHUNKS as f64
 }
 
-fn bench(criterion: &mut Criterion) {
+fn main() {
     ProcgenEngine::install(&mut |line| println!("{line}")).unwrap();
     for (game, runs_right) in [
         ("bigfish", false),
@@ -121,39 +106,19 @@ fn bench(criterion: &mut Criterion) {
         let config = settings(game);
         let mut chunks = chunks(&config, runs_right);
         for compression in [Compression::None, Compression::Lz4] {
-            let (mut replay, mut sequence) = (replay(&config, compression), 0);
-            for _ in 0..CHUNKS {
-                insert_next(&mut replay, &mut chunks, &mut sequence);
-            }
+            let mut replay = replay(&config, compression);
+            // The first round fills the replay, the second replaces its transitions.
+            mean_us(|sequence| insert_next(&mut replay, &mut chunks, sequence));
+            let insert =
+                mean_us(|sequence| insert_next(&mut replay, &mut chunks, CHUNKS + sequence));
+            let draw = mean_us(|_| drop(black_box(replay.draw(ROWS, Buffer::zeroed).unwrap())));
+            let batch = mean_us(|_| drop(black_box(replay.sample(ROWS).unwrap())));
             let held = replay.status().frame_bytes_held as f64 / TRANSITIONS as f64;
             println!(
-                "{name}, {compression:?}: {held:.0} bytes of frames a transition, {:.2} GB for 10^6 with all fields",
+                "{name}, {compression:?}: {held:.0} bytes of frames a transition, {:.2} GB for 10^6 with all fields; \
+                 insert of 16 x 16 {insert:.0} us, draw of 256 {draw:.0} us, batch of 256 {batch:.0} us",
                 (held + 32.0) / 1e3
             );
-            let how = format!("{compression:?}").to_lowercase();
-            let mut group = criterion.benchmark_group(format!("replay of {name}"));
-            group.sample_size(10);
-            group.warm_up_time(Duration::from_millis(300));
-            group.measurement_time(Duration::from_secs(1));
-            group.throughput(Throughput::Elements((COPIES * STEPS_PER_CHUNK) as u64));
-            group.bench_function(BenchmarkId::new("insert 16 x 16", &how), |b| {
-                b.iter(|| insert_next(&mut replay, &mut chunks, &mut sequence));
-            });
-            group.throughput(Throughput::Elements(1));
-            group.bench_function(BenchmarkId::new("draw 256 (locked)", &how), |b| {
-                b.iter(|| black_box(replay.draw(ROWS, Buffer::zeroed).unwrap()));
-            });
-            group.bench_function(BenchmarkId::new("draw and unpack 256", &how), |b| {
-                b.iter(|| black_box(replay.sample(ROWS).unwrap()));
-            });
-            let shared = Mutex::new(replay);
-            group.bench_function(BenchmarkId::new("the same on two threads", &how), |b| {
-                b.iter_custom(|batches| time_on_two_threads(&shared, batches));
-            });
-            group.finish();
         }
     }
 }
-
-criterion_group!(benches, bench);
-criterion_main!(benches);

@@ -15,12 +15,12 @@ pub struct Network {
     machines: Vec<String>,
 }
 
-/// Runs `ip` with these arguments.
-fn ip(args: &str) -> Result<(), String> {
+/// Runs `ip` with these arguments, and returns what it prints.
+fn ip(args: &str) -> Result<String, String> {
     let output = Command::new("ip").args(args.split_whitespace()).output();
     let output = output.map_err(|e| format!("{args}: {e}"))?;
     match output.status.success() {
-        true => Ok(()),
+        true => Ok(String::from_utf8_lossy(&output.stdout).into_owned()),
         false => Err(format!(
             "{args}: {}",
             String::from_utf8_lossy(&output.stderr).trim()
@@ -56,7 +56,7 @@ impl Network {
         );
         for (number, machine) in self.machines.iter().enumerate() {
             let namespace = self.namespace(machine);
-            let (inner, outer) = (format!("{}i{number}", self.name), self.router_end(machine));
+            let (inner, outer) = (self.machine_end(machine), self.router_end(machine));
             commands += &format!(
                 "
                 netns add {namespace}
@@ -69,7 +69,9 @@ impl Network {
                 -n {namespace} route add default via 10.77.{number}.1"
             );
         }
-        commands.lines().map(str::trim).try_for_each(ip)
+        commands
+            .lines()
+            .try_for_each(|line| ip(line.trim()).map(drop))
     }
 
     fn machine_index(&self, machine: &str) -> usize {
@@ -79,6 +81,11 @@ impl Network {
 
     fn namespace(&self, machine: &str) -> String {
         format!("{}-{machine}", self.name)
+    }
+
+    /// A machine's end of its link.
+    fn machine_end(&self, machine: &str) -> String {
+        format!("{}i{}", self.name, self.machine_index(machine))
     }
 
     /// The router's end of a machine's link.
@@ -111,19 +118,28 @@ impl Network {
         ip(&format!("-n {router} link set {device} {state}")).unwrap();
     }
 
-    /// Limits a machine's link to `kbit` kbit/s in each direction. Returns false if the kernel does not support it.
-    pub fn limit_rate(&self, machine: &str, kbit: u32) -> bool {
-        let inner = format!("{}i{}", self.name, self.machine_index(machine));
+    /// Limits what a machine sends and receives, in kbit/s. Packets beyond that wait at the link. Returns false if the kernel does not
+    /// support it.
+    pub fn limit_rate(&self, machine: &str, sent: u32, received: u32) -> bool {
+        let router = (self.namespace("router"), self.router_end(machine));
         let ends = [
-            (self.namespace("router"), self.router_end(machine)),
-            (self.namespace(machine), inner),
+            ((self.namespace(machine), self.machine_end(machine)), sent),
+            (router, received),
         ];
-        ends.iter().all(|(namespace, device)| {
+        ends.iter().all(|((namespace, device), kbit)| {
             let words = format!(
-                "netns exec {namespace} tc qdisc replace dev {device} root tbf rate {kbit}kbit burst 16kb latency 200ms"
+                "netns exec {namespace} tc qdisc replace dev {device} root tbf rate {kbit}kbit burst 2kb latency 5s"
             );
             ip(&words).is_ok()
         })
+    }
+
+    /// Returns how often a packet that a machine sent had to wait for the limit of its link.
+    pub fn delayed_packets(&self, machine: &str) -> u64 {
+        let (namespace, device) = (self.namespace(machine), self.machine_end(machine));
+        let queue = format!("netns exec {namespace} tc -s -j qdisc show dev {device}");
+        let queue: serde_json::Value = serde_json::from_str(&ip(&queue).unwrap()).unwrap();
+        queue[0]["overlimits"].as_u64().unwrap()
     }
 }
 

@@ -16,6 +16,8 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
     fs::create_dir(&used).unwrap();
     fs::write(used.join("metrics.csv"), "old").unwrap();
     fs::write(system.path("odd.toml"), "[run]\nworld = \"chain\"\n").unwrap();
+    fs::create_dir(system.path("odd")).unwrap();
+    fs::write(system.path("odd/config.toml"), "[run]\n").unwrap();
     let stderr_of = |call: &str| {
         let mut command = system.command(call);
         // The usage text contains the name by which the program was called.

@@ -105,30 +105,21 @@ fn a_closed_window_saves_the_run() {
     check_ended_saved(&system, launcher);
 }
 
+/// `driml local ... 2>&1 | head -2`, with processes and in lockstep.
 #[test]
 fn a_pipe_closed_after_two_lines_saves_the_run() {
-    let system = system();
-    // `driml local ... 2>&1 | head -2`
-    let (reader, writer) = pipe().unwrap();
-    let run = system.local_args(&format!("--agent driml-ada {LONG}"));
-    let launcher = spawn(&system, &run, writer.try_clone().unwrap(), writer);
-    let mut lines = BufReader::new(reader).lines();
-    let head = [lines.next(), lines.next()];
-    assert!(head.iter().flatten().all(|line| line.is_ok()), "{head:?}");
-    system.connect().wait_for_updates(100);
-    drop(lines);
-    check_ended_saved(&system, launcher);
-}
-
-#[test]
-fn a_closed_pipe_saves_a_run_in_lockstep() {
-    let system = system();
-    let (reader, writer) = pipe().unwrap();
-    let run = format!("local --agent c51 {LONG} --lockstep --run-dir run");
-    let launcher = spawn(&system, &run, Stdio::null(), writer);
-    system.run_folder("run").wait_for_updates(100);
-    drop(reader);
-    check_ended_saved(&system, launcher);
+    for flags in ["--agent driml-ada", "--agent c51 --lockstep"] {
+        let system = system();
+        let (reader, writer) = pipe().unwrap();
+        let run = format!("local {LONG} {flags} --run-dir run");
+        let launcher = spawn(&system, &run, writer.try_clone().unwrap(), writer);
+        let mut lines = BufReader::new(reader).lines();
+        let head = [lines.next(), lines.next()];
+        assert!(head.iter().flatten().all(|line| line.is_ok()), "{head:?}");
+        system.run_folder("run").wait_for_updates(100);
+        drop(lines);
+        check_ended_saved(&system, launcher);
+    }
 }
 
 /// Returns whether hangups are ignored, as under `nohup`, and then reports the test as skipped. Asks the kernel, not the program.

@@ -17,37 +17,30 @@ use crate::{
     system, tiny_replay,
 };
 
-/// Transitions in a log, one record each. Reading `LONG` takes longer than the time-out for an unreachable server.
-const LONG: u64 = 1_000_000;
-const SHORTER: u64 = 400_000;
+/// Transitions in a log, one record each. A slow machine reads them for longer than the time-out for an unreachable server.
+const KEPT: u64 = 400_000;
 const WARMUP: u64 = 192;
+/// The updates of a run that continues with the log: one of 16 rows for 1,024 transitions after the warm-up.
+const PLANNED_UPDATES: u64 = KEPT / 1024 + 15;
+const PLANNED_FRAMES: u64 = WARMUP + 1024 * PLANNED_UPDATES;
 /// The time-out for an unresponsive server in these runs, in seconds.
 const UNREACHABLE_MAX_S: f64 = 5.0;
 /// What a waiting process logs.
 const WAITING_LOG: &str =
     "waiting for as long as it takes: the replay server reads its replay back from disk, ";
 
-/// Returns the updates of a run that continues with `kept` transitions: one of 16 rows for 1,024 transitions after the warm-up.
-const fn planned_updates(kept: u64) -> u64 {
-    kept / 1024 + 15
-}
-
-const fn planned_frames(kept: u64) -> u64 {
-    WARMUP + 1024 * planned_updates(kept)
-}
-
 /// Returns flags without shared memory: a slow process would hold the lock of `/dev/shm` for seconds, for which other tests wait.
-fn flags(kept: u64) -> String {
-    let (frames, capacity) = (planned_frames(kept), kept + 100_000);
+fn flags() -> String {
+    let capacity = KEPT + 100_000;
     format!(
-        "--agent c51 --env chain --preset smoke --frames {frames} --set replay.replay_ratio=0.015625 \
+        "--agent c51 --env chain --preset smoke --frames {PLANNED_FRAMES} --set replay.replay_ratio=0.015625 \
          --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions={capacity} --set replay.slack_transitions=2048 \
          --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000 --set transport.shared_memory=false"
     )
 }
 
-/// Writes `kept` transitions of another actor into the log in `folder`, for a run with these settings. Returns the run spec.
-fn write_log(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
+/// Writes [`KEPT`] transitions of another actor into the log in `folder`, for a run with these settings. Returns the run spec.
+fn write_log(folder: &Path, config_toml: &str) -> RunSpec {
     let settings = Settings::parse(config_toml).unwrap();
     let spec: RunSpec = settings.table("run").unwrap();
     let mut config: Config = settings.table("replay").unwrap();
@@ -61,7 +54,7 @@ fn write_log(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
     tiny_replay::join_actor(&mut replay, 9);
     let mut header = tiny_replay::header(&spec, 9, 1, 1);
-    for sequence in 0..kept {
+    for sequence in 0..KEPT {
         (header.sequence, header.first_transition) = (sequence, sequence);
         let mut chunk = Chunk::zeroed(header);
         chunk.set(0, 0, 0.0, End::Running);
@@ -71,12 +64,12 @@ fn write_log(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     spec
 }
 
-/// Makes a log of `kept` transitions in the folder `replay`. Returns the run spec, and the flags of a replay server that reads the log.
-fn prepare_log(system: &TestSystem, kept: u64) -> (RunSpec, String) {
-    let flags = flags(kept);
+/// Makes a log in the folder `replay`. Returns the run spec, and the flags of a replay server that reads the log.
+fn prepare_log(system: &TestSystem) -> (RunSpec, String) {
+    let flags = flags();
     let server = system.start_replay_server(&flags);
     let client = system.connect();
-    let spec = write_log(kept, &system.path("replay"), &client.config_toml);
+    let spec = write_log(&system.path("replay"), &client.config_toml);
     drop(client);
     server.stop(130);
     (spec, format!("{flags} --replay-dir replay"))
@@ -132,28 +125,39 @@ fn check_postponed(system: &TestSystem, spec: &RunSpec) {
     check_replies(&client, rows);
 }
 
-/// Processes wait beyond the time-out for an unreachable server: some were there when the server died, others start while it reads.
+/// All checks share one log, which the last check damages.
 #[test]
-fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
+fn a_long_log_is_read_back() {
     let system = system();
-    let (spec, serve) = prepare_log(&system, LONG);
-    let server = system.start_replay_server(&serve);
+    let (spec, serve) = prepare_log(&system);
+    let server = a_server_that_reads_is_stopped_and_started_again(&system, &serve);
+    all_processes_wait_for_a_server_that_reads_its_replay_back(&system, &spec, &serve, server);
+    a_server_with_an_unreadable_log_ends(&system, &serve);
+}
+
+/// Processes wait beyond the time-out for an unreachable server: some were there when the server died, others start while it reads.
+fn all_processes_wait_for_a_server_that_reads_its_replay_back(
+    system: &TestSystem,
+    spec: &RunSpec,
+    serve: &str,
+    server: Process,
+) {
     let mut learner = system.start_learner("run");
     let mut actors = vec![system.start_actor(0)];
     system.connect().wait_for_updates(50);
     server.kill();
 
-    let mut server = start_stopped(&system, &serve);
+    let mut server = start_stopped(system, serve);
     let slow = slow_down(&mut server);
-    let first = recovery_progress(&system).expect("it has a long log");
-    check_postponed(&system, &spec);
+    let first = recovery_progress(system).expect("it has a long log");
+    check_postponed(system, spec);
     let words = [
         "chain, c51: frames ?/",
         "replay-server recovering ",
         "reads its replay back from disk (",
         "no action needed",
     ];
-    check_has(&status_text(&system), &words);
+    check_has(&status_text(system), &words);
     let watch_once = system.connect_args("watch --once");
     system.fails(&watch_once, "reads its replay back from disk");
     let mut watched = system.start(&system.connect_args("watch --run-dir seen"));
@@ -163,7 +167,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     actors[0].wait_for_stderr("the replay server reads its replay back from disk, ");
     learner.wait_for_stderr("the replay server reads its replay back from disk, ");
     let last = wait_for("more than the limit for an absent server", || {
-        let now = recovery_progress(&system).expect("the log is long enough");
+        let now = recovery_progress(system).expect("the log is long enough");
         (now["since_s"].as_f64() > Some(UNREACHABLE_MAX_S + 3.0)).then_some(now)
     });
     let read = |it: &Value| it["bytes_read"].as_u64();
@@ -177,25 +181,22 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let client = system.connect();
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
-    assert_eq!(status.updates, planned_updates(LONG));
-    assert_eq!(replay.rows_sampled, 16 * planned_updates(LONG));
-    assert_eq!(replay.transitions_inserted, planned_frames(LONG));
+    assert_eq!(status.updates, PLANNED_UPDATES);
+    assert_eq!(replay.rows_sampled, 16 * PLANNED_UPDATES);
+    assert_eq!(replay.transitions_inserted, PLANNED_FRAMES);
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait_ok();
     let seen = system.run_folder("seen").summary();
-    assert_eq!(seen.updates, planned_updates(LONG));
+    assert_eq!(seen.updates, PLANNED_UPDATES);
     learner.stop(0);
     drop(client);
     let exit = server.stop(0);
     exit.expect_stderr("continues with the replay in replay");
 }
 
-/// A server that is told to stop exits, however much is left to read. The next server reads everything.
-#[test]
-fn a_server_that_reads_is_stopped_and_started_again() {
-    let system = system();
-    let (_, serve) = prepare_log(&system, SHORTER);
-    let mut server = start_stopped(&system, &serve);
+/// A server that is told to stop exits, however much is left to read. The next server reads everything, and is returned.
+fn a_server_that_reads_is_stopped_and_started_again(system: &TestSystem, serve: &str) -> Process {
+    let mut server = start_stopped(system, serve);
     let slow = slow_down(&mut server);
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr(WAITING_LOG);
@@ -203,32 +204,34 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     exit.expect_stderr("it was stopped while it read its replay back");
     drop(slow);
     actor.stop(130);
-    let server = system.start_replay_server(&serve);
+    let server = system.start_replay_server(serve);
     let replay = system.connect().replay_status().unwrap();
-    assert_eq!(replay.transitions_inserted, SHORTER);
-    server.stop(130);
+    assert_eq!(replay.transitions_inserted, KEPT);
+    server
+}
 
-    // A server with an unreadable log exits with an error, and no process waits for it any more.
+/// The server exits with an error, and no process waits for it any more.
+fn a_server_with_an_unreadable_log_ends(system: &TestSystem, serve: &str) {
     for entry in fs::read_dir(system.path("replay")).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|it| it == "log") {
             fs::write(path, "no log").unwrap();
         }
     }
-    let server = system.start_replay_server(&serve);
+    let server = system.start_replay_server(serve);
     server.fails("no segment can be read");
 }
 
 #[test]
 fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
-    let mut process = system.start(&system.local_args(&format!("--durable {}", flags(SHORTER))));
+    let mut process = system.start(&system.local_args(&format!("--durable {}", flags())));
     system.connect().wait_for_updates(10);
     process.stop(130);
     let run = system.run_folder("run");
     let config = system.read("run/config.toml");
-    write_log(SHORTER, &run.path().join("replay"), &config);
-    let stored = run.summary().replay.transitions_inserted + SHORTER;
+    write_log(&run.path().join("replay"), &config);
+    let stored = run.summary().replay.transitions_inserted + KEPT;
     let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
     process = system.start(&format!("local --resume run --frames {frames}"));
@@ -248,7 +251,7 @@ fn roles_are_told_too() {
     let Some(system) = system().over_tls() else {
         return;
     };
-    let (_, serve) = prepare_log(&system, SHORTER);
+    let (_, serve) = prepare_log(&system);
     let mut server = system.start_replay_server(&serve);
     let slow = slow_down(&mut server);
     let [mut actor, mut learner] = [system.start_actor(0), system.start_learner("run")];

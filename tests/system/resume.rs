@@ -104,12 +104,6 @@ fn a_run_whose_processes_were_all_killed_continues() {
 #[test]
 fn what_cannot_be_resumed() {
     let system = system();
-    system.rejects_each(
-        "
-        local --resume nowhere => --resume takes the folder of a run that was interrupted
-        local --resume run --agent c51 => cannot be used with
-        ",
-    );
     let run = format!("local --agent c51 {SHORT} --run-dir run");
     system.run_ok(&run);
     for less in ["", "--frames 700"] {

@@ -33,8 +33,10 @@ impl Run {
     /// Starts a run. If the network cannot be made, returns `None` and reports the test as skipped.
     fn start(system: TestSystem, actors: usize, frames: u64, ratio: u64) -> Option<Self> {
         let network = Network::new(&MACHINES[..2 + actors])?;
+        // Without shared memory, which namespaces share, everything goes through the links.
         let flags = format!(
-            "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio}"
+            "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio} \
+             --set transport.shared_memory=false"
         );
         let mut run = Self {
             system,
@@ -151,16 +153,27 @@ fn cut_cables_heal_by_themselves() {
     run.check_end(Duration::from_secs(300));
 }
 
-/// One actor has a link of 256 kbit/s. No process restarts or loses its connection, and nothing is lost.
+/// One actor sends 64 kbit/s, so that a chunk takes half a second. No process restarts or loses its connection, and nothing is lost.
 #[test]
 fn a_narrow_link_stops_no_process() {
-    let Some(mut run) = Run::start(system(), 2, 16_000, 8) else {
+    let system = system();
+    // Pause the learner, so that the other actor does not play all frames before this one begins.
+    system.pause_learners_at(500);
+    let Some(mut run) = Run::start(system, 2, 10_000, 8) else {
         return;
     };
-    if !run.network.limit_rate("actor0", 256) {
+    wait_until("both actors", || {
+        let status = run.status();
+        status.is_some_and(|it| it["replay"]["actors_acting"] == 2)
+    });
+    if !run.network.limit_rate("actor0", 64, 256) {
         return skip("tc knows no tbf");
     }
-    run.wait_for_frames(10_000);
+    run.system.release_learners();
+    wait_until("packets that wait at the link", || {
+        run.network.delayed_packets("actor0") > 20
+    });
+    run.wait_for_frames(6_000);
     let status = wait_for("an answer", || run.status());
     let processes = &status["servers"][0]["processes"]["processes"];
     let processes = processes.as_array().unwrap();
