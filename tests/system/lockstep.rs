@@ -51,7 +51,7 @@ fn compared_results(it: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
 /// Makes a whole run, one that is prolonged after half of its frames, and one that is resumed after each signal. SIGINT saves a checkpoint;
 /// after SIGKILL, updates since the last checkpoint are made again. All runs give the same result.
 pub(crate) fn continues_exactly(flags: &str) {
-    const FRAMES: u64 = 1024;
+    const FRAMES: u64 = 2048;
     let start = |system: &TestSystem, frames: u64, name: &str| {
         system.start(&format!(
             "local --lockstep {flags} --actors 2 --frames {frames} --set replay.replay_ratio=8 \

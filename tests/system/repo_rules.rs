@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_500),
-    ("actor", 11_125),
+    ("protocol", 7_460),
+    ("actor", 10_980),
     ("replay-server", 11_170),
-    ("learner", 23_695),
-    ("deploy", 31_245),
-    ("tests", 10_640),
+    ("learner", 23_050),
+    ("deploy", 31_070),
+    ("tests", 10_580),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;
