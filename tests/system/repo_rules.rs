@@ -12,8 +12,8 @@ use walkdir::{DirEntry, WalkDir};
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_460),
-    ("actor", 10_980),
-    ("replay-server", 11_170),
+    ("actor", 10_990),
+    ("replay-server", 11_180),
     ("learner", 23_050),
     ("deploy", 31_070),
     ("tests", 10_580),

@@ -286,6 +286,20 @@ mod tests {
     }
 
     #[test]
+    fn waiting_has_a_beginning() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let warm_up = |have| Waiting::WarmUp { have, need: 100 };
+        let mut participants = Participants::new(start);
+        let actors = Waiting::ActorsWaitForLearner;
+        for (now, waiting, since) in [(1, warm_up(1), 1), (4, warm_up(50), 1), (6, actors, 6)] {
+            participants.set_waiting(waiting, at(now));
+            let seconds = (8 - since) as f64;
+            assert_eq!(participants.waiting(at(8)), (waiting, seconds));
+        }
+    }
+
+    #[test]
     fn of_very_many_processes_only_the_newest_warnings_are_passed_on() {
         let now = Instant::now();
         let mut participants = Participants::new(now);

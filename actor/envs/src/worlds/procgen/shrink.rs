@@ -146,4 +146,14 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn frames_of_several_environments_stay_apart() {
+        let (one, other) = (random(), vec![9; FRAME_BYTES]);
+        let both = shrunk(32, true, &[one.clone(), other.clone()].concat());
+        assert_eq!(
+            both,
+            [shrunk(32, true, &one), shrunk(32, true, &other)].concat()
+        );
+    }
 }
