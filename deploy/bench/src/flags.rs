@@ -41,10 +41,10 @@ pub enum BenchCommand {
     /// Runs with more and more actors: throughput, waiting time, age of weights
     Scale {
         /// Numbers of actors, such as 1,8,32 [default: 1,2,4,8,16,32, or 1,2 with --quick]
-        #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=256))]
+        #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = whole_number::within_u32(1..=256))]
         actors: Vec<u32>,
         /// Seconds per number of actors [default: 5, or 2 with --quick]
-        #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..=86_400))]
+        #[arg(long, value_name = "S", value_parser = whole_number::within_u32(1..=86_400))]
         seconds: Option<u32>,
     },
     /// Learner, policy, replay and env, in turn with PyTorch, Reverb and gym3 on the same work
@@ -61,7 +61,7 @@ pub struct BenchFlags {
     #[arg(long, global = true, value_name = "FILE")]
     pub(crate) json: Option<PathBuf>,
     /// Threads for arithmetic
-    #[arg(long, global = true, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(long, global = true, value_name = "N", default_value_t = 2, value_parser = whole_number::within_u32(1..=1024))]
     pub(crate) threads: u32,
     /// Precision of products, for learner and policy [default: both]; may be given several times
     #[arg(long, global = true, value_name = "PRECISION")]
@@ -105,7 +105,7 @@ pub struct BenchReplayArgs {
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = whole_number::within(1_000..=100_000_000))]
     pub(crate) held: u64,
     /// Rounds per server [default: 3 with --replay-dir, else 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=1000))]
     pub(crate) rounds: Option<u32>,
     /// Compare TCP and QUIC instead; this folder has certificates of replay-server, observer, learner and actors 1 to 5
     #[arg(long, value_name = "DIR", conflicts_with_all = ["replay_dir", "rounds"])]
@@ -119,7 +119,7 @@ pub struct BenchPeersArgs {
     #[arg(long, value_enum, value_delimiter = ',', value_name = "COMPONENTS")]
     pub(crate) only: Vec<Component>,
     /// Rounds of both programs [default: 5, or 1 with --quick]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=1000))]
     pub(crate) rounds: Option<u32>,
     /// Python with all peers
     #[arg(long, value_name = "PATH", default_value = "python3")]

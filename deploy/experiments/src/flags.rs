@@ -39,7 +39,7 @@ pub struct ExperimentFlags {
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Seeds 1 to N [default: from the experiment's settings]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(SEEDS_MAX)))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=SEEDS_MAX))]
     pub(crate) seeds: Option<u32>,
 }
 
@@ -47,7 +47,7 @@ pub struct ExperimentFlags {
 #[derive(Clone, Debug, Args)]
 pub struct QueueFlags {
     /// Runs at once [default: from the experiment's settings]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=256))]
     pub(crate) jobs: Option<u32>,
     /// Only write figures, data and page of finished runs
     #[arg(long)]
@@ -92,7 +92,7 @@ pub struct ProcgenArgs {
     #[arg(long, value_name = "N", value_parser = whole_number::within(500..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Greedy episodes per checkpoint, for the last three of a run [default: 100]; three times as many with averaged weights
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=1_000_000))]
     pub(crate) episodes: Option<u32>,
     /// Named settings [default: tuned]; `driml presets` lists them
     #[arg(long, value_name = "NAME")]
@@ -106,7 +106,7 @@ pub struct TradeoffArgs {
     #[arg(long, value_name = "WORLD", default_value = "mspacman")]
     pub(crate) env: String,
     /// Minutes for new runs; levels that do not fit with all their seeds are skipped
-    #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = clap::value_parser!(u32).range(0..=100_000))]
+    #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = whole_number::within_u32(0..=100_000))]
     pub(crate) budget: u32,
     /// Settings to change, such as learner.precision,DIM [default: all]; a wrong name lists them
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
@@ -118,7 +118,7 @@ pub struct TradeoffArgs {
     #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
     /// Greedy episodes per run [default: 100]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole_number::within_u32(1..=1_000_000))]
     pub(crate) episodes: Option<u32>,
     #[command(flatten)]
     pub(crate) flags: ExperimentFlags,
@@ -146,10 +146,10 @@ pub struct SweepArgs {
     #[arg(long = "set", value_name = "KEY=VALUE,..")]
     pub(crate) sets: Vec<String>,
     /// Seeds 1 to N per combination
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(SEEDS_MAX)))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole_number::within_u32(1..=SEEDS_MAX))]
     pub(crate) seeds: u32,
     /// Runs at once; they share the cores
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole_number::within_u32(1..=256))]
     pub(crate) jobs: u32,
     /// Only write table and plot of finished runs
     #[arg(long)]

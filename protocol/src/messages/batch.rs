@@ -160,7 +160,7 @@ impl Batch {
             merged.states_k += part.states_k;
             merged.states_n += part.states_n;
             merged.counts = merged.counts + part.counts;
-            merged.held += part.held;
+            merged.held = merged.held.saturating_add(part.held);
             age_total += part.mean_age * f64::from(part.rows);
             let (newest, oldest) = part.weights_versions;
             let (a, b) = merged.weights_versions;

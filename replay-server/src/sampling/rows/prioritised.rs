@@ -156,6 +156,8 @@ impl RowSampler for PrioritisedSampler {
         Some(self.masses.get(self.slot(index)) / self.masses.total())
     }
 
+    /// A repeated update changes nothing, nor does a row whose transition has been overwritten: both are counted.
+    /// Rows of other shards are ignored.
     fn set_priorities(
         &mut self,
         ring: &Ring,

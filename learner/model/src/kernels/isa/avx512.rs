@@ -248,6 +248,7 @@ impl Vector for F32 {
     type Element = f32;
     type Sums = __m512;
     type Operand = __m512;
+    const REGISTERS: usize = 32;
 
     #[inline(always)]
     unsafe fn load_row(at: *const f32) -> __m512 {
@@ -269,6 +270,7 @@ impl Vector for Bf16 {
     type Element = bf16;
     type Sums = __m512;
     type Operand = __m512i;
+    const REGISTERS: usize = 32;
 
     #[inline(always)]
     unsafe fn load_row(at: *const bf16) -> __m512i {

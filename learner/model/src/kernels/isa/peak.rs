@@ -1,4 +1,4 @@
-//! The peak multiplication rate of a processor: one tile whose operands stay in the L1 cache, over and over.
+//! The peak multiplication rate of a processor: its largest tile, whose operands stay in the L1 cache, over and over.
 //! Benchmarks compare the kernels with this rate. The product itself is not used.
 
 use rayon::prelude::*;
@@ -12,16 +12,17 @@ use super::{
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
 
-/// Scalars along the reduction axis. A panel one register wide then takes 16 KiB in f32.
-const DEPTH: usize = 256;
+/// The size of the right operand, which fits into the L1 cache of every processor.
+const PANEL_BYTES: usize = 1 << 14;
 
-/// Multiplies the tallest tile that is one register wide `times` times on every thread of the pool. Returns the FLOPs of all of them.
+/// Multiplies the widest tile, as tall as it may be, `times` times on every thread of the pool. Returns the FLOPs of all of them.
 pub fn multiply_in_first_cache(precision: Precision, times: usize) -> f64 {
     with_simd!(AnySimd::fastest(precision), simd => multiply(simd, times))
 }
 
 fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
-    let rows = S::rows_max(1);
+    let (vecs, rows) = (S::VECS_MAX, S::rows_max(S::VECS_MAX));
+    let (cols, depth) = (vecs * LANES, reduction_len(simd));
     let threads = rayon::current_num_threads();
     (0..threads).into_par_iter().with_max_len(1).for_each(|_| {
         let ones = |len| {
@@ -29,41 +30,46 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
             ones.fill(S::Element::rounded(1.0));
             ones
         };
-        let (left, panel) = (ones(rows * DEPTH), ones(DEPTH * LANES));
-        let mut out = Buffer::zeros(rows * LANES);
+        let (left, panel) = (ones(rows * depth), ones(depth * cols));
+        let mut out = Buffer::zeros(rows * cols);
         for _ in 0..times {
-            let left = LeftOperand::rows(&left, DEPTH);
+            let left = LeftOperand::rows(&left, depth);
             let output = OutputTile {
                 out: &mut out,
-                row_stride: LANES,
-                cols: LANES,
-                vecs: 1,
+                row_stride: cols,
+                cols,
+                vecs,
                 mode: Mode::Replace,
             };
             multiply_tile(simd, rows, left, &panel, output);
         }
         assert!(
-            out.iter().all(|&sum| sum == DEPTH as f32),
+            out.iter().all(|&sum| sum == depth as f32),
             "sums of products of ones are {:?}",
             &*out
         );
     });
-    2.0 * (threads * times * rows * LANES * DEPTH) as f64
+    2.0 * (threads * times * rows * cols * depth) as f64
+}
+
+/// Scalars of the panel along the reduction axis.
+fn reduction_len<S: Simd>(_: S) -> usize {
+    PANEL_BYTES / (S::VECS_MAX * LANES * size_of::<S::Element>())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn rows_of<S: Simd>(_: S) -> usize {
-        S::rows_max(1)
+    fn tile_products<S: Simd>(simd: S) -> usize {
+        S::rows_max(S::VECS_MAX) * S::VECS_MAX * LANES * reduction_len(simd)
     }
 
     #[test]
     fn every_instruction_set_sums_the_tile_that_is_counted() {
         for simd in Precision::ALL.into_iter().flat_map(AnySimd::all_available) {
-            let (thrice, rows) = with_simd!(simd, simd => (multiply(simd, 3), rows_of(simd)));
-            let products = 3 * rayon::current_num_threads() * rows * LANES * DEPTH;
+            let (thrice, once) = with_simd!(simd, simd => (multiply(simd, 3), tile_products(simd)));
+            let products = 3 * rayon::current_num_threads() * once;
             assert_eq!(thrice, 2.0 * products as f64);
         }
     }

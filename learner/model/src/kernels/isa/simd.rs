@@ -32,6 +32,13 @@ pub(crate) struct RawTile<E> {
     pub(super) mode: Mode,
 }
 
+impl<E> RawTile<E> {
+    /// Whether the rows are neighbouring windows, three pixels wide: each begins a third of a run after the one before.
+    pub(super) const fn has_three_taps(&self) -> bool {
+        self.steps.is_multiple_of(3) && self.row_stride * 3 == self.steps * self.step_stride
+    }
+}
+
 /// An instruction set, with the type in which it stores operands. Sums are f32.
 ///
 /// A value exists only if the processor has the instructions: `new` checks that first.
