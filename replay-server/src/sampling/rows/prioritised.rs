@@ -156,8 +156,7 @@ impl RowSampler for PrioritisedSampler {
         Some(self.masses.get(self.slot(index)) / self.masses.total())
     }
 
-    /// A repeated update changes nothing, nor does a row whose transition has been overwritten: both are counted.
-    /// Rows of other shards are ignored.
+    /// Only counts rows of a repeated update, and rows whose transition was overwritten. Ignores rows of other shards.
     fn set_priorities(
         &mut self,
         ring: &Ring,

@@ -33,9 +33,11 @@ pub(crate) struct RawTile<E> {
 }
 
 impl<E> RawTile<E> {
-    /// Whether the rows are neighbouring windows, three pixels wide: each begins a third of a run after the one before.
-    pub(super) const fn has_three_taps(&self) -> bool {
-        self.steps.is_multiple_of(3) && self.row_stride * 3 == self.steps * self.step_stride
+    /// How many rows read each step of a run: 2 or 3 if the rows are windows that overlap by a half or by two thirds, else 1.
+    pub(super) fn taps(&self) -> usize {
+        let run = self.steps * self.step_stride;
+        let fits = |taps: &usize| self.steps.is_multiple_of(*taps) && self.row_stride * taps == run;
+        [2, 3].into_iter().find(fits).unwrap_or(1)
     }
 }
 

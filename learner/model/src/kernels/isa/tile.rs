@@ -63,7 +63,7 @@ pub(crate) struct OutputTile<'a> {
 
 /// Multiplies `rows` rows of `left` by `panel` [runs * steps, vecs * LANES, DEPTH].
 ///
-/// Sums are in the order of the runs and steps; AVX-512 takes the taps of [`RawTile::has_three_taps`] together.
+/// Sums are in the order of the runs and steps; AVX-512 takes those that share a pixel together.
 ///
 /// # Panics
 /// If a size is 0 or beyond the instruction set's, or an operand or the output is too short.

@@ -6,9 +6,6 @@ use super::{
     simd::{LANES, Mode, RawTile},
 };
 
-/// Neighbouring pixels of a window's row in [`add_windows`].
-const TAPS: usize = 3;
-
 /// Accumulators of `LANES` columns, in registers.
 #[allow(unsafe_code, reason = "instructions of one kind of processor")]
 pub(super) trait Sums: Copy {
@@ -24,7 +21,7 @@ pub(super) trait Vector: Copy {
     type Sums: Sums;
     /// One step of `LANES` columns, or of one row.
     type Operand: Copy;
-    /// Registers that hold one of `Sums` or an operand; 0 if there are too few for [`add_windows`].
+    /// Registers that hold one of `Sums` or an operand; 0 if there are too few for windows.
     const REGISTERS: usize = 0;
 
     /// Loads the step at `at` of one row and broadcasts it to all columns.
@@ -46,11 +43,11 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
     // SAFETY: `RawTile` allows every address that is used; the caller guarantees the instructions.
     unsafe {
         let mut sums = [[V::Sums::zero(); VECS]; ROWS];
-        let fits = ROWS * VECS + TAPS * VECS + TAPS <= V::REGISTERS;
-        if fits && tile.has_three_taps() {
-            add_windows::<V, ROWS, VECS>(tile, &mut sums);
-        } else {
-            add_products::<V, ROWS, VECS>(tile, &mut sums);
+        let fits = |taps| ROWS * VECS + taps * VECS + taps <= V::REGISTERS;
+        match tile.taps() {
+            2 if fits(2) => add_products::<V, ROWS, VECS, 2>(tile, &mut sums),
+            3 if fits(3) => add_products::<V, ROWS, VECS, 3>(tile, &mut sums),
+            _ => add_products::<V, ROWS, VECS, 1>(tile, &mut sums),
         }
         // By value: references would keep the accumulators in memory in the loops above.
         for (r, sums) in sums.into_iter().enumerate() {
@@ -63,88 +60,53 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
     }
 }
 
-/// Adds the products of a tile to `sums`, step after step.
-#[inline(always)]
-#[allow(unsafe_code, reason = "instructions and pointers")]
-unsafe fn add_products<V: Vector, const ROWS: usize, const VECS: usize>(
-    tile: &RawTile<V::Element>,
-    sums: &mut [[V::Sums; VECS]; ROWS],
-) {
-    // SAFETY: as for `compute`.
-    unsafe {
-        let (mut panel, mut run) = (tile.panel, tile.left);
-        for _ in 0..tile.runs {
-            let mut at = run;
-            for _ in 0..tile.steps {
-                let columns = load_columns::<V, VECS>(panel);
-                for (r, sums) in sums.iter_mut().enumerate() {
-                    let row = V::load_row(at.add(r * tile.row_stride));
-                    for (sums, columns) in sums.iter_mut().zip(columns) {
-                        *sums = V::mul_add(*sums, row, columns);
-                    }
-                }
-                panel = panel.add(VECS * LANES * V::Element::DEPTH);
-                // The last step of the last run may end at the end of the allocation.
-                at = at.wrapping_add(tile.step_stride);
-            }
-            run = run.wrapping_add(tile.run_stride);
-        }
-    }
-}
-
-/// [`add_products`] of windows with [`RawTile::has_three_taps`]: a pixel is loaded once for the three windows it lies in.
+/// Adds the products of a tile to `sums`. With more than one of `TAPS`, which are then [`RawTile::taps`], a pixel is loaded once for all
+/// windows it lies in.
 ///
-/// [`add_products`] loads an operand for each product of a tile one register wide. Processors that load as seldom as they multiply
-/// then reach half of their peak.
+/// With one tap, a tile one register wide loads an operand for each product. A processor that loads as seldom as it multiplies then
+/// reaches half of its peak.
 #[inline(always)]
 #[allow(unsafe_code, reason = "instructions and pointers")]
-unsafe fn add_windows<V: Vector, const ROWS: usize, const VECS: usize>(
+unsafe fn add_products<V: Vector, const ROWS: usize, const VECS: usize, const TAPS: usize>(
     tile: &RawTile<V::Element>,
     sums: &mut [[V::Sums; VECS]; ROWS],
 ) {
     // SAFETY: as for `compute`; row r reads at tap t what row r + t reads at tap 0.
     unsafe {
-        let step_len = VECS * LANES * V::Element::DEPTH;
-        let tap_steps = tile.steps / TAPS;
-        for run in 0..tile.runs {
-            let pixels = tile.left.wrapping_add(run * tile.run_stride);
-            let panel = tile.panel.add(run * tile.steps * step_len);
-            for step in 0..tap_steps {
-                let first = panel.add(step * step_len);
-                let mut columns = [load_columns::<V, VECS>(first); TAPS];
-                for (tap, columns) in columns.iter_mut().enumerate().skip(1) {
-                    *columns = load_columns::<V, VECS>(first.add(tap * tap_steps * step_len));
+        let (len, tap_steps) = (LANES * V::Element::DEPTH, tile.steps / TAPS);
+        let (mut panel, mut run) = (tile.panel, tile.left);
+        for _ in 0..tile.runs {
+            let mut at = run;
+            for _ in 0..tap_steps {
+                // No closure here: it could be compiled without these instructions, and each would then be a call.
+                let mut columns = [[V::load_columns(panel); VECS]; TAPS];
+                for (tap, columns) in columns.iter_mut().enumerate() {
+                    for (v, columns) in columns.iter_mut().enumerate() {
+                        *columns = V::load_columns(panel.add((tap * tap_steps * VECS + v) * len));
+                    }
                 }
-                let at = pixels.wrapping_add(step * tile.step_stride);
                 let mut window = [V::load_row(at); TAPS];
-                window[1] = V::load_row(at.add(tile.row_stride));
+                for (tap, pixel) in window.iter_mut().enumerate().take(TAPS - 1).skip(1) {
+                    *pixel = V::load_row(at.add(tap * tile.row_stride));
+                }
                 for (r, sums) in sums.iter_mut().enumerate() {
-                    window[2] = V::load_row(at.add((r + 2) * tile.row_stride));
+                    window[TAPS - 1] = V::load_row(at.add((r + TAPS - 1) * tile.row_stride));
                     for (pixel, columns) in window.into_iter().zip(columns) {
                         for (sums, columns) in sums.iter_mut().zip(columns) {
                             *sums = V::mul_add(*sums, pixel, columns);
                         }
                     }
-                    window = [window[1], window[2], window[2]];
+                    for tap in 1..TAPS {
+                        window[tap - 1] = window[tap];
+                    }
                 }
+                panel = panel.add(VECS * len);
+                // The last step of the last run may end at the end of the allocation.
+                at = at.wrapping_add(tile.step_stride);
             }
+            panel = panel.add((TAPS - 1) * tap_steps * VECS * len);
+            run = run.wrapping_add(tile.run_stride);
         }
-    }
-}
-
-/// Loads one step of a panel.
-#[inline(always)]
-#[allow(unsafe_code, reason = "instructions and pointers")]
-unsafe fn load_columns<V: Vector, const VECS: usize>(
-    panel: *const V::Element,
-) -> [V::Operand; VECS] {
-    // SAFETY: as for `compute`. No closure: it could be compiled without these instructions, and each would then be a call.
-    unsafe {
-        let mut columns = [V::load_columns(panel); VECS];
-        for (v, columns) in columns.iter_mut().enumerate().skip(1) {
-            *columns = V::load_columns(panel.add(v * LANES * V::Element::DEPTH));
-        }
-        columns
     }
 }
 
