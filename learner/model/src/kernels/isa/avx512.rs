@@ -50,7 +50,7 @@ impl Bf16 {
 }
 
 /// Whether bf16's instruction multiplies faster than f32's. On AMD's Zen 4 the peak is 430 GFLOP/s against 221, on Intel's
-/// family 6, model 207 without AMX 140 against 145 (`driml bench learner --kernels`, two cores each).
+/// family 6, model 207 without AMX 150 against 257 (`driml bench learner --kernels`, two cores each).
 #[allow(
     unused_unsafe,
     reason = "the instruction is unsafe in Rust 1.90 and safe in later ones"

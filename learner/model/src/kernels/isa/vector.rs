@@ -85,20 +85,19 @@ unsafe fn add_products<V: Vector, const ROWS: usize, const VECS: usize, const TA
                         *columns = V::load_columns(panel.add((tap * tap_steps * VECS + v) * len));
                     }
                 }
-                let mut window = [V::load_row(at); TAPS];
-                for (tap, pixel) in window.iter_mut().enumerate().take(TAPS - 1).skip(1) {
-                    *pixel = V::load_row(at.add(tap * tile.row_stride));
+                // The last `TAPS` are the pixels of a row. A shorter array, or one that is rotated, would stay in memory.
+                let mut window = [V::load_row(at); 3];
+                if TAPS == 3 {
+                    window[1] = V::load_row(at.add(tile.row_stride));
                 }
                 for (r, sums) in sums.iter_mut().enumerate() {
-                    window[TAPS - 1] = V::load_row(at.add((r + TAPS - 1) * tile.row_stride));
-                    for (pixel, columns) in window.into_iter().zip(columns) {
+                    window[2] = V::load_row(at.add((r + TAPS - 1) * tile.row_stride));
+                    for (tap, columns) in columns.into_iter().enumerate() {
                         for (sums, columns) in sums.iter_mut().zip(columns) {
-                            *sums = V::mul_add(*sums, pixel, columns);
+                            *sums = V::mul_add(*sums, window[3 - TAPS + tap], columns);
                         }
                     }
-                    for tap in 1..TAPS {
-                        window[tap - 1] = window[tap];
-                    }
+                    window = [window[1], window[2], window[2]];
                 }
                 panel = panel.add(VECS * len);
                 // The last step of the last run may end at the end of the allocation.
