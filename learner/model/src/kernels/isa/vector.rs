@@ -62,7 +62,6 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
 
 /// Adds the products of a tile to `sums`. With more than one of `TAPS`, which are then [`RawTile::taps`], a pixel is loaded once for all
 /// windows it lies in.
-///
 /// With one tap, a tile one register wide loads an operand for each product. A processor that loads as seldom as it multiplies then
 /// reaches half of its peak.
 #[inline(always)]
