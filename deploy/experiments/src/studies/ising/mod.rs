@@ -161,10 +161,10 @@ fn learning_figure(task: &Task, trained: &[Outcome]) -> Figure {
         Curve::from_values(means, Band::Range).series(name, index)
     };
     let ends = vec![(0.0, 0.5), (task.settings.updates as f64, 0.5)];
-    let no_information = Series::line("nothing told", 0, ends).with_colour(GREY);
+    let chance = Series::line("chance", 0, ends).with_colour(GREY);
     let pairs = auc_series("in the patch: true pair or other", 1, |it| it.auc_pairs);
     let areas = vec![
-        no_information.with_mark(Mark::Dashed),
+        chance.with_mark(Mark::Dashed),
         auc_series("patch or noise", 0, |it| it.auc),
         auc_series("patch or noise, clear places", 2, |it| it.auc_clear),
         pairs.with_mark(Mark::Dashed),
