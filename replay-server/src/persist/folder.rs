@@ -32,7 +32,7 @@ const SEGMENTS_MIN: u64 = 16;
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each message says it")]
 pub enum PersistError {
-    #[error("{doing} {}: {source}; --replay-dir needs a folder with room that this process may write", path.display())]
+    #[error("{doing} {}: {source}; the replay needs a folder with room that this process may write", path.display())]
     Io {
         doing: &'static str,
         path: PathBuf,
