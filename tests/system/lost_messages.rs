@@ -389,6 +389,29 @@ fn a_shard_that_fills_late_is_asked() {
     panic!("a shard that holds something is never drawn from");
 }
 
+/// The transitions of a shard whose actor has left may all lack later steps. The other shard then sends the rows of all batches.
+#[test]
+fn a_shard_without_an_anchor_holds_up_no_batch() {
+    const CHUNKS: u64 = 32;
+    let first_steps = tiny_replay::header(&batches_spec(), 0, 100, 1);
+    let stored = u64::from(SHARD_STEPS) * CHUNKS + first_steps.transitions() as u64;
+    let mut shards = empty_shards(2, 1_000, Some(stored));
+    shards[1].insert(&Chunk::zeroed(first_steps));
+    fill_shard(&mut shards[0], 0..CHUNKS / 2);
+    let mut served = serve(shards);
+    for _ in 0..2 {
+        served.learner.next().expect("more transitions will come");
+    }
+    fill_shard(&mut served.replays[0].lock().unwrap(), CHUNKS / 2..CHUNKS);
+    let mut batches = 2;
+    while let Some(ServedBatch { parts, .. }) = served.learner.next() {
+        assert!(parts.iter().all(|it| it.shard == 0), "{parts:?}");
+        batches += 1;
+    }
+    assert_eq!(batches, stored / u64::from(ROWS));
+    served.learner.end();
+}
+
 /// A shard's inserts wait while its count of the other shard's rows is old. The next draw request to the shard updates the count.
 #[test]
 fn a_shard_that_waits_hears_what_the_other_gave() {

@@ -1,7 +1,6 @@
 //! Real Procgen through all processes. The engine is downloaded into the cache folder once, as `driml local` does.
 //! With `DRIML_OFFLINE=1` each of these tests is skipped by name. Each game is tested with the code of the worlds.
 
-use driml_settings::config::RunConfig;
 use driml_tests::{TestSystem, check_has, skipped_offline};
 
 use crate::system;
@@ -21,40 +20,6 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
     system
         .run_ok("evaluate --run run --episodes 2 --levels unseen")
         .expect_stdout("procgen:bigfish on unseen levels, 2 episodes each");
-}
-
-/// The engine's frames lose a border that no convolution reads. At 104 x 80 they are enlarged after that.
-#[test]
-fn a_border_that_no_convolution_reads_changes_no_bit() {
-    let Some(system) = with_engine() else { return };
-    for (name, sets, cut) in [
-        ("64", "", [60, 60]),
-        (
-            "104",
-            "--set input.height=104 --set input.width=80",
-            [62, 61],
-        ),
-    ] {
-        let flags = "--env procgen:coinrun --agent driml-ada --preset smoke --frames 416";
-        let trained = system.train(
-            &format!("--lockstep {flags} {sets}"),
-            &format!("cut-{name}"),
-        );
-        let text = system.read(&format!("cut-{name}/config.toml"));
-        let config = RunConfig::parse("config.toml", &text).unwrap();
-        assert_eq!([config.run.frame_height, config.run.frame_width], cut);
-        let whole = config.with_whole_frames().unwrap();
-        assert_eq!([whole.run.frame_height, whole.run.frame_width], [64, 64]);
-        std::fs::write(system.path(&format!("{name}.toml")), whole.to_toml()).unwrap();
-        let config = format!("--lockstep --config {name}.toml");
-        let whole = system.train(&config, &format!("whole-{name}"));
-        assert_eq!(trained.weights_sha256, whole.weights_sha256);
-        let played = ["cut", "whole"].map(|run| {
-            let ended = system.run_ok(&format!("evaluate --run {run}-{name} --episodes 2"));
-            ended.stdout
-        });
-        assert_eq!(played[0], played[1]);
-    }
 }
 
 /// N updates, saved and resumed for N more, equal a run of 2 N: the engine's state is restored.

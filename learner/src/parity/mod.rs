@@ -347,36 +347,3 @@ fn max_or_nan(largest: f64, d: f64) -> f64 {
         largest
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use driml_model::{PolicyNetwork, Precision};
-
-    use super::*;
-
-    #[test]
-    fn an_actor_s_values_agree_with_every_case() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/parity");
-        for entry in std::fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.extension().is_none_or(|it| it != "safetensors") {
-                continue;
-            }
-            let case = Case::parse(&std::fs::read(&path).unwrap()).unwrap();
-            let (batch, name) = (case.batch(), path.display());
-            let agent = case_agent(&case, case.settings.clone(), &Compute::CPU).unwrap();
-            let shape = [batch.rows, agent.model().num_actions];
-            let expected = case.expected("q_values_t", &shape).unwrap();
-            let weights = agent.weights().unwrap();
-            let slow = agent.model().without_dim();
-            let mut policy = PolicyNetwork::new(&slow, &weights, Precision::F32).unwrap();
-            let mut acted = vec![0.0; expected.len()];
-            policy.q_values(batch.states_t, &mut acted).unwrap();
-            let scale = expected.iter().fold(1.0, |a: f64, b| a.max(b.abs()));
-            for found in [acted, agent.q_values_t(&batch).unwrap()] {
-                let error = largest_error(&to_f64(&found), &expected);
-                assert!(error < 2e-6 * scale, "{name}: {error}");
-            }
-        }
-    }
-}

@@ -271,7 +271,7 @@ impl Fetcher {
                 pending_replies.push((shard, reply));
             }
         }
-        let (mut finished, mut failed) = (false, None);
+        let (mut finished, mut refused, mut failed) = (false, None, None);
         for (shard, pending) in pending_replies {
             // Only the part that did not arrive is requested again.
             let reply = match self.receive_reply(pending) {
@@ -295,7 +295,7 @@ impl Fetcher {
                 }
                 Err(NotReady::Wait(waiting)) => partial.record_waiting(waiting),
                 Err(NotReady::Finished) => finished = true,
-                Err(NotReady::Refused { why }) => bail!(Rejected(why)),
+                Err(NotReady::Refused { why }) => refused = Some((shard, why)),
             }
         }
         if let Some(e) = failed {
@@ -311,6 +311,11 @@ impl Fetcher {
             return Ok(NextBatch::Ready(Box::new(ServedBatch { batch, parts })));
         }
         self.fetch_counts(&mut partial, |_, _| true)?;
+        partial.reassign_rows(&mut self.rng);
+        if let Some((_, why)) = refused.filter(|(shard, _)| partial.shards[*shard].pending_rows > 0)
+        {
+            bail!(Rejected(why));
+        }
         // Once a part has come, a shard that reports the end may have been told outdated counts of the other shards.
         let is_over = finished && partial.parts.is_empty();
         let waited = partial.since_last_batch.record_failure();

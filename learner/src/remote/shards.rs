@@ -242,6 +242,12 @@ impl PartialBatch {
         for shard in &mut self.shards {
             shard.share = shard.held as f64 / total as f64;
         }
+        self.assign_rows(rows, total, rng);
+        true
+    }
+
+    /// Draws the shard of each of `rows` rows; all shards hold `total` transitions.
+    fn assign_rows(&mut self, rows: u32, total: u64, rng: &mut impl Rng) {
         for _ in 0..rows {
             let mut transition = rng.random_range(0..total);
             for shard in &mut self.shards {
@@ -252,7 +258,18 @@ impl PartialBatch {
                 transition -= shard.held;
             }
         }
-        true
+    }
+
+    /// Draws the rows of shards that cannot send any, as they hold nothing to draw from, from the other shards. The shares stay, because
+    /// importance weights do not depend on a factor that all rows have.
+    pub(super) fn reassign_rows(&mut self, rng: &mut impl Rng) {
+        let total: u64 = self.shards.iter().map(|it| it.held).sum();
+        if total == 0 {
+            return;
+        }
+        let empty = self.shards.iter_mut().filter(|it| it.held == 0);
+        let rows = empty.map(|it| std::mem::take(&mut it.pending_rows)).sum();
+        self.assign_rows(rows, total, rng);
     }
 
     /// Abandons a batch of which no part has arrived, so that the next one is drawn anew.
@@ -329,6 +346,22 @@ mod tests {
         assert!(chi_square < 16.27, "3 degrees of freedom: {chi_square}");
         let mut nothing = batch_of(&[shard_state(0, 0, 0, 0)]);
         assert!(!nothing.begin(8, &mut rng) && nothing.is_complete());
+    }
+
+    #[test]
+    fn rows_of_a_shard_without_any_are_drawn_from_the_others() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        for (held, pending, expected) in [
+            ([0, 9, 0], [5, 2, 1], [0, 8, 0]),
+            ([7, 9, 0], [5, 2, 0], [5, 2, 0]),
+            ([0, 0, 0], [5, 2, 1], [5, 2, 1]),
+        ] {
+            let states: [_; 3] = std::array::from_fn(|at| shard_state(held[at], 0, 0, pending[at]));
+            let mut batch = batch_of(&states);
+            batch.reassign_rows(&mut rng);
+            let pending: Vec<_> = batch.shards.iter().map(|it| it.pending_rows).collect();
+            assert_eq!(pending, expected, "{held:?}");
+        }
     }
 
     #[test]

@@ -89,7 +89,8 @@ pub struct ReplayStatus {
     pub transitions_inserted: u64,
     /// Transitions that filled the memory again after the run was resumed without its replay.
     pub transitions_refilled: u64,
-    /// Transitions held now, from which rows can be drawn: 0 while a replay fills its memory again.
+    /// Transitions held now, from which rows can be drawn: 0 while a replay fills its memory again, and after a draw that found no anchor
+    /// until the next chunk.
     pub transitions_held: u64,
     /// Bytes of memory that the frames of these transitions take.
     pub frame_bytes_held: u64,

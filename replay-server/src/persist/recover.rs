@@ -106,6 +106,7 @@ pub(super) fn recover(
         oldest: 0,
         has_same_capacity: false,
         unusable: Vec::new(),
+        closed: None,
     };
     let bytes = |&number| fs::metadata(folder.segment_path(number)).map_or(0, |it| it.len());
     let total: u64 = numbers.iter().map(bytes).sum();
@@ -148,6 +149,8 @@ struct LogReader<'a> {
     has_same_capacity: bool,
     /// Segments that cannot be used. They are renamed once it is known that others can.
     unusable: Vec<PathBuf>,
+    /// The name of the last segment that was read, if a record closes it: another segment was begun after it.
+    closed: Option<String>,
 }
 
 impl LogReader<'_> {
@@ -220,10 +223,8 @@ impl LogReader<'_> {
             bytes: if is_last { at } else { bytes.len() } as u64,
             snapshot_bytes: 0,
         });
+        self.closed = matches!(ended, Ok(true)).then(|| name.clone());
         match ended {
-            Ok(true) if is_last => self.warn(format!(
-                "the segment after {name} is missing: the replay is what it was when that one began; what was stored and served since is lost"
-            )),
             Ok(_) => {}
             Err(_) if !is_last => self.warn(format!(
                 "{name} is damaged at byte {at}: {cut} bytes of it cannot be used"
@@ -309,6 +310,11 @@ impl LogReader<'_> {
         if !self.recovery.found && !self.recovery.warnings.is_empty() {
             let why = self.recovery.warnings.join("; ");
             return unusable(format!("no segment can be read ({why})"));
+        }
+        if let Some(name) = self.closed.take() {
+            self.warn(format!(
+                "no segment after {name} can be read: the replay is what it was when the next one began; what was stored and served since is lost"
+            ));
         }
         // The records written next must be readable too.
         if self.position.next_ordinal > ORDINAL_MAX / 2 {

@@ -221,13 +221,13 @@ impl Replay {
         let (affinity, rng) = (&state.affinity, &mut state.rng);
         let drawn = self.sampler.draw(&self.ring, affinity, rng, header, alloc);
         let Some(mut drawn) = drawn else {
+            state.starving = true;
             if self.limiter.all_stored() {
                 let why = format!(
                     "none of the {held} transitions held can be sampled, and no more will come: every environment needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer environments"
                 );
                 return Err(NotReady::Refused { why });
             }
-            state.starving = true;
             return Err(NotReady::Wait(Waiting::LearnerWaitsForActors));
         };
         self.limiter.count_sampled(rows);

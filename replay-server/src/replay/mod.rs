@@ -134,8 +134,8 @@ impl Replay {
         ReplayStatus {
             transitions_inserted: counts.this_shard.inserted,
             transitions_refilled: counts.refilled,
-            transitions_held: match counts.refill_left {
-                0 => self.ring.inserted() - self.ring.oldest(),
+            transitions_held: match (counts.refill_left, self.state.starving) {
+                (0, false) => self.ring.inserted() - self.ring.oldest(),
                 _ => 0,
             },
             frame_bytes_held: self.ring.frames().bytes_held(),

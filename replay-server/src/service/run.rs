@@ -169,8 +169,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     threads.extend(service.clone().start_threads()?);
     threads.push(members);
     service.wait_until_over(&args.drain, args.keep_alive);
-    // The threads of the service wait for this flag.
     shutdown.set();
+    // With the lock, as no thread may be between its test of the flag and its wait.
+    drop(service.state());
     service.changed.notify_all();
     tracing::info!(
         "replay server stops with {} transitions stored",

@@ -98,11 +98,13 @@ impl Service {
         }
     }
 
-    /// Waits until something has changed, or for `due_in`, the time until a parked item is due.
+    /// Waits until something has changed, or for `due_in`, the time until a parked item is due; not after the shutdown.
     pub(super) fn wait_changed(&self, mut state: MutexGuard<'_, State>, due_in: Option<Duration>) {
         state.update_waiting(Instant::now());
-        let waited = self.changed.wait_timeout(state, due_in.unwrap_or(IDLE_MAX));
-        drop(waited.unwrap_or_else(PoisonError::into_inner));
+        if !self.shutdown.is_set() {
+            let waited = self.changed.wait_timeout(state, due_in.unwrap_or(IDLE_MAX));
+            drop(waited.unwrap_or_else(PoisonError::into_inner));
+        }
     }
 }
 

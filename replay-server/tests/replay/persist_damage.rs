@@ -188,13 +188,14 @@ fn damage_costs_what_it_hits_and_is_said() {
     type Spoil = fn(&Path);
     let last = usize::MAX;
     let gone = "are lost";
-    let next = "is missing: the replay is what it was";
+    let next = "can be read: the replay is what it was";
     let misplaced = "not the segment that belongs here";
     let flip_late: Spoil = |it| flip(it, |length| length * 2 / 3);
     let flip_early: Spoil = |it| flip(it, |_| 40);
     let begin_one: Spoil = |it| copy_to(it, 999, 20);
     let misplace: Spoil = |it| copy_to(it, 600, 1 << 20);
     let forget_id: Spoil = |it| remove(&it.with_file_name("log.toml"));
+    let empty: Spoil = |it| fs::write(it, []).unwrap();
     let back_up: Spoil = |it| {
         fs::copy(it, it.with_file_name("segment-3.log")).unwrap();
     };
@@ -205,6 +206,7 @@ fn damage_costs_what_it_hits_and_is_said() {
         (7, remove, &[gone, "missing"], Counts),
         (0, remove, &["the oldest segments are missing"], Counts),
         (last, remove, &[next], Beginning),
+        (last, empty, &[next], Beginning),
         (last, lengthen_a_record, &["are cut off"], Beginning),
         (last, append_zeros, &[], All),
         // A segment that was just begun, one under another's name, a copy, and a missing identity, which the segments have too.
