@@ -120,6 +120,8 @@ pub(crate) struct Speed {
 }
 
 const RATE_WINDOW: Duration = Duration::from_secs(20);
+/// A rate over less time says little: counts arrive in lumps.
+const RATE_TIME_MIN: Duration = Duration::from_millis(500);
 /// No answers for so long are a pause: this process or the others were stopped. The speed does not count it.
 pub(crate) const PAUSE_MIN: Duration = Duration::from_secs(15);
 
@@ -140,14 +142,15 @@ impl Rates {
         }
     }
 
-    /// The rate of each count since it last stood at its oldest value in the window; 0 before the second sample.
+    /// The rate of each count since it last stood at its oldest value in the window, at least for [`RATE_TIME_MIN`]; 0 before that.
     fn speed(&self) -> Speed {
         let rate = |count: fn(&Sample) -> u64| {
             let (first, last) = (self.0.front()?, self.0.back()?);
             let mut newest_first = self.0.iter().rev();
-            let idle = newest_first.find(|it| count(it) == count(first))?;
+            let idle = newest_first
+                .find(|it| count(it) == count(first) && last.0 - it.0 >= RATE_TIME_MIN)?;
             let seconds = (last.0 - idle.0).as_secs_f64();
-            (seconds > 0.0).then(|| count(last).saturating_sub(count(idle)) as f64 / seconds)
+            Some(count(last).saturating_sub(count(idle)) as f64 / seconds)
         };
         Speed {
             frames: rate(|it| it.1).unwrap_or(0.0),
@@ -365,6 +368,8 @@ mod tests {
         assert!(long.0.len() <= 22);
         let warmed_up = rates([(0, 0, 7), (10, 10, 7), (12, 12, 47)]).speed();
         assert_eq!((warmed_up.frames, warmed_up.updates), (1.0, 20.0));
+        // Samples of one moment.
+        assert_eq!(rates([(3, 0, 0), (3, 256, 9)]).speed(), Speed::default());
         let paused = [(0, 0, 0), (1, 10, 1), (5_000, 20, 2), (5_001, 50, 8)];
         let [at_once, later] = [3, 4].map(|samples| rates(paused[..samples].to_vec()).speed());
         assert_eq!(
