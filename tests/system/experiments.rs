@@ -58,14 +58,16 @@ fn check_experiment(name: &str, files: &str) {
     // More seeds add pieces to the same grid; the full length is another grid.
     system.run_ok(&format!("{call} --seeds 1"));
     let printed = system.run_ok(&call).stdout;
-    system.rejects(&format!("experiment {name}"), "made with other settings");
-    let folder = system.path("experiments").join(name);
+    let out = format!("experiments/{name}-smoke");
+    let full = format!("experiment {name} --out {out}");
+    system.rejects(&full, "made with other settings");
+    let folder = system.path(&out);
     assert!(printed.ends_with("README.md\n"), "{printed}");
     check_page(&folder, &["**Time.**", "**Expected.**"], files);
     let first = data_files(&folder);
 
     // If half of the pieces are lost, the next call makes them again, with the same bytes.
-    let mut pieces = system.file_names(&format!("experiments/{name}/pieces"));
+    let mut pieces = system.file_names(&format!("{out}/pieces"));
     pieces.retain(|it| !["settings.json", "cores.json"].contains(&&**it));
     pieces.sort();
     for piece in pieces.iter().step_by(2) {
@@ -110,13 +112,17 @@ fn procgen_without_the_engine() {
     // A rejected call leaves the folder free for the corrected call.
     system.rejects(&format!("{call} --set learner.batchsize=1"), "no setting");
     system.run_ok(call);
-    let folder = system.path("experiments/procgen");
+    let folder = system.path("experiments/procgen-smoke");
     let files = "curves.png curves.svg table.csv";
     let page = check_page(&folder, &["**Results.**\n\n* ", "| --- |"], files);
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
     let first = data_files(&folder);
-    let table = || system.run_folder("experiments/procgen").table("table.csv");
+    let table = || {
+        system
+            .run_folder("experiments/procgen-smoke")
+            .table("table.csv")
+    };
     let before = table();
     let header = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
     assert_eq!(before.header.join(","), header);
@@ -185,7 +191,7 @@ fn procgen_without_the_engine() {
 fn pacman() {
     let system = system();
     system.run_ok(&format!("experiment pacman --smoke {SMALL_NETWORK}"));
-    let folder = system.path("experiments/pacman");
+    let folder = system.path("experiments/pacman-smoke");
     let files = "fig3.png fig3.svg final_loss.csv ghosts.csv loss.csv noise.csv";
     check_page(&folder, &["**Results.**\n\n* ", "| --- |"], files);
     let config = |name: &str| {

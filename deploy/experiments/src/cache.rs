@@ -265,7 +265,8 @@ pub(crate) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFla
 
 /// Returns the folder of the experiment `name`: `--out`, or the default.
 fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
-    let default = || Path::new("experiments").join(name);
+    let suffix = if flags.smoke { "-smoke" } else { "" };
+    let default = || Path::new("experiments").join(format!("{name}{suffix}"));
     flags.out.clone().unwrap_or_else(default)
 }
 

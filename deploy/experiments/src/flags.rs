@@ -35,7 +35,7 @@ pub struct ExperimentFlags {
     /// A test in seconds: shows only that the command works
     #[arg(long)]
     pub(crate) smoke: bool,
-    /// Folder for figures, data and page [default: experiments/NAME]; a stopped experiment resumes there
+    /// Folder for figures, data and page [default: experiments/NAME or NAME-smoke]; a stopped experiment resumes there
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Seeds 1 to N [default: from the experiment's settings]
