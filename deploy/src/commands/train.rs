@@ -1,7 +1,7 @@
 //! `driml train`: prepares settings, plan, engine and run folder, and then runs as separate processes or in lockstep.
 //! `driml_launch::launcher` starts and ends the processes.
 
-use std::path::PathBuf;
+use std::{iter, path::PathBuf};
 
 use anyhow::bail;
 use clap::Args;
@@ -196,7 +196,12 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
 fn default_run_dir(run: &RunSpec) -> PathBuf {
     let (world, agent, seed) = (file_name_of(&run.world), &run.agent, run.seed);
     let time = jiff::Timestamp::now().strftime("%Y%m%d-%H%M%S");
-    PathBuf::from(format!("runs/{world}-{agent}-seed{seed}-{time}"))
+    let name = format!("runs/{world}-{agent}-seed{seed}-{time}");
+    // Another run may have started in the same second.
+    let others = (2..).map(|number| format!("{name}-{number}"));
+    let mut paths = iter::once(name.clone()).chain(others).map(PathBuf::from);
+    let unused = paths.find(|path| !path.exists());
+    unused.expect("numbers do not end")
 }
 
 /// Converts a world's name to a part of a file name. The command of `exec:` may have blanks, slashes and any length.
