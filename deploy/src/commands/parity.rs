@@ -5,7 +5,10 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::console::print;
 use driml_learner::{Kernels, Precision};
-use driml_machine::device::{DeviceFlag, check_device};
+use driml_machine::{
+    device::{DeviceFlag, check_device},
+    units::count,
+};
 
 #[derive(Debug, Args)]
 pub(crate) struct ParityArgs {
@@ -37,5 +40,5 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     }
     let all = args.files.len();
     anyhow::ensure!(failed == 0, "files out of tolerance: {failed} of {all}");
-    Ok(())
+    print(&format!("within tolerance: {}\n", count(all, "file")))
 }
