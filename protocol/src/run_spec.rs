@@ -161,8 +161,8 @@ impl RunSpec {
             ("run.frame_channels", self.frame_channels, 16),
             ("run.frame_stack", self.frame_stack, FRAME_STACK_MAX),
         ] {
-            let why = "it must be at least 1 and of a sensible size";
-            check((1..=max).contains(&value), key, value, || why)?;
+            let why = || format!("it lies between 1 and {max}");
+            check((1..=max).contains(&value), key, value, why)?;
             bytes *= u64::from(value);
         }
         let fits = u32::try_from(bytes).is_ok();

@@ -300,7 +300,7 @@ fn damaged_checkpoints_and_those_of_another_run_are_named(system: &TestSystem) {
     let damaged = format!("error: run/checkpoints/{name}/online.safetensors is damaged: ");
     system
         .fails(call, &damaged)
-        .expect_stderr("remove the folder it is in");
+        .expect_stderr("checkpoint before it, remove ");
     fs::write(&path, &whole).unwrap();
     let one = system.run_ok(call).stdout;
     assert!(one.contains("1 episode each") && !one.contains("deviation"));

@@ -12,11 +12,11 @@ use walkdir::{DirEntry, WalkDir};
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_460),
-    ("actor", 10_990),
-    ("replay-server", 11_180),
-    ("learner", 23_050),
-    ("deploy", 31_070),
-    ("tests", 10_580),
+    ("actor", 10_940),
+    ("replay-server", 11_195),
+    ("learner", 23_030),
+    ("deploy", 31_100),
+    ("tests", 10_570),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

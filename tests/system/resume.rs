@@ -120,7 +120,7 @@ fn what_cannot_be_resumed() {
     system.run_ok("local --resume kept --frames 1600 --set local.durable=false");
     system.rejects_each(
         "
-        local --resume run --frames 2000 --set run.n_step=5 => belongs to a run with specification
+        local --resume run --frames 2000 --set run.n_step=5 => run.n_step cannot change in a run: resume without this --set
         local --resume run --frames 2000 --set world.reward_right=2 => world.reward_right cannot change in a run: resume without this --set
         local --resume run --frames 2000 --set model.atoms=31 => was saved with model.atoms = 51
         local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => only in memory; add --durable

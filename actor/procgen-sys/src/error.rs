@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// The end of every error about the engine: names a world that works without the engine.
-pub(crate) const WITHOUT_ENGINE: &str = "(`--env mspacman` is the world that needs no engine)";
+pub(crate) const WITHOUT_ENGINE: &str = "(`--env mspacman` needs no engine)";
 
 /// Why the engine could not be found, installed, loaded or used.
 #[derive(Debug, thiserror::Error)]
@@ -30,11 +30,14 @@ pub enum ProcgenError {
     /// The wheel, or the library in it, is not the pinned one.
     #[error("unpacking {0}; delete it and fetch it again {WITHOUT_ENGINE}")]
     Wheel(String),
-    #[error("installing procgen's engine: {doing} {}: {source} {WITHOUT_ENGINE}", .path.display())]
+    #[error(
+        "installing procgen's engine: {doing} {}: {why}; DRIML_CACHE names another folder {WITHOUT_ENGINE}",
+        .path.display()
+    )]
     Io {
         doing: &'static str,
         path: PathBuf,
-        source: io::Error,
+        why: io::Error,
     },
     /// The engine is built for Linux on x86-64 with AVX only.
     #[error("procgen's engine cannot run here: {0} {WITHOUT_ENGINE}")]
@@ -64,10 +67,6 @@ impl ProcgenError {
     /// Adds to an error of the file system the operation and the path.
     pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ProcgenError {
         let path = path.to_owned();
-        move |source| ProcgenError::Io {
-            doing,
-            path,
-            source,
-        }
+        move |why| ProcgenError::Io { doing, path, why }
     }
 }

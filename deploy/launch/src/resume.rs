@@ -188,9 +188,12 @@ fn check_changes(
     config: &RunConfig,
     lockstep: bool,
 ) -> anyhow::Result<()> {
-    if let Some(key) = before.world.first_difference(&config.world) {
-        let why = usage!("world.{key} cannot change in a run: resume without this --set");
-        bail!(why);
+    let world = before.world.first_difference(&config.world);
+    let world = world.map(|key| format!("world.{key}"));
+    if let Some(key) = world.or_else(|| before.first_difference_in_run(config)) {
+        bail!(usage!(
+            "{key} cannot change in a run: resume without this --set"
+        ));
     }
     let compute = DeviceName::Cpu.open(config.learner.precision)?;
     let learner = LearnerConfig::from_toml(&config.to_toml())

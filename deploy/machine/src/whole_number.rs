@@ -8,6 +8,9 @@ use std::ops::RangeInclusive;
 /// # Errors
 /// The text is not a whole number, or is 2^64 or more. The message says what to write.
 pub fn read(text: &str) -> Result<u64, String> {
+    if text.starts_with('-') {
+        return Err(format!("{text} is negative"));
+    }
     let none = || format!("{text:?} is not a whole number; write one as 1000000, 1_000_000 or 1e6");
     let plain = text.replace('_', "");
     let (mantissa, exponent) = plain.split_once(['e', 'E']).unwrap_or((&plain, "0"));
@@ -77,8 +80,8 @@ mod tests {
     #[test]
     fn what_is_not_whole_is_refused() {
         for text in [
-            "", "ten", "-1", "1.5", "1e-1", "1.25e1", "e6", ".5e1", "1e", "1e6x", "+", "_",
-            "1e1e1", "0x10",
+            "", "ten", "1.5", "1e-1", "1.25e1", "e6", ".5e1", "1e", "1e6x", "+", "_", "1e1e1",
+            "0x10",
         ] {
             let said = read(text).unwrap_err();
             let is_told = said.contains("is not a whole number; write one as");
@@ -87,6 +90,7 @@ mod tests {
         for text in ["18446744073709551616", "1e20", "1e99999999"] {
             assert!(read(text).unwrap_err().contains("is more than"), "{text}");
         }
+        assert_eq!(read("-1").unwrap_err(), "-1 is negative");
         let few = within(1..=10);
         assert_eq!(few("1e1"), Ok(10));
         assert_eq!(few("11").unwrap_err(), "11 is not in 1..=10");

@@ -86,6 +86,15 @@ impl RunConfig {
         published.weights_bytes(self.learner.publish_dtype)
     }
 
+    /// Returns the first setting in `[run]` that differs in `other`; all processes of a run agree on these.
+    pub fn first_difference_in_run(&self, other: &Self) -> Option<String> {
+        let table = |it: &Self| Table::try_from(&it.run).expect("settings are read from TOML");
+        let (before, after) = (table(self), table(other));
+        let mut keys = before.keys().chain(after.keys());
+        let differs = |key: &&String| before.get(*key) != after.get(*key);
+        keys.find(differs).map(|key| format!("run.{key}"))
+    }
+
     /// Reads every table into its component's Config. The derived settings must be in `table`.
     pub(crate) fn read(table: Table) -> Result<Self, Usage> {
         let read = Value::Table(table).try_into();

@@ -202,7 +202,11 @@ fn fill_in_visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSe
 /// Reads the text of a file that driml wrote. An error if a derived setting differs from what follows from the others.
 pub(crate) fn parse_file(name: &str, text: &str) -> Result<Table, Usage> {
     let read = text.parse::<Table>();
-    let read = read.map_err(|e| usage!("{name} is not TOML: {}", e.message()))?;
+    let read = read.map_err(|e| {
+        let before = e.span().and_then(|it| text.get(..it.start));
+        let line = before.unwrap_or_default().lines().count().max(1);
+        usage!("{name} is not TOML: line {line}: {}", e.message())
+    })?;
     let mut right = read.clone();
     fill_in_derived(&mut right).map_err(|e| usage!("{name}: {e}"))?;
     for (path, how) in derived_settings() {

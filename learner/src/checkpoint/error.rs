@@ -18,8 +18,9 @@ pub enum CheckpointError {
         why: io::Error,
     },
     #[error(
-        "{file} is damaged: {why}. To resume from the checkpoint before it, remove the folder it is in; \
-         to begin anew, remove all checkpoint-* folders beside it"
+        "{} is damaged: {why}. To resume from the checkpoint before it, remove {}; \
+         to begin anew, remove all checkpoint-* folders beside it",
+        file.display(), file.parent().unwrap_or(file).display()
     )]
     Damaged { file: PathBuf, why: String },
     #[error(

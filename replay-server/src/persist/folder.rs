@@ -204,7 +204,10 @@ impl ReplayFolder {
             read => read.map_err(io_error("reading", &path))?,
         };
         toml::from_str(&text).map(Some).map_err(|e| {
-            let why = format!("cannot be read: {}", e.message());
+            let why = format!(
+                "cannot be read: {}; remove it, the segments have the same",
+                e.message()
+            );
             PersistError::Unusable(path, why)
         })
     }

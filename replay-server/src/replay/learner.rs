@@ -224,7 +224,7 @@ impl Replay {
             state.starving = true;
             if self.limiter.all_stored() {
                 let why = format!(
-                    "none of the {held} transitions held can be sampled, and no more will come: every environment needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer environments"
+                    "none of the {held} transitions held can be sampled, and no more will come: every environment needs n_step or k_max consecutive ones; raise replay.capacity_transitions or --frames, or use fewer --envs"
                 );
                 return Err(NotReady::Refused { why });
             }

@@ -57,7 +57,8 @@ impl Table {
         let reading = || format!("reading {}", path.display());
         match fs::read(path) {
             Err(e) if e.kind() == ErrorKind::NotFound => Ok(Self::default()),
-            text => Self::parse(&text.with_context(reading)?).with_context(reading),
+            text => Self::parse(&text.with_context(reading)?)
+                .map_err(|e| usage!("{}: {e}; correct or remove that line", path.display()).into()),
         }
     }
 
