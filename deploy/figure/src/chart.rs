@@ -223,7 +223,8 @@ impl Chart {
             area = draw_title(canvas, area, &self.title);
         }
         if legend {
-            area = self.draw_legend(canvas, area);
+            let height = draw_legend(canvas, area, self.named_series());
+            area = Rect::new(area.x, area.y + height, area.width, area.height - height);
         }
         let points = || self.series.iter().flat_map(|series| &series.points);
         let bands = || self.series.iter().flat_map(|series| &series.band);
@@ -249,38 +250,43 @@ impl Chart {
         }
     }
 
-    /// Draws the legend in as many rows as it needs, and returns the rectangle below the legend.
-    fn draw_legend(&self, canvas: &mut Canvas, area: Rect) -> Rect {
-        let named = || self.series.iter().filter(|series| !series.name.is_empty());
-        if named().next().is_none() {
-            return area;
-        }
-        let (mut x, mut y) = (area.x, area.y);
-        for series in named() {
-            let name_width_max = area.width - LEGEND_MARK - 6.0;
-            let name = font::fit(&series.name, LEGEND_SIZE, Weight::Regular, name_width_max);
-            let width = LEGEND_MARK + 6.0 + font::width(&name, LEGEND_SIZE, Weight::Regular) + 16.0;
-            if x > area.x && x + width - 16.0 > area.right() {
-                x = area.x;
-                y += LEGEND_LEADING;
-            }
-            let middle = y + LEGEND_LEADING / 2.0;
-            if !series.band.is_empty() && series.mark != Mark::Bars {
-                let patch = Rect::new(x, middle - 5.0, LEGEND_MARK, 10.0);
-                canvas.rects(&[patch], series.colour.with_alpha(BAND_ALPHA));
-            }
-            let ends = [(x, middle), (x + LEGEND_MARK, middle)];
-            match series.mark {
-                Mark::Line | Mark::Dashed => series.draw_marks(canvas, &ends),
-                _ => series.draw_marks(canvas, &[(x + LEGEND_MARK / 2.0, middle)]),
-            }
-            let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
-            canvas.text(at, &name, TextStyle::new(LEGEND_SIZE, INK, Anchor::Start));
-            x += width;
-        }
-        let used = y + LEGEND_LEADING + 4.0 - area.y;
-        Rect::new(area.x, area.y + used, area.width, area.height - used)
+    /// Returns the series that have a legend entry.
+    pub(super) fn named_series(&self) -> impl Iterator<Item = &Series> {
+        self.series.iter().filter(|series| !series.name.is_empty())
     }
+}
+
+/// Draws a legend at the top of `area`, in as many rows as it needs, and returns its height.
+pub(super) fn draw_legend<'a>(
+    canvas: &mut Canvas,
+    area: Rect,
+    all: impl IntoIterator<Item = &'a Series>,
+) -> f64 {
+    let (mut x, mut y, mut bottom) = (area.x, area.y, area.y);
+    for series in all {
+        let name_width_max = area.width - LEGEND_MARK - 6.0;
+        let name = font::fit(&series.name, LEGEND_SIZE, Weight::Regular, name_width_max);
+        let width = LEGEND_MARK + 6.0 + font::width(&name, LEGEND_SIZE, Weight::Regular) + 16.0;
+        if x > area.x && x + width - 16.0 > area.right() {
+            x = area.x;
+            y += LEGEND_LEADING;
+        }
+        let middle = y + LEGEND_LEADING / 2.0;
+        if !series.band.is_empty() && series.mark != Mark::Bars {
+            let patch = Rect::new(x, middle - 5.0, LEGEND_MARK, 10.0);
+            canvas.rects(&[patch], series.colour.with_alpha(BAND_ALPHA));
+        }
+        let ends = [(x, middle), (x + LEGEND_MARK, middle)];
+        match series.mark {
+            Mark::Line | Mark::Dashed => series.draw_marks(canvas, &ends),
+            _ => series.draw_marks(canvas, &[(x + LEGEND_MARK / 2.0, middle)]),
+        }
+        let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
+        canvas.text(at, &name, TextStyle::new(LEGEND_SIZE, INK, Anchor::Start));
+        x += width;
+        bottom = y + LEGEND_LEADING + 4.0;
+    }
+    bottom - area.y
 }
 
 struct Plot<'a> {

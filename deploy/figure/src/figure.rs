@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::{
     canvas::{Anchor, Canvas, Letters, Rect, TextStyle},
-    chart::Chart,
+    chart::{Chart, Series, draw_legend},
     colours::{CARD, CARD_BORDER, INK, INK_SOFT},
     error::FigureError,
     font,
@@ -19,6 +19,8 @@ const MARGIN: f64 = 18.0;
 const TITLE_SIZE: f64 = 17.0;
 const NOTE_SIZE: f64 = 12.5;
 const NOTE_LEADING: f64 = 17.0;
+/// The share of a panel that the legend of a chart may take.
+const LEGEND_SHARE_MAX: f64 = 0.25;
 
 /// One panel of a figure.
 #[derive(Debug)]
@@ -89,6 +91,31 @@ impl Figure {
         }
     }
 
+    /// Returns the series of one legend for all charts, each name once, if a chart's legend would take too much of its panel.
+    fn shared_legend(&self) -> Vec<&Series> {
+        let charts = || {
+            let panels = self.panels.iter();
+            panels.filter_map(|panel| match panel {
+                Panel::Chart(chart) => Some(chart),
+                Panel::Heat(_) | Panel::Lattice(_) => None,
+            })
+        };
+        let (width, height) = self.panel_size;
+        let mut scratch = Canvas::new(width, height, Letters::Text);
+        let area = Rect::new(0.0, 0.0, width, height);
+        let mut shared: Vec<&Series> = Vec::new();
+        let mut heights =
+            charts().map(|chart| draw_legend(&mut scratch, area, chart.named_series()));
+        if heights.any(|it| it > LEGEND_SHARE_MAX * height) {
+            for series in charts().flat_map(Chart::named_series) {
+                if shared.iter().all(|it| it.name != series.name) {
+                    shared.push(series);
+                }
+            }
+        }
+        shared
+    }
+
     fn draw(&self, look: Look, letters: Letters) -> Canvas {
         let columns = self.columns.clamp(1, self.panels.len().max(1));
         let rows = self.panels.len().div_ceil(columns);
@@ -96,10 +123,18 @@ impl Figure {
         let width = MARGIN + columns as f64 * (panel_width + MARGIN);
         let lines = |note: &String| font::wrap(note, NOTE_SIZE, width - 2.0 * MARGIN);
         let notes: Vec<String> = self.notes.iter().flat_map(lines).collect();
-        let header_height = match look {
+        let mut header_height = match look {
             Look::Card => MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING,
             Look::Plain => MARGIN,
         };
+        let shared = self.shared_legend();
+        let legend = Rect::new(MARGIN, header_height, width - 2.0 * MARGIN, 0.0);
+        let legend_height = draw_legend(
+            &mut Canvas::new(width, 0.0, letters),
+            legend,
+            shared.clone(),
+        );
+        header_height += legend_height;
         let height = header_height + rows as f64 * (panel_height + MARGIN) + 4.0;
 
         let mut canvas = Canvas::new(width, height, letters);
@@ -107,6 +142,7 @@ impl Figure {
             Look::Card => self.draw_header(&mut canvas, &notes),
             Look::Plain => canvas.rects(&[Rect::new(0.0, 0.0, width, height)], CARD),
         }
+        draw_legend(&mut canvas, legend, shared.clone());
         for (index, panel) in self.panels.iter().enumerate() {
             let (row, column) = ((index / columns) as f64, (index % columns) as f64);
             let x = MARGIN + column * (panel_width + MARGIN);
@@ -114,7 +150,7 @@ impl Figure {
             let area = Rect::new(x, y, panel_width, panel_height);
             match panel {
                 Panel::Chart(chart) => {
-                    let legend = look == Look::Card || index == 0;
+                    let legend = shared.is_empty() && (look == Look::Card || index == 0);
                     let title = look == Look::Card || self.panels.len() > 1;
                     chart.draw(&mut canvas, area, title, legend);
                 }
@@ -187,6 +223,29 @@ mod tests {
             let is_whole = text.starts_with(start) && text.contains(inside);
             assert!(is_whole && !text.contains("NaN"), "{name}");
             assert!(text == encode(), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_legend_that_would_fill_a_panel_is_above_all_panels() {
+        let svg = |runs: usize| {
+            let line = |at| {
+                Series::line(
+                    &format!("a run with a long name {at:02}"),
+                    at,
+                    vec![(0.0, 1.0)],
+                )
+            };
+            let chart = |_| {
+                let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
+                Panel::Chart(Chart::new("", x, y, (0..runs).map(line).collect()))
+            };
+            let panels = (0..2).map(chart).collect();
+            let bytes = Figure { panels, ..figure() }.encode(Format::Svg, Look::Card);
+            String::from_utf8(bytes.unwrap()).unwrap()
+        };
+        for (runs, entries) in [(3, 6), (20, 20)] {
+            assert_eq!(svg(runs).matches("a run with").count(), entries);
         }
     }
 

@@ -48,7 +48,7 @@ pub fn menu() -> Result<String, Usage> {
         text += &format!("{world:18}  k = {fix_k:<5}  {augments:9}  k = {noact_k:<7}  {lambdas}\n");
     }
     text += "\noff in every preset\n";
-    text += "--set 'actor.epsilon_ladder={base=0.4,alpha=7}'  a fixed epsilon per actor, each smaller than the one before, as in Ape-X\n";
+    text += "--actors 4 --set 'actor.epsilon_ladder={base=0.4,alpha=7}'  a fixed epsilon per actor, each smaller than the one before, as in Ape-X\n";
     text += "\ntuned uses it on bigfish, fruitbot and starpilot; works on any game\n";
     text += "--set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4\n";
     text += "\nrainbow uses it; works with any agent\n";

@@ -35,7 +35,10 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
     let affinity = checkpoint::read_affinity(path)?
         .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
     let side = affinity.num_actions();
-    let values = affinity.matrix().into_iter().map(|a| Some(f64::from(a)));
+    let matrix = affinity.matrix();
+    // From 0, so that nearly equal probabilities have nearly the same colour.
+    let most = matrix.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
+    let values = matrix.into_iter().map(|a| Some(f64::from(a)));
     let updates = count(*updates, "update");
     let title = format!("{}, {updates}", folder_name(folder.path()));
     Ok(Heat {
@@ -43,6 +46,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
         labels: ("next action".into(), "action".into()),
         unit: "A [probability]".into(),
         decimals: Some(2),
+        range: Some((0.0, most.into())),
         ..Heat::new(&title, side, values.collect())
     })
 }
