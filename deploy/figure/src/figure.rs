@@ -134,7 +134,9 @@ impl Figure {
             legend,
             shared.clone(),
         );
-        header_height += legend_height;
+        if !shared.is_empty() {
+            header_height += legend_height + 10.0;
+        }
         let height = header_height + rows as f64 * (panel_height + MARGIN) + 4.0;
 
         let mut canvas = Canvas::new(width, height, letters);
