@@ -14,8 +14,8 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_460),
     ("actor", 10_940),
     ("replay-server", 11_195),
-    ("learner", 23_030),
-    ("deploy", 31_100),
+    ("learner", 22_990),
+    ("deploy", 31_170),
     ("tests", 10_570),
 ];
 /// The most lines of one file.
