@@ -15,7 +15,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 10_940),
     ("replay-server", 11_195),
     ("learner", 22_990),
-    ("deploy", 31_170),
+    ("deploy", 31_175),
     ("tests", 10_570),
 ];
 /// The most lines of one file.

@@ -204,7 +204,7 @@ pub(crate) fn parse_file(name: &str, text: &str) -> Result<Table, Usage> {
     let read = text.parse::<Table>();
     let read = read.map_err(|e| {
         let before = e.span().and_then(|it| text.get(..it.start));
-        let line = before.unwrap_or_default().lines().count().max(1);
+        let line = before.unwrap_or_default().matches('\n').count() + 1;
         usage!("{name} is not TOML: line {line}: {}", e.message())
     })?;
     let mut right = read.clone();

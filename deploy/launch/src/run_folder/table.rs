@@ -242,6 +242,11 @@ mod tests {
         assert_eq!(read.value::<f64>(&read.rows[0], "loss"), None);
         assert_eq!(read.last::<u64>("k"), None);
         assert!(Table::parse(b"frames,lo").unwrap().header.is_empty());
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.csv");
+        fs::write(&path, "frames,loss\n1\n").unwrap();
+        let said = Table::read(&path).unwrap_err().to_string();
+        assert!(said.ends_with("; correct or remove that line"), "{said}");
     }
 
     #[test]

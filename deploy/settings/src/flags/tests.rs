@@ -185,7 +185,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         layers,
         text.replace("[input]", "[inputs]"),
         text.replace("world = \"mspacman\"", "world = \"chain\""),
-        "= 3".into(),
+        "[run]\n= 3".into(),
         String::new(),
         text.replace("envs = 16", "envs = 16\ncolour = 1"),
     ]
@@ -195,7 +195,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct one of the two
         x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote
         x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`
-        x.toml is not TOML: line 1: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`
+        x.toml is not TOML: line 2: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`
         x.toml: the settings lack run.world, a word: use a config.toml that driml wrote
         x.toml: in the settings: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`, in `actor`
     "#]]
