@@ -64,39 +64,8 @@ fn wrong_actions_are_refused_and_step_nothing() {
 }
 
 #[test]
-fn every_game_steps_and_a_state_put_back_repeats_the_trajectory_in_any_environment() {
+fn a_state_of_another_game_or_of_no_environment_is_refused() {
     let Some(engine) = engine() else { return };
-    for game in Game::ALL {
-        let mut envs = VecGame::new(engine, &options(game)).unwrap();
-        let alone = Options {
-            num_envs: 1,
-            rand_seed: 99,
-            ..options(game)
-        };
-        let mut other = VecGame::new(engine, &alone).unwrap();
-        let at_first = (envs.first(), envs.rewards());
-        assert_eq!(at_first, (&[1; 4][..], &[0.0; 4][..]), "{game}");
-        let mut levels = envs.level_seed().iter();
-        assert!(levels.all(|level| (0..500).contains(level)), "{game}");
-        let start = envs.frames().to_vec();
-        for t in 0..20 {
-            envs.act(&actions(t, 4)).unwrap();
-        }
-        let state = envs.state(2).unwrap();
-        assert!(!state.bytes().is_empty());
-        other.set_state(0, &state).unwrap();
-        let size = other.frames().len();
-        for t in 20..60 {
-            let frame = &envs.frames()[2 * size..3 * size];
-            let expected = (frame, envs.level_seed()[2], envs.first()[2]);
-            let found = (other.frames(), other.level_seed()[0], other.first()[0]);
-            assert!(found == expected, "{game}, step {t}");
-            let actions = actions(t, 4);
-            envs.act(&actions).unwrap();
-            other.act(&actions[2..3]).unwrap();
-        }
-        assert_ne!(envs.frames(), start, "{game}: nothing moved in 60 steps");
-    }
     let mut coinrun = VecGame::new(engine, &options(Game::Coinrun)).unwrap();
     let mut maze = VecGame::new(engine, &options(Game::Maze)).unwrap();
     let state = maze.state(0).unwrap();
