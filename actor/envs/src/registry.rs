@@ -138,16 +138,6 @@ impl WorldConfig {
         }
     }
 
-    /// Returns the first setting that differs in `other`, a world of the same name. Time-outs do not count: they do not change the task.
-    pub fn first_difference(&self, other: &Self) -> Option<String> {
-        let table = |it| Table::try_from(it).expect("settings are read from TOML");
-        let (before, after) = (table(self), table(other));
-        let mut keys = before.keys().chain(after.keys());
-        let differs =
-            |key: &&String| !key.ends_with("_timeout_ms") && before.get(*key) != after.get(*key);
-        keys.find(differs).cloned()
-    }
-
     /// Returns the same world with the command or the library of `name`, if the world has code outside this program.
     /// This machine may have that code in another place than the machine on which the run was made.
     pub fn with_code_of(&self, name: WorldName) -> Result<Self, EnvError> {

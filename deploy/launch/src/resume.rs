@@ -188,9 +188,7 @@ fn check_changes(
     config: &RunConfig,
     lockstep: bool,
 ) -> anyhow::Result<()> {
-    let world = before.world.first_difference(&config.world);
-    let world = world.map(|key| format!("world.{key}"));
-    if let Some(key) = world.or_else(|| before.first_difference_in_run(config)) {
+    if let Some(key) = before.first_change_of_task(config) {
         bail!(usage!(
             "{key} cannot change in a run: resume without this --set"
         ));

@@ -1,6 +1,8 @@
 //! The resolved settings of a run: one TOML file with a table for each component, checked as a whole.
 //! No number is filled in here; `flags` does that.
 
+use std::collections::BTreeMap;
+
 use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
@@ -14,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::derived;
+use crate::{derived, overrides::leaves};
 
 /// The processes that the launcher starts, and their resources.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -86,13 +88,19 @@ impl RunConfig {
         published.weights_bytes(self.learner.publish_dtype)
     }
 
-    /// Returns the first setting in `[run]` that differs in `other`; all processes of a run agree on these.
-    pub fn first_difference_in_run(&self, other: &Self) -> Option<String> {
-        let table = |it: &Self| Table::try_from(&it.run).expect("settings are read from TOML");
-        let (before, after) = (table(self), table(other));
-        let mut keys = before.keys().chain(after.keys());
-        let differs = |key: &&String| before.get(*key) != after.get(*key);
-        keys.find(differs).map(|key| format!("run.{key}"))
+    /// Returns the path of the first setting in `[world]` or `[run]` that differs in `other`: a run keeps them. Time-outs of a world do
+    /// not count, as they do not change the task.
+    pub fn first_change_of_task(&self, other: &Self) -> Option<String> {
+        let tables = [self, other].map(Self::to_table);
+        let [before, after] = [0, 1].map(|at| BTreeMap::from_iter(leaves(&tables[at])));
+        let differs = |path: &&String| before.get(*path) != after.get(*path);
+        let is_kept = |path: &&String| !path.ends_with("_timeout_ms") && differs(path);
+        ["world.", "run."].into_iter().find_map(|table| {
+            let mut paths = before.keys().chain(after.keys());
+            paths
+                .find(|path| path.starts_with(table) && is_kept(path))
+                .cloned()
+        })
     }
 
     /// Reads every table into its component's Config. The derived settings must be in `table`.

@@ -103,18 +103,6 @@ fn a_machine_s_own_code_is_that_of_the_same_world() {
 }
 
 #[test]
-fn a_setting_that_makes_another_task_is_named() {
-    let changed = procgen(0, 500).first_difference(&procgen(0, 200));
-    assert_eq!(changed.unwrap(), "num_levels");
-    let [WorldConfig::Exec(mut slower), ..] = configs() else {
-        unreachable!("it is the first");
-    };
-    slower.step_timeout_ms += 1;
-    let changed = configs()[0].first_difference(&WorldConfig::Exec(slower));
-    assert_eq!(changed, None);
-}
-
-#[test]
 fn a_world_that_a_program_adds_is_as_the_others() {
     #[derive(Deserialize)]
     #[serde(deny_unknown_fields)]

@@ -268,3 +268,28 @@ fn a_file_s_torso_is_switched_with_its_settings() {
     expect!["model configuration: channels is empty, and torso = impala is made of it: set model.channels, or set model.torso to nature"]
         .assert_eq(&resolve_nature(&["model.torso=impala"]).unwrap_err());
 }
+
+#[test]
+fn a_setting_that_makes_another_task_is_named() {
+    let chain = |sets: &[&str]| paper("chain", "c51", sets).unwrap();
+    for (sets, expected) in [
+        (&["learner.batch_size=32"][..], None),
+        (&["run.gamma=0.5"], Some("run.gamma")),
+        (
+            &["run.gamma=0.5", "world.step_limit=77"],
+            Some("world.step_limit"),
+        ),
+    ] {
+        let changed = chain(&[]).first_change_of_task(&chain(sets));
+        assert_eq!(changed.as_deref(), expected, "{sets:?}");
+    }
+    let exec = |timeout_ms: u32| RunConfig {
+        world: toml::from_str(&format!(
+            "kind = 'exec'\ncommand = 'x'\nheight = 4\nwidth = 4\nchannels = 1\nactions = ['a']\n\
+             start_timeout_ms = 9\nstep_timeout_ms = {timeout_ms}"
+        ))
+        .unwrap(),
+        ..chain(&[])
+    };
+    assert_eq!(exec(1).first_change_of_task(&exec(2)), None);
+}
