@@ -2,7 +2,7 @@
 //! The chart computes no statistics: the caller decides what a band means.
 
 use super::{
-    canvas::{Anchor, Canvas, Point, Rect, TextStyle, draw_title},
+    canvas::{Anchor, Canvas, Letters, Point, Rect, TextStyle, draw_title},
     colours::{Colour, GRID, INK, INK_SOFT, SERIES_COLOURS, series_colour},
     font::{self, Weight},
     ticks,
@@ -287,6 +287,12 @@ pub(super) fn draw_legend<'a>(
         bottom = y + LEGEND_LEADING + 4.0;
     }
     bottom - area.y
+}
+
+/// Returns the height of a legend of this width.
+pub(super) fn legend_height<'a>(width: f64, all: impl IntoIterator<Item = &'a Series>) -> f64 {
+    let mut scratch = Canvas::new(width, 0.0, Letters::Text);
+    draw_legend(&mut scratch, Rect::new(0.0, 0.0, width, 0.0), all)
 }
 
 struct Plot<'a> {

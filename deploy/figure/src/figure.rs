@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::{
     canvas::{Anchor, Canvas, Letters, Rect, TextStyle},
-    chart::{Chart, Series, draw_legend},
+    chart::{Chart, Series, draw_legend, legend_height},
     colours::{CARD, CARD_BORDER, INK, INK_SOFT},
     error::FigureError,
     font,
@@ -101,11 +101,8 @@ impl Figure {
             })
         };
         let (width, height) = self.panel_size;
-        let mut scratch = Canvas::new(width, height, Letters::Text);
-        let area = Rect::new(0.0, 0.0, width, height);
         let mut shared: Vec<&Series> = Vec::new();
-        let mut heights =
-            charts().map(|chart| draw_legend(&mut scratch, area, chart.named_series()));
+        let mut heights = charts().map(|chart| legend_height(width, chart.named_series()));
         if heights.any(|it| it > LEGEND_SHARE_MAX * height) {
             for series in charts().flat_map(Chart::named_series) {
                 if shared.iter().all(|it| it.name != series.name) {
@@ -129,13 +126,8 @@ impl Figure {
         };
         let shared = self.shared_legend();
         let legend = Rect::new(MARGIN, header_height, width - 2.0 * MARGIN, 0.0);
-        let legend_height = draw_legend(
-            &mut Canvas::new(width, 0.0, letters),
-            legend,
-            shared.clone(),
-        );
         if !shared.is_empty() {
-            header_height += legend_height + 10.0;
+            header_height += legend_height(legend.width, shared.clone()) + 10.0;
         }
         let height = header_height + rows as f64 * (panel_height + MARGIN) + 4.0;
 
