@@ -368,8 +368,9 @@ mod tests {
         assert!(long.0.len() <= 22);
         let warmed_up = rates([(0, 0, 7), (10, 10, 7), (12, 12, 47)]).speed();
         assert_eq!((warmed_up.frames, warmed_up.updates), (1.0, 20.0));
-        // Samples of one moment.
-        assert_eq!(rates([(3, 0, 0), (3, 256, 9)]).speed(), Speed::default());
+        let mut lump = rates([(0, 0, 0)]);
+        lump.add(lump.0[0].0 + Duration::from_millis(1), 256, 9);
+        assert_eq!(lump.speed(), Speed::default(), "too soon to tell");
         let paused = [(0, 0, 0), (1, 10, 1), (5_000, 20, 2), (5_001, 50, 8)];
         let [at_once, later] = [3, 4].map(|samples| rates(paused[..samples].to_vec()).speed());
         assert_eq!(
