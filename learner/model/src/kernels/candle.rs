@@ -120,8 +120,7 @@ pub(crate) fn grouped_linear(
 
 /// max(x, 0). Its gradient at exactly 0 is 0, unlike that of candle's `relu`. It keeps NaN.
 pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
-    let is_positive = x.gt(0f32)?.to_dtype(x.dtype())?.detach();
-    x * is_positive
+    x.le(0f32)?.where_cond(&x.zeros_like()?, x)
 }
 
 /// As `dots::dot_products`: psi and phi [B, L, R] or [B, R] to [L, B, B].

@@ -34,7 +34,7 @@ pub(crate) fn grouped_linear(
     let ((rows, inputs), count) = (x.dims2()?, b.elem_count() / out.max(1));
     let fits = w.dims() == [count * out, inputs] && b.dims() == [count * out];
     let known = groups.iter().all(|&group| usize::from(group) < count);
-    if !fits || rows != groups.len() || !known || inputs * out == 0 {
+    if !fits || rows != groups.len() || !known || rows * inputs * out == 0 {
         bail!(
             "layer of x {:?} with weight {:?}, bias {:?} and {out} outputs for each of {} rows' groups",
             x.shape(),

@@ -2,7 +2,7 @@
 
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::{Element, Simd};
-use crate::kernels::rounding::{store, store_byte_steps, store_bytes, store_steps};
+use crate::kernels::rounding::{store, store_bytes, store_steps};
 
 /// Stored images [n, height, width, channels_in].
 #[derive(Clone, Copy)]
@@ -79,12 +79,6 @@ impl<E: Element> Images<'_, E> {
         (len, shift): (usize, usize),
         [scratch, image_scratch]: &'r mut [ScratchBuffer<E>; 2],
     ) -> &'r [E] {
-        let range = index * len..(index + 1) * len;
-        if let Self::Pixels(Pixels::Bytes(bytes)) = self {
-            let steps = scratch.slice(len * E::DEPTH);
-            store_byte_steps(simd, &bytes[range], shift, steps);
-            return steps;
-        }
         let image = self.image(simd, index, (len, 0), image_scratch);
         if E::DEPTH == 1 {
             return image;

@@ -12,7 +12,7 @@ pub enum Precision {
     #[default]
     F32,
     /// 8 bits of significand and f32's exponents: operands are rounded to nearest, ties to even. Processors with bf16
-    /// products flush operands, products and sums below 1.2e-38 to 0. An operand above 3.3895e38 rounds to infinity.
+    /// products flush operands, products and sums below 1.2e-38 to 0. An operand from 3.3962e38 on rounds to infinity.
     Bf16,
 }
 

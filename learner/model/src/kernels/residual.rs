@@ -51,7 +51,7 @@ pub(crate) fn residual_block(
         None => (1, 0),
     };
     let is_bias = |bias: &Tensor| bias.dims() == [outputs];
-    let fits = features > 0
+    let fits = rows > 0
         && features + joined_width == inputs
         && groups > 0
         && rows.is_multiple_of(groups)

@@ -10,18 +10,6 @@ vectorized! {
 }
 
 vectorized! {
-    /// Stores pixels as operands of a sum over windows: [`Element::store_byte_steps`].
-    pub(crate) fn store_byte_steps<S>(
-        simd,
-        bytes: &'a [u8],
-        shift: usize,
-        steps: &'a mut [S::Element],
-    ) {
-        S::Element::store_byte_steps(simd, bytes, shift, steps);
-    }
-}
-
-vectorized! {
     /// Rounds `floats` into `values`, which has the same length.
     pub(crate) fn store<S>(simd, floats: &'a [f32], values: &'a mut [S::Element]) {
         S::Element::store(simd, floats, values);

@@ -157,12 +157,6 @@ macro_rules! bf16_rounding {
                 // SAFETY: `new` found the instructions.
                 unsafe { avx512_rounding::convert_bytes(bytes, to) }
             }
-
-            #[inline(always)]
-            fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
-                // SAFETY: `new` found the instructions.
-                unsafe { avx512_rounding::pair_bytes(first, second, pairs) }
-            }
         }
     };
 }

@@ -5,10 +5,9 @@
 
 use std::arch::x86_64::{
     __m256bh, __m256i, __m512, __m512bh, __m512i, _mm_loadu_si128, _mm256_mask_storeu_epi16,
-    _mm512_castps_si512, _mm512_cvtepi32_ps, _mm512_cvtepu8_epi32, _mm512_cvtne2ps_pbh,
-    _mm512_cvtneps_pbh, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_mask_storeu_epi16,
-    _mm512_maskz_loadu_ps, _mm512_or_si512, _mm512_permutex2var_epi16, _mm512_permutexvar_epi16,
-    _mm512_srli_epi32, _mm512_storeu_si512,
+    _mm512_cvtepi32_ps, _mm512_cvtepu8_epi32, _mm512_cvtne2ps_pbh, _mm512_cvtneps_pbh,
+    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_mask_storeu_epi16, _mm512_maskz_loadu_ps,
+    _mm512_permutex2var_epi16, _mm512_permutexvar_epi16, _mm512_storeu_si512,
 };
 use std::mem::transmute;
 
@@ -162,30 +161,6 @@ pub(super) unsafe fn convert_bytes(bytes: &[u8], to: &mut [bf16]) {
     }
     for (to, &byte) in to_tail.iter_mut().zip(tail) {
         *to = bf16::from_byte(byte);
-    }
-}
-
-/// `Rounding::pair_bytes`, 16 pairs at a time.
-#[inline]
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
-pub(super) unsafe fn pair_bytes(first: &[u8], second: &[u8], pairs: &mut [bf16]) {
-    let columns = first.len().min(second.len());
-    let pairs = &mut pairs[..2 * columns];
-    let (first_blocks, first_tail) = first[..columns].as_chunks::<LANES>();
-    let (second_blocks, second_tail) = second[..columns].as_chunks::<LANES>();
-    let (pair_blocks, pair_tail) = pairs.as_chunks_mut::<{ 2 * LANES }>();
-    for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
-        // SAFETY: 16 bytes of each row become one register of pairs.
-        unsafe {
-            let first = _mm512_srli_epi32::<16>(_mm512_castps_si512(bytes_to_floats(first)));
-            let second = _mm512_castps_si512(bytes_to_floats(second));
-            let words = _mm512_or_si512(first, second);
-            _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words);
-        }
-    }
-    let pairs = pair_tail.as_chunks_mut::<2>().0.iter_mut();
-    for ((pair, &first), &second) in pairs.zip(first_tail).zip(second_tail) {
-        *pair = [first, second].map(bf16::from_byte);
     }
 }
 

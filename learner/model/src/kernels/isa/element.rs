@@ -42,14 +42,6 @@ pub(crate) trait Rounding: Copy {
             *to = bf16::from_byte(byte);
         }
     }
-
-    /// Converts two rows of pixels and interleaves them, as [`Rounding::pair`].
-    #[inline(always)]
-    fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
-        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
-            (pair[0], pair[1]) = (bf16::from_byte(first), bf16::from_byte(second));
-        }
-    }
 }
 
 pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
@@ -80,11 +72,7 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// Converts pixels as [`Element::from_byte`], into the first elements of `to`.
     fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]);
 
-    /// Converts pixels as [`Element::from_byte`]. If `DEPTH` is 2, each is paired with the one `shift` further,
-    /// or with 0 beyond the end: `steps` [pixels, DEPTH].
-    fn store_byte_steps<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]);
-
-    /// As [`Element::store_byte_steps`], for elements.
+    /// Copies `values`. If `DEPTH` is 2, each is paired with the one `shift` further, or with 0 beyond the end: `steps` [values, DEPTH].
     fn store_steps<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
 
     /// Packs the scalars of a step [DEPTH] into 32 bits.
@@ -140,11 +128,6 @@ impl Element for f32 {
         for (to, &byte) in to.iter_mut().zip(bytes) {
             *to = Self::from_byte(byte);
         }
-    }
-
-    #[inline(always)]
-    fn store_byte_steps<R: Rounding>(rounding: R, bytes: &[u8], _: usize, steps: &mut [Self]) {
-        Self::store_bytes(rounding, bytes, steps);
     }
 
     #[inline(always)]
@@ -222,17 +205,6 @@ impl Element for bf16 {
     #[inline(always)]
     fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]) {
         rounding.convert_bytes(bytes, to);
-    }
-
-    #[inline(always)]
-    fn store_byte_steps<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]) {
-        let shifted = bytes.get(shift..).unwrap_or_default();
-        let (begin, end) = bytes.split_at(shifted.len());
-        let (both, one) = steps.split_at_mut(shifted.len() * 2);
-        rounding.pair_bytes(begin, shifted, both);
-        for (pair, &byte) in one.chunks_exact_mut(2).zip(end) {
-            (pair[0], pair[1]) = (Self::from_byte(byte), Self::default());
-        }
     }
 
     #[inline(always)]

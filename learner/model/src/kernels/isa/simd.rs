@@ -36,7 +36,11 @@ impl<E> RawTile<E> {
     /// How many rows read each step of a run: 2 or 3 if the rows are windows that overlap by a half or by two thirds, else 1.
     pub(super) fn taps(&self) -> usize {
         let run = self.steps * self.step_stride;
-        let fits = |taps: &usize| self.steps.is_multiple_of(*taps) && self.row_stride * taps == run;
+        // Not `row_stride * taps`: the stride of a single row is any number, and the product may wrap.
+        let fits = |taps: &usize| {
+            let are_multiples = [self.steps, run].iter().all(|it| it.is_multiple_of(*taps));
+            are_multiples && self.row_stride == run / taps
+        };
         [2, 3].into_iter().find(fits).unwrap_or(1)
     }
 }
