@@ -91,8 +91,9 @@ impl Figure {
         }
     }
 
-    /// Returns the series of one legend for all charts, each name once, if a chart's legend would take too much of its panel.
-    fn shared_legend(&self) -> Vec<&Series> {
+    /// Returns the series of one legend for all charts, each name once, if a chart's legend would take too much of its panel, or if the
+    /// only legend would lack a series.
+    fn shared_legend(&self, look: Look) -> Vec<&Series> {
         let charts = || {
             let panels = self.panels.iter();
             panels.filter_map(|panel| match panel {
@@ -103,7 +104,13 @@ impl Figure {
         let (width, height) = self.panel_size;
         let mut shared: Vec<&Series> = Vec::new();
         let mut heights = charts().map(|chart| legend_height(width, chart.named_series()));
-        if heights.any(|it| it > LEGEND_SHARE_MAX * height) {
+        let first: Vec<&str> = match self.panels.first() {
+            Some(Panel::Chart(chart)) => chart.named_series().map(|it| &*it.name).collect(),
+            _ => Vec::new(),
+        };
+        let mut all = charts().flat_map(Chart::named_series);
+        let lacks_a_name = look == Look::Plain && all.any(|it| !first.contains(&&*it.name));
+        if lacks_a_name || heights.any(|it| it > LEGEND_SHARE_MAX * height) {
             for series in charts().flat_map(Chart::named_series) {
                 if shared.iter().all(|it| it.name != series.name) {
                     shared.push(series);
@@ -124,7 +131,7 @@ impl Figure {
             Look::Card => MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING,
             Look::Plain => MARGIN,
         };
-        let shared = self.shared_legend();
+        let shared = self.shared_legend(look);
         let legend = Rect::new(MARGIN, header_height, width - 2.0 * MARGIN, 0.0);
         if !shared.is_empty() {
             header_height += legend_height(legend.width, shared.clone()) + 10.0;
@@ -246,12 +253,13 @@ mod tests {
     #[test]
     fn a_plain_figure_is_its_panels_and_one_legend() {
         let svg = |look| {
-            let chart = |title: &str| {
-                let line = Series::line("driml-ada", 0, vec![(0.0, 1.0), (1.0, 3.0)]);
+            let chart = |title: &str, names: &[&str]| {
+                let line = |name: &&str| Series::line(name, 0, vec![(0.0, 1.0), (1.0, 3.0)]);
                 let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
-                Panel::Chart(Chart::new(title, x, y, vec![line]))
+                Panel::Chart(Chart::new(title, x, y, names.iter().map(line).collect()))
             };
-            let panels = vec![chart("first"), chart("second")];
+            let second = chart("second", &["driml-ada", "c51"]);
+            let panels = vec![chart("first", &["driml-ada"]), second];
             let bytes = Figure { panels, ..figure() }.encode(Format::Svg, look);
             String::from_utf8(bytes.unwrap()).unwrap()
         };
@@ -262,6 +270,7 @@ mod tests {
             ("made up", 1, 0),
             ("rx=", 1, 0),
             ("driml-ada", 2, 1),
+            ("c51", 1, 1),
             ("second", 1, 1),
         ] {
             let found = (count(&card, word), count(&plain, word));
