@@ -60,7 +60,7 @@ fn check_experiment(name: &str, files: &str) {
     let printed = system.run_ok(&call).stdout;
     let out = format!("experiments/{name}-smoke");
     let full = format!("experiment {name} --out {out}");
-    system.rejects(&full, "made with other settings");
+    system.rejects(&full, "holds results made with ");
     let folder = system.path(&out);
     assert!(printed.ends_with("README.md\n"), "{printed}");
     check_page(&folder, &["**Time.**", "**Expected.**"], files);
@@ -220,6 +220,8 @@ fn tradeoff() {
         !folder.join("runs/c51-seed1").exists(),
         "a plan runs nothing"
     );
+    let settings = folder.join("pieces/settings.json");
+    assert!(!settings.exists(), "a plan settles nothing");
 
     call("--dials learner.precision");
     let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
@@ -334,5 +336,5 @@ fn a_grid_makes_every_combination_once() {
     system.run_ok("grid --report");
     assert_eq!(table().rows, made);
     // Another grid is rejected in the same folder.
-    system.rejects(&format!("{fixed} --frames 352"), "other settings");
+    system.rejects(&format!("{fixed} --frames 352"), "holds results made with axes = ");
 }

@@ -24,6 +24,7 @@ use serde::{
     Deserialize, Serialize,
     de::{DeserializeOwned, IgnoredAny},
 };
+use serde_json::{Map, Value as Json};
 
 use crate::{
     flags::ExperimentFlags,
@@ -38,6 +39,13 @@ const SETTINGS: &str = "settings.json";
 const CORES: &str = "cores";
 /// The subfolder with the runs of a sweep. Git ignores it.
 pub(crate) const RUNS: &str = "runs";
+
+/// Returns `text` as the name of a file: each unsuitable character, such as one of a world's command, becomes a dash.
+pub(crate) fn file_name(text: &str) -> String {
+    let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
+    let letters = text.chars().map(|it| if is_allowed(it) { it } else { '-' });
+    letters.collect()
+}
 
 #[derive(Serialize, Deserialize)]
 struct StoredPiece<T> {
@@ -77,7 +85,7 @@ impl Session {
         if report_only && !has(PIECES) && !has(RUNS) {
             let folder = folder.display();
             bail!(usage!(
-                "{folder} has no results yet: there is nothing to report"
+                "{folder} has no results yet: run the same command without --report first"
             ));
         }
         let pieces = folder.join(PIECES);
@@ -86,9 +94,10 @@ impl Session {
         let path = pieces.join(SETTINGS);
         match fs::read(&path) {
             Ok(found) if found == settings.as_bytes() => {}
-            Ok(_) => bail!(usage!(
-                "{} holds results made with other settings: choose another --out, or remove that folder",
-                folder.display()
+            Ok(found) => bail!(usage!(
+                "{} holds results made with {}: choose another --out, or remove that folder",
+                folder.display(),
+                describe_change(&found, settings.as_bytes())
             )),
             Err(_) if report_only => {}
             Err(_) => output::write_file("--out", &path, settings.as_bytes())?,
@@ -108,6 +117,12 @@ impl Session {
             session.store(CORES, Machine::detect().cores)?;
         }
         Ok(session)
+    }
+
+    /// Removes the stored settings, so that a later call may choose others. The pieces must name what they were made from.
+    pub(crate) fn forget_settings(&self) -> anyhow::Result<()> {
+        let path = self.folder.join(PIECES).join(SETTINGS);
+        fs::remove_file(&path).with_context(|| format!("removing {}", path.display()))
     }
 
     /// Returns the piece of this name if it exists and can be read, whatever it was made from.
@@ -141,7 +156,8 @@ impl Session {
     }
 
     fn piece_path(&self, key: &str) -> PathBuf {
-        self.folder.join(PIECES).join(format!("{key}.json"))
+        let name = file_name(&format!("{key}.json"));
+        self.folder.join(PIECES).join(name)
     }
 
     /// Counts runs, which `sweep::runs` keeps: the time of all of them together, how many were made at once, and the names of the
@@ -165,7 +181,9 @@ impl Session {
     pub(crate) fn check_has_runs<T>(&self, made: &[T]) -> anyhow::Result<()> {
         if made.is_empty() {
             self.check_none_missing()?;
-            bail!(usage!("no run is finished yet: there is nothing to report"));
+            bail!(usage!(
+                "no run is finished yet: run the same command without --report first"
+            ));
         }
         Ok(())
     }
@@ -261,6 +279,18 @@ impl Session {
 pub(crate) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
     let text = fs::read_to_string(folder(name, flags).join(PIECES).join(SETTINGS)).ok()?;
     serde_json::from_str(&text).ok()
+}
+
+/// Names the first setting that differs, with both values.
+fn describe_change(before: &[u8], now: &[u8]) -> String {
+    let parse = |text| serde_json::from_slice::<Map<String, Json>>(text).unwrap_or_default();
+    let (before, now) = (parse(before), parse(now));
+    let mut keys = before.keys().chain(now.keys());
+    let changed = keys.find(|key| before.get(*key) != now.get(*key)).cloned();
+    changed.map_or("other settings".into(), |key| {
+        let [before, now] = [before, now].map(|it| it.get(&key).cloned().unwrap_or_default());
+        format!("{key} = {before}, not {now}")
+    })
 }
 
 /// Returns the folder of the experiment `name`: `--out`, or the default.

@@ -64,11 +64,16 @@ impl Progress {
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.count(units);
         self.show();
-        if self.shutdown.drain.is_set() {
+        if self.is_interrupted() {
             self.clear();
             return Err(Interrupted);
         }
         Ok(())
+    }
+
+    /// Whether a Ctrl-C or a signal asked the experiment to stop.
+    pub(crate) fn is_interrupted(&self) -> bool {
+        self.shutdown.drain.is_set()
     }
 
     pub(crate) fn line(&self, line: &str) {

@@ -107,7 +107,8 @@ impl Player {
         self
     }
 
-    /// Plays whole episodes on the given levels. Returns their returns; none if the world does not have these levels.
+    /// Plays whole episodes on the given levels. Returns their returns; none if the world does not have these levels. Once `is_over` returns
+    /// true, the rest is not played.
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.
@@ -117,11 +118,12 @@ impl Player {
         levels: Levels,
         episodes: u32,
         seed: u64,
+        is_over: impl Fn() -> bool,
     ) -> anyhow::Result<Option<Vec<f64>>> {
         let Ok(world) = world_with_levels(&self.config.world, levels) else {
             return Ok(None);
         };
-        let watch = &mut stop_when(|| false);
+        let watch = &mut stop_when(is_over);
         let played = self.play(policy_kind, &world, episodes as usize, seed, watch);
         played.map(Some)
     }
@@ -183,10 +185,16 @@ impl Player {
     }
 }
 
-/// Plays whole episodes with a random policy in a run's world, on the training levels. Returns their returns. Needs no checkpoint.
-pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
+/// Plays whole episodes with a random policy in a run's world, on the training levels. Returns their returns. Needs no checkpoint. Once
+/// `is_over` returns true, the rest is not played.
+pub fn random_returns(
+    config: &RunConfig,
+    episodes: usize,
+    seed: u64,
+    is_over: impl Fn() -> bool,
+) -> anyhow::Result<Vec<f64>> {
     let world = world_with_levels(&config.world, Levels::Train)?;
-    let (policy, watch) = (&mut random_policy(config)?, &mut stop_when(|| false));
+    let (policy, watch) = (&mut random_policy(config)?, &mut stop_when(is_over));
     play_episodes(config, policy, &world, episodes, EPSILON, seed, watch)
 }
 

@@ -36,6 +36,9 @@ pub struct PlotArgs {
     /// For a paper: charts without title and notes, and one legend
     #[arg(long)]
     pub(crate) plain: bool,
+    /// Settings that distinguish runs, although they depend on the machine
+    #[arg(skip)]
+    pub(crate) compared: Vec<String>,
     /// File to write, .svg, .pdf or .png
     #[arg(long, value_name = "FILE", default_value = "plot.svg")]
     pub(crate) out: PathBuf,

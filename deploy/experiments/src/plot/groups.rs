@@ -13,7 +13,7 @@ use super::{
 use crate::stats::{Spread, interval};
 
 const GRID_INTERVALS: usize = 240;
-/// The most points of a single run's curve. Of a longer curve only every second, third, ... point is drawn.
+/// The most points of a single run's curve. Of a longer curve the ends are drawn, and between them the lowest and highest of neighbours.
 const POINTS_MAX: usize = 600;
 /// Curves without a common x are still averaged if the gap is at most this share of x: evaluations of seeds are some frames apart.
 const GAP_SHARE_MAX: f64 = 0.05;
@@ -137,10 +137,24 @@ pub(crate) fn smooth(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
 }
 
 fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let step = points.len().div_ceil(POINTS_MAX).max(1);
-    let is_left_out = |_: &&_| !(points.len() - 1).is_multiple_of(step);
-    let last = points.last().filter(is_left_out);
-    points.iter().step_by(step).chain(last).copied().collect()
+    if points.len() <= POINTS_MAX {
+        return points.to_vec();
+    }
+    let end = points.len() - 1;
+    let extremes = |chunk: &[(f64, f64)]| {
+        let by_y = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
+        let (low, high) = (chunk.iter().min_by(by_y), chunk.iter().max_by(by_y));
+        let mut ends: Vec<_> = low.into_iter().chain(high).copied().collect();
+        ends.sort_by(|a, b| a.0.total_cmp(&b.0));
+        ends
+    };
+    let inner = points[1..end].chunks(2 * points.len().div_ceil(POINTS_MAX));
+    let inner = inner.flat_map(extremes);
+    [points[0]]
+        .into_iter()
+        .chain(inner)
+        .chain([points[end]])
+        .collect()
 }
 
 /// Returns mean and band of several curves over their common range of x, or at the middle of a small gap between them.
@@ -184,6 +198,18 @@ mod tests {
         let points = [(0.0, 1.0), (10.0, 3.0), (10.0, 5.0), (20.0, 6.0)];
         let found = [-1.0, 0.0, 5.0, 15.0, 99.0].map(|x| interpolate(&points, x));
         assert_eq!(found, [1.0, 1.0, 2.0, 5.5, 6.0]);
+    }
+
+    #[test]
+    fn a_thinned_curve_keeps_its_extremes_and_its_ends() {
+        let mut points: Vec<_> = (0..5000).map(|x| (f64::from(x), 1.0)).collect();
+        (points[0].1, points[1234].1, points[1235].1, points[4999].1) = (2.0, 9.0, -9.0, 3.0);
+        let drawn = thin(&points);
+        assert!(drawn.len() <= POINTS_MAX + 2, "{}", drawn.len());
+        assert!(drawn.is_sorted_by(|a, b| a.0 <= b.0));
+        for at in [0, 1234, 1235, 4999] {
+            assert!(drawn.contains(&points[at]), "{at}");
+        }
     }
 
     #[test]

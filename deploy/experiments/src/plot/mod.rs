@@ -24,7 +24,7 @@ use driml_machine::{error::usage, units::count};
 pub(crate) use self::{
     flags::Band,
     groups::{Curve, combine_seeds, smooth},
-    runs::Run,
+    runs::{Run, Settings, read_settings},
 };
 use self::{
     flags::PlotArgs,
@@ -106,7 +106,8 @@ fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
 }
 
 fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
-    let runs = run_folders(args)?.into_iter().map(|it| Run::read(&it));
+    let runs = run_folders(args)?.into_iter();
+    let runs = runs.map(|it| Run::read_comparing(&it, &args.compared));
     let runs = runs.collect::<anyhow::Result<Vec<_>>>()?;
     let named = |column: &String| {
         let word = SHORT_NAMES.iter().find(|(word, _)| word == column);
@@ -244,7 +245,7 @@ fn random_means(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f6
         let config = read_config(&run.folder)?;
         let task = (config.world.clone(), config.actor.actions);
         if !known.contains(&task) {
-            let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0)?);
+            let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0, || false)?);
             found.push((config.run.world.clone(), mean));
             known.push(task);
         }

@@ -19,6 +19,17 @@ const TOTAL_LOSS: &str = "total_loss";
 /// The columns of `metrics.csv` that hold words instead of numbers.
 const TEXTS: [&str; 1] = ["waiting"];
 
+/// The beginnings of the names of settings that do not influence what is learned.
+const OF_MACHINE: [&str; 7] = [
+    "local.",
+    "transport.",
+    "learner.checkpoint_period_updates",
+    "learner.checkpoints_kept",
+    "actor.world_threads",
+    "replay.capacity_transitions",
+    "replay.compressed_bytes_max",
+];
+
 /// Settings as text, by their full dotted names.
 pub(crate) type Settings = BTreeMap<String, String>;
 
@@ -37,6 +48,11 @@ pub(crate) struct Run {
 
 impl Run {
     pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
+        Self::read_comparing(folder, &[])
+    }
+
+    /// Reads a run whose settings `compared` distinguish it from others, although they depend on the machine.
+    pub(super) fn read_comparing(folder: &RunFolder, compared: &[String]) -> anyhow::Result<Self> {
         let path = folder.metrics();
         let text = std::fs::read(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
@@ -50,7 +66,8 @@ impl Run {
         );
         let evaluations = folder.evaluations();
         let evaluated = Table::read(&evaluations)?;
-        let (settings, seed) = read_settings(&folder.config()).unzip();
+        let config = std::fs::read_to_string(folder.config()).ok();
+        let (settings, seed) = config.and_then(|it| read_settings(&it, compared)).unzip();
         let word = |name: &str| settings.as_ref()?.get(name);
         let world_agent = word("run.world").zip(word("run.agent"));
         let world_agent = world_agent.map(|(world, agent)| format!("{world} {agent}"));
@@ -139,27 +156,21 @@ pub(super) fn folder_name(folder: &Path) -> String {
     name.to_string_lossy().into_owned()
 }
 
-/// Returns the settings without the seed and without those that depend on the machine, and the seed. A run without settings is not
-/// grouped with others.
-fn read_settings(path: &Path) -> Option<(Settings, Option<i64>)> {
-    let table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
+/// Returns the settings of a run's `config.toml` without the seed and without those that depend on the machine, unless they are
+/// `compared`; and the seed. A run without settings is not grouped with others.
+pub(crate) fn read_settings(config: &str, compared: &[String]) -> Option<(Settings, Option<i64>)> {
+    let table: toml::Table = config.parse().ok()?;
     table.get("run")?.as_table()?;
     let mut all = flatten(&table);
     let seed = all.remove("run.seed").and_then(|seed| seed.parse().ok());
     // Most launch settings depend on the machine, but the number of actors influences what is learned.
-    let actors = all.remove("local.actors");
-    all.retain(|name, _| !name.starts_with("local.") && !name.starts_with("transport."));
-    all.extend(actors.map(|actors| ("actors".to_owned(), actors)));
-    // These settings do not influence what is learned.
-    for name in [
-        "learner.checkpoint_period_updates",
-        "learner.checkpoints_kept",
-        "actor.world_threads",
-        "replay.capacity_transitions",
-        "replay.compressed_bytes_max",
-    ] {
-        all.remove(name);
+    if let Some(actors) = all.remove("local.actors") {
+        all.insert("actors".into(), actors);
     }
+    all.retain(|name, _| {
+        let is_in = |prefix: &str| name.starts_with(prefix);
+        compared.iter().any(|it| is_in(it)) || !OF_MACHINE.into_iter().any(is_in)
+    });
     Some((all, seed))
 }
 

@@ -63,6 +63,9 @@ fn runs_that_differ_in_their_seed_are_one_line_with_a_band() {
     assert_eq!(curve.points.last(), Some(&(20.0, 3.5)));
     assert_eq!(curve.band.last(), Some(&(20.0, 2.5, 4.5)));
     assert_eq!(groups::group_runs(&runs, false).len(), 3);
+    let compared = ["local.learner_threads".into()];
+    let compared = [&a, &b].map(|it| Run::read_comparing(&RunFolder::new(it), &compared).unwrap());
+    assert_eq!(groups::group_runs(&compared, true).len(), 2);
 
     let svg = drawn(&root.args(&[&a, &b, &c], &[]));
     assert!(svg.contains("the band is their smallest and largest value"));

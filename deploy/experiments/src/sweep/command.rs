@@ -77,8 +77,10 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     print(&format!("{}{LEGEND}", align_columns(&lines, &[])))?;
     session.check_has_runs(&finished)?;
     let runs = finished.iter().map(|it| it.run.folder.path().to_owned());
+    let varied = axes.iter().filter(|axis| axis.values.len() > 1);
     plot::run(&PlotArgs {
         runs: runs.collect(),
+        compared: varied.map(|axis| axis.name.clone()).collect(),
         out: session.folder.join(format!("{NAME}.svg")),
         ..PlotArgs::default()
     })?;

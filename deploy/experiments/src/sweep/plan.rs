@@ -15,6 +15,8 @@ use driml_settings::{
     flags::{Flags, RunFlags, resolve},
 };
 
+use crate::cache::file_name;
+
 /// The flags of `driml train` that make a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct TrainCall {
@@ -42,7 +44,19 @@ impl TrainCall {
         given.flatten().collect()
     }
 
+    pub(crate) fn with_seed(&self, seed: u32) -> Self {
+        Self {
+            seed,
+            ..self.clone()
+        }
+    }
+
+    /// Resolves the settings for this machine, whatever memory is free now.
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
+        self.config_within(u64::MAX)
+    }
+
+    fn config_within(&self, memory_bytes: u64) -> Result<RunConfig, Usage> {
         let flags = RunFlags {
             env: self.env.clone(),
             agent: self.agent.clone(),
@@ -55,7 +69,11 @@ impl TrainCall {
                 ..Flags::default()
             },
         };
-        Ok(resolve(&flags, &Machine::detect())?.0)
+        let machine = Machine {
+            memory_bytes,
+            ..Machine::detect()
+        };
+        Ok(resolve(&flags, &machine)?.0)
     }
 }
 
@@ -73,12 +91,9 @@ pub(crate) struct PlannedRun {
 }
 
 impl PlannedRun {
-    /// Plans a run. In the folder name each unsuitable character, such as one of a world's command, becomes a dash.
     pub(crate) fn new(name: &str, call: TrainCall, frames: u64) -> Self {
-        let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
-        let letters = name.chars().map(|it| if is_allowed(it) { it } else { '-' });
         Self {
-            name: letters.collect(),
+            name: file_name(name),
             call,
             frames,
             episodes: None,
@@ -111,12 +126,9 @@ pub(crate) fn install_worlds<P>(plans: &[PointPlan<P>], report: bool) -> anyhow:
     let mut known: Vec<TrainCall> = Vec::new();
     let plans = if report { &[] } else { plans };
     for (_, plan) in plans {
-        let call = TrainCall {
-            seed: 1,
-            ..plan.call.clone()
-        };
+        let call = plan.call.with_seed(1);
         if !known.contains(&call) {
-            let config = call.config();
+            let config = call.config_within(Machine::detect().memory_bytes);
             let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
             let is_as_planned = config.run.seed == 1 && config.frames() == plan.frames;
             ensure!(

@@ -54,6 +54,9 @@ pub(crate) fn run_all<P>(
         waiting: VecDeque::new(),
         running: Vec::new(),
     };
+    if !report_only {
+        queue.runs.check_settings(&plans)?;
+    }
     for (_, plan) in &plans {
         if queue.runs.get_finished(plan).is_some() {
             progress.count_earlier(plan.units);

@@ -45,8 +45,11 @@ impl PlaySettings {
         key: &str,
         run: &FinishedRun,
     ) -> anyhow::Result<Vec<f64>> {
-        session.load_or_make(&self.episodes.to_string(), key, self.units, |_| {
-            random_returns(&read_config(&run.folder)?, self.episodes as usize, SEED)
+        session.load_or_make(&self.episodes.to_string(), key, self.units, |progress| {
+            let (config, is_over) = (read_config(&run.folder)?, || progress.is_interrupted());
+            let returns = random_returns(&config, self.episodes as usize, SEED, is_over)?;
+            progress.advance(0)?;
+            Ok(returns)
         })
     }
 
@@ -58,9 +61,12 @@ impl PlaySettings {
         let chosen = choose_checkpoints(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(chosen.len().max(1) as u32);
         let returns = chosen.into_iter().map(|choice| {
-            progress.advance(0)?;
             let player = Player::load(folder, choice, WeightsChoice::default())?;
-            player.play_levels(PolicyKind::Agent, self.levels, each, SEED)
+            let is_over = || progress.is_interrupted();
+            let returns =
+                player.play_levels(PolicyKind::Agent, self.levels, each, SEED, is_over)?;
+            progress.advance(0)?;
+            Ok(returns)
         });
         let all = returns.collect::<anyhow::Result<Option<Vec<_>>>>()?;
         Ok(all.map(|all| all.concat()))

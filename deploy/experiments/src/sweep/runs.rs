@@ -6,11 +6,19 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::Context;
-use driml_launch::run_folder::{Outcome, RunFolder, Summary, read_progress, write_atomically};
+use anyhow::{Context, bail};
+use driml_launch::{
+    checkpoint_choice::read_config,
+    run_folder::{Outcome, RunFolder, Summary, read_progress, write_atomically},
+};
+use driml_machine::error::usage;
+use driml_settings::config::RunConfig;
 
-use super::plan::{FinishedRun, PlannedRun};
-use crate::cache::RUNS;
+use super::plan::{FinishedRun, PlannedRun, PointPlan, TrainCall};
+use crate::{
+    cache::RUNS,
+    plot::{Settings, read_settings},
+};
 
 /// The number of bytes at the end of a failed run's output that are shown.
 const LOG_TAIL_BYTES: usize = 1200;
@@ -45,6 +53,39 @@ impl Runs {
             summary,
             commit: self.read_commit(plan),
         })
+    }
+
+    /// Checks that the existing runs have the settings that the same calls mean now: presets may have changed since, and defaults depend on
+    /// the machine.
+    pub(super) fn check_settings<P>(&self, plans: &[PointPlan<P>]) -> anyhow::Result<()> {
+        let mut known: Vec<(TrainCall, Settings)> = Vec::new();
+        let settings = |config: RunConfig| {
+            let found = read_settings(&config.to_toml(), &[]);
+            found.expect("a run's settings have a table [run]").0
+        };
+        for (_, plan) in plans {
+            let (folder, call) = (self.folder(plan), plan.call.with_seed(1));
+            if !self.is_made_by(plan) || !folder.config().exists() {
+                continue;
+            }
+            let at = known.iter().position(|it| it.0 == call);
+            let at = at.unwrap_or(known.len());
+            if at == known.len() {
+                let now = settings(call.config()?);
+                known.push((call, now));
+            }
+            let now = &known[at].1;
+            let made = settings(read_config(&folder)?);
+            let mut keys = made.keys().chain(now.keys());
+            if let Some(key) = keys.find(|key| made.get(*key) != now.get(*key)) {
+                let [made, now] = [&made, now].map(|it| it.get(key).map_or("unset", |it| it));
+                bail!(usage!(
+                    "{} was made with {key} = {made}, and this call now means {now}: choose another --out, or remove that folder",
+                    folder.display()
+                ));
+            }
+        }
+        Ok(())
     }
 
     fn read_commit(&self, plan: &PlannedRun) -> String {
@@ -122,7 +163,6 @@ pub(super) mod tests {
     };
 
     use super::*;
-    use crate::sweep::plan::TrainCall;
 
     pub(in crate::sweep) fn write_finished_run(folder: &RunFolder) {
         let call = TrainCall {
@@ -167,6 +207,32 @@ pub(super) mod tests {
         fs::write(folder.metrics(), "seconds,frames\n").unwrap();
         let found = runs.get_finished(&plan(10));
         assert!(found.is_none(), "its metrics are gone");
+    }
+
+    #[test]
+    fn a_run_of_other_settings_is_not_mixed_in() {
+        let root = tempfile::tempdir().unwrap();
+        let runs = Runs::open(root.path()).unwrap();
+        let call = TrainCall {
+            env: Some("chain".into()),
+            seed: 2,
+            ..TrainCall::default()
+        };
+        let plans = [((), PlannedRun::new("run", call, 10))];
+        let folder = runs.folder(&plans[0].1);
+        write_finished_run(&folder);
+        let check = || runs.check_settings(&plans).map_err(|e| e.to_string());
+        let config = fs::read_to_string(folder.config()).unwrap();
+        let other = config.replace("beta1 = 0.9", "beta1 = 0.8");
+        assert_ne!(other, config);
+        fs::write(folder.config(), &other).unwrap();
+        assert_eq!(check(), Ok(()), "another call made it");
+        runs.write_call(&plans[0].1, "abc", false).unwrap();
+        let problem = check().unwrap_err();
+        let expected = "beta1 = 0.8, and this call now means 0.9";
+        assert!(problem.contains(expected), "{problem}");
+        fs::write(folder.config(), config).unwrap();
+        assert_eq!(check(), Ok(()));
     }
 
     #[test]

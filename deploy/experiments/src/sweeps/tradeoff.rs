@@ -22,8 +22,8 @@ use minijinja::context;
 
 use self::{
     menu::{DialLevel, Point, Settings},
-    plan::{Budget, Cost},
-    results::{Numbers, PointResult, Results, SeedResult},
+    plan::{Cost, choose_levels},
+    results::{Numbers, PointResult, Results, SeedResult, is_resumed},
 };
 use crate::{
     cache::{self, Session},
@@ -63,6 +63,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let world = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let name = format!("tradeoff-{}", world.to_string().replace("procgen:", ""));
     let stored = cache::settings_of(&name, &args.flags);
+    let is_new = stored.is_none() && !args.queue.report;
     let mut settings = Settings::from_args(args, world, stored)?;
     let report_only = args.queue.report;
     if !report_only {
@@ -80,9 +81,14 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         settings,
         speeds: BTreeMap::new(),
     };
-    tradeoff.measure_speeds()?;
-    let left = (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
-    let chosen = tradeoff.choose_levels(left)?;
+    let left = || (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
+    let measured = tradeoff.measure_speeds();
+    let chosen = measured.and_then(|()| tradeoff.choose_levels(left()));
+    // The length of the runs is settled once there is a run.
+    if is_new && (args.plan || !chosen.as_ref().is_ok_and(|it| it.contains(&true))) {
+        tradeoff.session.forget_settings()?;
+    }
+    let chosen = chosen?;
     if args.plan {
         return Ok(());
     }
@@ -93,9 +99,11 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
             true => "no run is finished yet",
             false => "no level and its base both have a finished run",
         };
-        return Err(
-            usage!("{what}, and none fits into the budget: there is nothing to report").into(),
-        );
+        let next = match report_only {
+            true => "run the same command without --report first",
+            false => "raise --budget",
+        };
+        return Err(usage!("{what}, and none fits into the budget: {next}").into());
     }
     report::write_report(tradeoff.session, &results)
 }
@@ -130,7 +138,9 @@ impl Tradeoff<'_> {
     /// Benchmarks every requested level and its base. For other levels, and for a report, it only reads existing benchmarks.
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
         let (smoke, settings) = (self.args.flags.smoke, &self.settings);
-        let (units, program) = (self.piece_units(), cache::program_id()?);
+        let (units, common) = (self.piece_units(), &settings.common);
+        let program = cache::program_id()?;
+        let source = format!("{program}, {:?}, {:?}", common.preset, common.sets);
         for point in settings.levels.iter().flat_map(DialLevel::points) {
             if self.speeds.contains_key(&point.key) {
                 continue;
@@ -140,11 +150,11 @@ impl Tradeoff<'_> {
                 // Accept the result of any program: only requested points are measured again.
                 self.session.read_piece(&key)
             } else {
-                let base = settings.common.config(settings.timing_base(point))?;
-                let config = settings.common.config(point)?;
+                let base = common.config(settings.timing_base(point))?;
+                let config = common.config(point)?;
                 self.session.progress.add_work(units);
                 let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
-                Some(self.session.load_or_make(&program, &key, units, measure)?)
+                Some(self.session.load_or_make(&source, &key, units, measure)?)
             };
             self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
         }
@@ -158,25 +168,28 @@ impl Tradeoff<'_> {
             return Ok(vec![false; levels.len()]);
         }
         let runs = Runs::open(&self.session.folder)?;
-        let mut budget = Budget::new(left);
-        let (mut chosen, mut asked) = (vec![false; levels.len()], Vec::new());
-        let all = levels.iter().zip(&mut chosen);
-        for (level, is_chosen) in all.filter(|it| it.0.is_requested) {
-            let [base, level_cost] = level.points().map(|it| self.cost(&runs, it, &level.base));
-            let costs = [base?, level_cost?];
-            *is_chosen = budget.try_take(&costs);
-            let [_, Cost { seconds, .. }] = costs;
-            asked.push(context! { name => level.name(), seconds, fits => *is_chosen });
-        }
+        let requested = || levels.iter().filter(|it| it.is_requested);
+        let costs = requested().map(|level| {
+            let [base, own] = level.points().map(|it| self.cost(&runs, it, &level.base));
+            Ok([base?, own?])
+        });
+        let costs = costs.collect::<anyhow::Result<Vec<_>>>()?;
+        let (fits, seconds) = choose_levels(&costs, left);
+        let asked = requested().zip(&costs).zip(&fits);
+        let asked = asked.map(|((level, [_, (_, seconds)]), fits)| {
+            context! { name => level.name(), seconds, fits }
+        });
         let values = context! {
             settings => self.settings.common,
             seeds => self.settings.seeds,
-            levels => asked,
-            seconds => budget.seconds,
+            levels => asked.collect::<Vec<_>>(),
+            seconds,
             left,
         };
         print(&fill(include_str!("tradeoff_plan.j2"), &values)?)?;
-        Ok(chosen)
+        let mut fits = fits.into_iter();
+        let is_chosen = |it: &DialLevel| it.is_requested && fits.next() == Some(true);
+        Ok(levels.iter().map(is_chosen).collect())
     }
 
     /// Returns the cost of the unfinished runs of a point. `base` is the point itself or the base of its level.
@@ -207,10 +220,7 @@ impl Tradeoff<'_> {
                 estimated(point)?.map_or(f64::INFINITY, |seconds| factor * seconds)
             }
         };
-        Ok(Cost {
-            key: point.key.clone(),
-            seconds: each * unfinished as f64,
-        })
+        Ok((point.key.clone(), each * unfinished as f64))
     }
 
     /// Returns the runs of the chosen levels and their bases, and all runs that are already finished.
@@ -269,7 +279,10 @@ impl Tradeoff<'_> {
             }
             result.seeds.push(SeedResult {
                 seed: plan.call.seed,
-                curve: Run::read(&run.folder)?.values("seconds", "mean_return")?,
+                curve: match is_resumed(&run) {
+                    true => Vec::new(),
+                    false => Run::read(&run.folder)?.values("seconds", "mean_return")?,
+                },
                 run,
                 greedy: greedy.unwrap_or_default(),
             });

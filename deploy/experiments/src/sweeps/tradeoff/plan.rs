@@ -3,42 +3,24 @@
 
 use std::collections::BTreeSet;
 
-#[derive(Clone, Debug)]
-pub(super) struct Cost {
-    pub(super) key: String,
-    pub(super) seconds: f64,
-}
+/// The name of a point, and the seconds that its unfinished runs take.
+pub(super) type Cost = (String, f64);
 
-/// A budget of machine time, and the points on which it is spent.
-#[derive(Debug, Default)]
-pub(super) struct Budget {
-    pub(super) seconds_max: f64,
-    /// The seconds of everything taken. Each point counts once.
-    pub(super) seconds: f64,
-    taken: BTreeSet<String>,
-}
-
-impl Budget {
-    pub(super) fn new(seconds_max: f64) -> Self {
-        Self {
-            seconds_max,
-            ..Self::default()
-        }
-    }
-
-    /// Takes a level and its base with all their seeds if both fit, and returns whether it does. A level that costs nothing always fits. A
-    /// level that does not fit leaves its room to later levels.
-    pub(super) fn try_take(&mut self, base_and_level: &[Cost; 2]) -> bool {
-        let both = base_and_level.iter();
-        let new = both.clone().filter(|it| !self.taken.contains(&it.key));
-        let more: f64 = new.map(|it| it.seconds).sum();
-        let fits = more == 0.0 || self.seconds + more <= self.seconds_max;
+/// Returns which levels fit into `seconds_max`, each with its base and all seeds, and the seconds of all that fit. Each point is paid once.
+/// A level that costs nothing always fits. One that does not fit leaves its room to later levels.
+pub(super) fn choose_levels(base_and_level: &[[Cost; 2]], seconds_max: f64) -> (Vec<bool>, f64) {
+    let (mut seconds, mut taken) = (0.0, BTreeSet::new());
+    let fits = base_and_level.iter().map(|both| {
+        let new = both.iter().filter(|(key, _)| !taken.contains(key));
+        let more: f64 = new.map(|(_, seconds)| seconds).sum();
+        let fits = more == 0.0 || seconds + more <= seconds_max;
         if fits {
-            self.seconds += more;
-            self.taken.extend(both.map(|it| it.key.clone()));
+            seconds += more;
+            taken.extend(both.iter().map(|(key, _)| key));
         }
         fits
-    }
+    });
+    (fits.collect(), seconds)
 }
 
 /// Returns the frames of a run: the largest of `full`, its half and its quarter with which the first level and its base fit into the
@@ -73,16 +55,11 @@ mod tests {
             (&finished, 0.0, &[true, false], 0.0),
             (&finished, 50.0, &[true, true], 50.0),
         ] {
-            let mut budget = Budget::new(seconds_max);
-            let costs = levels.iter().map(|both| {
-                both.map(|(key, seconds)| Cost {
-                    key: key.to_owned(),
-                    seconds,
-                })
-            });
-            let found: Vec<_> = costs.map(|it| budget.try_take(&it)).collect();
-            let found = (&found[..], budget.seconds);
-            assert_eq!(found, (chosen, seconds), "{seconds_max} s");
+            let owned = levels
+                .iter()
+                .map(|it| it.map(|(key, cost)| (key.to_owned(), cost)));
+            let found = choose_levels(&owned.collect::<Vec<_>>(), seconds_max);
+            assert_eq!(found, (chosen.to_vec(), seconds), "{seconds_max} s");
         }
     }
 
