@@ -1,7 +1,7 @@
 //! Joining a run: fetching its settings, and registering as an actor or as the learner.
 //! Serving a run and leaving it are up to each process.
 
-use std::time::Duration;
+use std::{fmt, time::Duration};
 
 use zenoh::{Session, bytes::ZBytes};
 
@@ -79,19 +79,24 @@ pub fn fetch_run_info_once(
 struct ServerWait {
     silence: Silence,
     silence_log: LogLimiter,
-    recovery_log: LogLimiter,
+    wait_log: LogLimiter,
 }
 
 impl ServerWait {
+    /// Records the answer of a server that needs time, and logs now and then `why`, if the user `should_know`.
+    fn record_wait(&mut self, should_know: bool, why: &impl fmt::Display) {
+        self.silence.record_answer();
+        if should_know && self.wait_log.admit().is_some() {
+            tracing::info!("waiting for as long as it takes: {why}");
+        }
+    }
+
     /// Records a failed attempt, and logs now and then what this process waits for. Returns an error if a retry is useless.
     fn record_failure(&mut self, e: SessionError) -> Result<(), JoinError> {
         let e = match e {
             SessionError::Unreadable { why, .. } => return Err(why.into()),
             SessionError::Recovering(recovering) => {
-                self.silence.record_answer();
-                if recovering.progress.is_slow() && self.recovery_log.admit().is_some() {
-                    tracing::info!("waiting for as long as it takes: {recovering}");
-                }
+                self.record_wait(recovering.progress.is_slow(), &recovering);
                 return Ok(());
             }
             e => e,
@@ -135,6 +140,7 @@ pub fn join(
                 let why = format!("the replay server rejects this process: {why}");
                 return Err(JoinError::Refused(why));
             }
+            Ok(JoinReply::Wait { why }) => server_wait.record_wait(true, &why),
             Ok(JoinReply::Taken { why }) => match &mut predecessor {
                 Some(silence) => {
                     if silence.record_failure() > PREDECESSOR_WAIT_MAX {

@@ -63,6 +63,11 @@ pub enum JoinReply {
         /// The replay server's reason, a sentence.
         why: String,
     },
+    /// The replay server cannot record the process now. The process retries for as long as it takes.
+    Wait {
+        /// What the replay server waits for, as text for the user.
+        why: String,
+    },
 }
 
 /// The replay server's information for a process that it admits.

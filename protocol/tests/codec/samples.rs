@@ -347,6 +347,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         }),
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },
+        JoinReply::Wait { why: "c".into() },
     ];
     samples.extend(joined.map(|reply| Sample::new(&reply)));
     samples.extend(waits.map(|wait| Sample::new(&BatchReply::NotReady(NotReady::Wait(wait)))));

@@ -44,8 +44,7 @@ impl Service {
         incoming.into_responder().reply(&run_info);
     }
 
-    /// Answers a process that joins: its number of earlier incarnations, or why it is rejected. No reply while the disk cannot
-    /// record it.
+    /// Answers a process that joins: its number of earlier incarnations, or why it is rejected or has to wait.
     pub(super) fn join<J: Request<Reply = JoinReply>>(
         &self,
         incoming: Incoming<J>,
@@ -62,7 +61,8 @@ impl Service {
                 Err(rejected) => rejected,
             };
             if !state.replay.write_pending() {
-                return None;
+                let why = "the replay server cannot write its log; its output says why".into();
+                return Some(JoinReply::Wait { why });
             }
             if let JoinReply::Refused { why } = &reply {
                 state.reject(J::NAME, why);
