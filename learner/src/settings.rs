@@ -76,7 +76,9 @@ impl UpdateSettings {
             check_range("average_tau", tau, TAU_RANGE)?;
         }
         if self.target_period_updates == 0 {
-            return Err(UpdateError::Settings("target_period_updates = 0".into()));
+            return Err(UpdateError::Settings(
+                "target_period_updates = 0, which must be at least 1".into(),
+            ));
         }
         self.lambda.validate()?;
         self.make_auxiliary_loss()?;

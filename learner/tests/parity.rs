@@ -44,10 +44,6 @@ fn so_it_is_with_candle_s_own_operations() {
 #[test]
 fn so_it_is_in_bf16() {
     let report = check_all(&Compute::cpu(Precision::Bf16)).swap_remove(0);
-    let f32 = check_file(&cases()[0], &Compute::CPU).unwrap();
-    for (bf16, f32) in report.lines.iter().zip(&f32.lines) {
-        assert!(bf16.name != f32.name || bf16.tolerance >= f32.tolerance);
-    }
     let farther = report.lines.iter().filter(|line| line.error > 2e-5).count();
     assert!(farther > 5, "products were not rounded: {report}");
 }
@@ -75,7 +71,7 @@ fn a_broken_file_is_a_clear_error() {
         (r#""config""#, r#""confix""#, "config"),
         (r#"\"atoms\": 51"#, r#"\"atoms\": -1"#, "config"),
         (r#"\"atoms\": 51"#, r#"\"atoms\": 50"#, "head"),
-        (r#"\"atoms\": 51"#, r#"\"atoms\":  0"#, ""),
+        (r#"\"atoms\": 51"#, r#"\"atoms\":  0"#, "atoms"),
         (
             r#"\"tanh_clip\": 20.0"#,
             r#"\"tanh_clip\":  0.0"#,

@@ -77,7 +77,9 @@ impl Lambda {
     pub fn validate(&self) -> Result<(), UpdateError> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
             if !(value >= 0.0 && value.is_finite()) {
-                return Err(UpdateError::Settings(format!("lambda.{name} = {value}")));
+                return Err(UpdateError::Settings(format!(
+                    "lambda.{name} = {value}, which must be a finite number of at least 0"
+                )));
             }
         }
         Ok(())

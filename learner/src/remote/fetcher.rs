@@ -169,7 +169,13 @@ impl Fetcher {
     }
 
     pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
-        let mut silence = Silence::default();
+        // With several shards the threads take turns, so that a thread's tries lie as far apart as the time-outs of all.
+        let shared = &self.shared;
+        let turns = match shared.clients.len() {
+            1 => 1,
+            _ => shared.requests.in_flight,
+        };
+        let mut silence = Silence::with_try_timeout(REQUEST_TIMEOUT * turns);
         while !self.shared.shutdown.is_set() {
             fail_point::reach("batches");
             let fetched = self.fetch();
@@ -403,9 +409,7 @@ impl Fetcher {
         })?;
         Ok(match reply {
             BatchReply::Batch(header) => {
-                if shared_memory {
-                    self.trust.record_arrival();
-                }
+                self.trust.record_arrival(shared_memory);
                 Ok(Batch::from_payload(header, payload)?)
             }
             BatchReply::NotReady(not_ready) => {

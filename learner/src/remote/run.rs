@@ -160,6 +160,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         }
     }
     let saved = checkpointer.save_last(&learner);
+    if let (Err(_), Err(e)) = (&learned, &saved) {
+        tracing::warn!("no last checkpoint: {e:#}");
+    }
     if learned.is_ok() && !learner.publication_is_due() {
         publisher.publish(learner.export_weights()?);
     }
@@ -237,8 +240,14 @@ fn learn(
             status.computing_s += (ended - started).as_secs_f64();
         });
         waiting_since = ended;
-        if learner.checkpoint_is_due() {
-            checkpointer.save(learner);
+        if learner.checkpoint_is_due()
+            && let Err(e) = checkpointer.save(learner)
+        {
+            tracing::warn!(
+                "no checkpoint after {} updates, trying again at the next period: {e:#}",
+                learner.updates()
+            );
+            checkpointer.first_failure.get_or_insert(e);
         }
     }
     Ok(false)
@@ -256,22 +265,13 @@ struct Checkpointer {
 }
 
 impl Checkpointer {
-    fn save(&mut self, learner: &Learner) {
-        match learner.save(&self.folder, None) {
-            Ok(()) => {
-                self.saved_counts = Some(Self::counts(learner));
-                let saved_updates = &self.counters.saved_updates;
-                saved_updates.store(learner.updates(), Ordering::Release);
-                self.first_failure = None;
-            }
-            Err(e) => {
-                tracing::warn!(
-                    "no checkpoint after {} updates, trying again at the next period: {e:#}",
-                    learner.updates()
-                );
-                self.first_failure.get_or_insert(e);
-            }
-        }
+    fn save(&mut self, learner: &Learner) -> Result<(), CheckpointError> {
+        learner.save(&self.folder, None)?;
+        self.saved_counts = Some(Self::counts(learner));
+        let saved_updates = &self.counters.saved_updates;
+        saved_updates.store(learner.updates(), Ordering::Release);
+        self.first_failure = None;
+        Ok(())
     }
 
     fn counts(learner: &Learner) -> (u64, u64) {
@@ -280,10 +280,11 @@ impl Checkpointer {
 
     /// Saves a last checkpoint, if updates were made or frames stored since the newest one.
     fn save_last(mut self, learner: &Learner) -> Result<(), CheckpointError> {
-        if self.saved_counts != Some(Self::counts(learner)) {
-            self.save(learner);
-        }
-        self.first_failure.map_or(Ok(()), Err)
+        let saved = match self.saved_counts == Some(Self::counts(learner)) {
+            true => Ok(()),
+            false => self.save(learner),
+        };
+        self.first_failure.map_or(saved, Err)
     }
 }
 

@@ -260,8 +260,8 @@ impl PartialBatch {
         }
     }
 
-    /// Draws the rows of shards that cannot send any, as they hold nothing to draw from, from the other shards. The shares stay, because
-    /// importance weights do not depend on a factor that all rows have.
+    /// Draws the rows of shards that cannot send any, as they hold nothing to draw from, from the other shards. Their shares stay, because
+    /// importance weights do not depend on a factor that all rows have. A shard that held nothing when the batch began gets its share now.
     pub(super) fn reassign_rows(&mut self, rng: &mut impl Rng) {
         let total: u64 = self.shards.iter().map(|it| it.held).sum();
         if total == 0 {
@@ -269,6 +269,8 @@ impl PartialBatch {
         }
         let empty = self.shards.iter_mut().filter(|it| it.held == 0);
         let rows = empty.map(|it| std::mem::take(&mut it.pending_rows)).sum();
+        let new = self.shards.iter_mut().filter(|it| it.share == 0.0);
+        new.for_each(|it| it.share = it.held as f64 / total as f64);
         self.assign_rows(rows, total, rng);
     }
 
@@ -361,6 +363,9 @@ mod tests {
             batch.reassign_rows(&mut rng);
             let pending: Vec<_> = batch.shards.iter().map(|it| it.pending_rows).collect();
             assert_eq!(pending, expected, "{held:?}");
+            // A row of probability 0 would have an infinite weight.
+            let may_send = |it: &ShardState| it.pending_rows == 0 || it.share > 0.0;
+            assert!(held == [0; 3] || batch.shards.iter().all(may_send));
         }
     }
 

@@ -15,7 +15,7 @@ use crate::synthetic::{
 /// Makes an update that fails, checks that every weight keeps its bits, and returns the error.
 fn failure(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
     let bits = |agent: &Agent| -> Vec<u32> {
-        let all = agent.online().iter();
+        let all = agent.online().iter().chain(agent.target().iter());
         all.flat_map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
             .map(f32::to_bits)
             .collect()

@@ -91,7 +91,7 @@ impl Batch {
     }
 
     /// Merges the rows of all `parts`, one part after the other; `None` if `parts` is empty or the parts differ in shape. `allocate` returns a
-    /// buffer of the given bytes, with arbitrary content.
+    /// buffer of the given bytes, with arbitrary content. Counts and ages in the header are those of the first part.
     pub fn merge(parts: &[Self], allocate: impl FnOnce(usize) -> Buffer) -> Option<Self> {
         let header = Self::merged_header(parts)?;
         let mut merged = Self::with_buffer(header, allocate(header.payload_bytes()));
@@ -148,7 +148,6 @@ impl Batch {
         };
         let (first, others) = parts.split_first()?;
         let mut merged = first.header;
-        let mut age_total = merged.mean_age * f64::from(merged.rows);
         for part in others.iter().map(|part| part.header) {
             if shape(&part) != shape(&merged) {
                 return None;
@@ -159,14 +158,10 @@ impl Batch {
             merged.rows += part.rows;
             merged.states_k += part.states_k;
             merged.states_n += part.states_n;
-            merged.counts = merged.counts + part.counts;
-            merged.held = merged.held.saturating_add(part.held);
-            age_total += part.mean_age * f64::from(part.rows);
             let (newest, oldest) = part.weights_versions;
             let (a, b) = merged.weights_versions;
             merged.weights_versions = (a.max(newest), b.min(oldest));
         }
-        merged.mean_age = age_total / f64::from(merged.rows);
         Some(merged)
     }
 

@@ -34,7 +34,8 @@ impl StackedFrames {
         let stack = self.frame_stack as usize;
         let pixel_bytes = stack.checked_mul(self.frame_channels as usize);
         (2..=FRAME_STACK_MAX).contains(&self.frame_stack)
-            && pixel_bytes.is_some_and(|bytes| bytes > 0 && state_bytes.is_multiple_of(bytes))
+            && pixel_bytes
+                .is_some_and(|it| (1..=state_bytes).contains(&it) && state_bytes.is_multiple_of(it))
             && (self.frames as usize).div_ceil(stack) <= states
     }
 

@@ -13,7 +13,8 @@ pub const EPISODES_MAX: usize = 8_192;
 pub struct EpisodesRequest {
     /// Episodes that the requester already has.
     pub since: u64,
-    /// Whether the requester is the run's launcher. The replay server keeps episodes until the launcher has them, whatever others have.
+    /// Whether the requester is the run's launcher. The replay server keeps the newest 32,768 episodes until the launcher has
+    /// them, whatever others have, and 1,024 on disk.
     pub is_launcher: bool,
 }
 

@@ -1,8 +1,7 @@
 //! Batches of all kinds: drawn by priority, made of stacks of frames, merged from parts; and impossible ones.
 
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, RowScalars, ShardCounts,
-    StackedFrames, codec,
+    Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, RowScalars, StackedFrames, codec,
 };
 
 use crate::samples::{
@@ -202,6 +201,13 @@ fn few_frames_do_not_make_more_than_a_message_may_have() {
             ..batch().header
         };
         let (header, payload) = Batch::from_rows(header, &rows, Buffer::zeroed).into_payload();
+        let frame_bytes = state_bytes / STACKED.frame_stack as usize;
+        let without_frames = Buffer::zeroed(payload.len() - frame_bytes);
+        let empty_states = BatchHeader {
+            state_bytes: 0,
+            ..header
+        };
+        assert!(Batch::from_payload(empty_states, without_frames).is_err());
         let said =
             Batch::from_payload(header, payload).map_or_else(|e| e.to_string(), |_| String::new());
         let why = "states would fill more than";
@@ -212,15 +218,9 @@ fn few_frames_do_not_make_more_than_a_message_may_have() {
 
 #[test]
 fn parts_are_merged_row_by_row() {
-    let header = |mean_age, versions| BatchHeader {
+    let header = |versions| BatchHeader {
         positives: 3,
         state_bytes: 3,
-        counts: ShardCounts {
-            inserted: 10,
-            rows_sampled: 1,
-        },
-        held: 5,
-        mean_age,
         weights_versions: versions,
         ..BatchHeader::default()
     };
@@ -249,15 +249,14 @@ fn parts_are_merged_row_by_row() {
         batch
     };
     let parts = [
-        part(header(1.0, (7, 3)), 0..4),
-        part(header(4.0, (9, 5)), 4..6),
-        part(header(1.0, (8, 4)), 6..8),
+        part(header((7, 3)), 0..4),
+        part(header((9, 5)), 4..6),
+        part(header((8, 4)), 6..8),
     ];
     let merged = Batch::merge(&parts, used_memory).unwrap();
     let whole = merged.header;
     let expected = part(whole, 0..8);
-    assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
-    assert_eq!((whole.counts.inserted, whole.held), (30, 15));
+    assert_eq!(whole.weights_versions, (9, 3));
     assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
     assert_eq!(merged, expected);
     let states_n: Vec<u8> = [20, 22, 24, 26].map(|byte| [byte; 3]).concat();
@@ -265,7 +264,7 @@ fn parts_are_merged_row_by_row() {
 
     let other = BatchHeader {
         state_bytes: 4,
-        ..header(0.0, (1, 1))
+        ..header((1, 1))
     };
     let other = part(other, 0..1);
     let parts = [parts[0].clone(), other];

@@ -92,7 +92,7 @@ impl Replay {
     /// writes, and if the limiter has no room, unless the actor is leaving or the last draw found no anchor.
     pub(crate) fn store_if_allowed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         let is_leaving = packed.chunk.header.leaving;
-        if !(self.limiter.may_insert() || self.state.starving || is_leaving) {
+        if !(self.limiter.may_insert() || self.is_starving() || is_leaving) {
             return self.wait_reply(false);
         }
         let journal = self.journal.as_mut();

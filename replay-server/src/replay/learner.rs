@@ -36,6 +36,13 @@ impl Replay {
             Some(known) if known.learner == join.learner => return Ok(0),
             Some(known) if known.run == join.run || join.restart => {}
             Some(_) if done == 0 && join.updates == 0 => {}
+            Some(_) if done == 0 => {
+                return Err(format!(
+                    "another learner has begun this run anew, and this one is after {} updates: start the replay server and the actors \
+                     again, then this learner",
+                    join.updates
+                ));
+            }
             Some(_) => {
                 return Err(format!(
                     "the run has learned {done} updates, and the learner has no checkpoint of it: start the learner with the --run-dir \
@@ -47,7 +54,6 @@ impl Replay {
         let learned = join.counts.rows_sampled;
         let unlearned = self.counts().rows_sampled.saturating_sub(learned);
         let repeated_updates = done.saturating_sub(join.updates);
-        self.limiter.refund(unlearned);
         self.limiter.counts.this_shard.rows_sampled = learned;
         self.limiter.counts.other_shards = join.other_shards;
         let state = &mut self.state;

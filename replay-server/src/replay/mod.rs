@@ -121,11 +121,16 @@ impl Replay {
     /// Returns which side waits now, for batches of the `batch_size` that the replay was created for.
     pub fn waiting(&self) -> Waiting {
         match self.limiter.waiting(self.batch_size) {
-            Waiting::ActorsWaitForLearner | Waiting::Neither if self.state.starving => {
+            Waiting::ActorsWaitForLearner | Waiting::Neither if self.is_starving() => {
                 Waiting::LearnerWaitsForActors
             }
             waiting => waiting,
         }
+    }
+
+    /// Whether the last draw found no anchor. Then the next chunk is stored without credit.
+    pub(crate) const fn is_starving(&self) -> bool {
+        self.state.starving
     }
 
     /// Returns the status. Fields that only the service knows keep their defaults.
@@ -134,7 +139,7 @@ impl Replay {
         ReplayStatus {
             transitions_inserted: counts.this_shard.inserted,
             transitions_refilled: counts.refilled,
-            transitions_held: match (counts.refill_left, self.state.starving) {
+            transitions_held: match (counts.refill_left, self.is_starving()) {
                 (0, false) => self.ring.inserted() - self.ring.oldest(),
                 _ => 0,
             },

@@ -70,8 +70,12 @@ impl Service {
         while !self.shutdown.is_set() {
             fail_point::reach("sample");
             let mut state = self.state();
-            let now = Instant::now();
+            let (now, was_starving) = (Instant::now(), state.replay.is_starving());
             let Some((parked, drawn)) = state.take_answerable(now, &self.pool) else {
+                // Now the parked chunks may be stored.
+                if state.replay.is_starving() && !was_starving {
+                    self.changed.notify_all();
+                }
                 let due_in = state.requests.iter().map(|it| it.time_left(now)).min();
                 self.wait_changed(state, due_in);
                 continue;
