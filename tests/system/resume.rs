@@ -117,6 +117,10 @@ fn what_cannot_be_resumed() {
     system.run_ok("local --resume step --frames 1600 --set learner.batch_size=32");
     let run = format!("local --agent c51 --durable {SHORT} --run-dir kept");
     system.run_ok(&run);
+    system.rejects(
+        "local --resume kept --frames 2000 --set replay.shards=2 --set local.actors=2",
+        "replay.shards = 2, but kept/replay holds the transitions of 1",
+    );
     system.run_ok("local --resume kept --frames 1600 --set local.durable=false");
     system.rejects_each(
         "

@@ -76,13 +76,14 @@ const _: () = {
 };
 
 pub(crate) type Handle = *mut c_void;
-pub(crate) type VersionFn = unsafe extern "C" fn() -> i32;
-pub(crate) type MakeFn = unsafe extern "C" fn(i32, LibenvOptions) -> Handle;
-pub(crate) type GetTensortypes = unsafe extern "C" fn(Handle, u32, *mut LibenvTensortype) -> i32;
-pub(crate) type SetBuffers = unsafe extern "C" fn(Handle, *mut LibenvBuffers);
-pub(crate) type HandleFn = unsafe extern "C" fn(Handle);
-pub(crate) type GetState = unsafe extern "C" fn(Handle, i32, *mut c_char, i32) -> i32;
-pub(crate) type SetState = unsafe extern "C" fn(Handle, i32, *mut c_char, i32);
+pub(crate) type VersionFn = unsafe extern "C-unwind" fn() -> i32;
+pub(crate) type MakeFn = unsafe extern "C-unwind" fn(i32, LibenvOptions) -> Handle;
+pub(crate) type GetTensortypes =
+    unsafe extern "C-unwind" fn(Handle, u32, *mut LibenvTensortype) -> i32;
+pub(crate) type SetBuffers = unsafe extern "C-unwind" fn(Handle, *mut LibenvBuffers);
+pub(crate) type HandleFn = unsafe extern "C-unwind" fn(Handle);
+pub(crate) type GetState = unsafe extern "C-unwind" fn(Handle, i32, *mut c_char, i32) -> i32;
+pub(crate) type SetState = unsafe extern "C-unwind" fn(Handle, i32, *mut c_char, i32);
 
 /// A name in the engine's fixed, NUL-terminated form. Panics on names that do not fit; ours are constants.
 pub(crate) fn option_name(text: &str) -> [c_char; NAME_BYTES] {

@@ -83,8 +83,9 @@ pub(crate) fn run_pip(python: &str, arguments: &[&str]) -> Result<Output, Procge
     // Other users must not be able to change the files that pip writes, whatever the caller's umask.
     let mut command = Command::new("sh");
     command.args(["-c", "umask 022; exec \"$@\"", "sh", python, "-m", "pip"]);
-    // A configuration of pip with `user = true` conflicts with `--target`.
-    command.args(arguments).env("PIP_USER", "0");
+    // A configuration of pip with `user = true` conflicts with `--target`; with `require-virtualenv = true` pip installs nothing here.
+    command.args(arguments);
+    command.envs([("PIP_USER", "0"), ("PIP_REQUIRE_VIRTUALENV", "0")]);
     let missing = |what: &str| {
         let text = format!(
             "{what} is not installed; install Python and pip (`apt-get install python3-pip`, `dnf install python3-pip`)"

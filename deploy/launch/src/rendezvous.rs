@@ -77,9 +77,12 @@ impl Rendezvous {
 
 /// Where such folders lie: in `folder`, the one for temporary files, if an endpoint can name a path there.
 fn parent_folder(folder: PathBuf) -> PathBuf {
-    let path = folder.to_string_lossy();
-    let fits = path.len() + LONGEST_SOCKET.len() <= SOCKET_PATH_MAX && !path.contains(ADDRESS_ENDS);
-    if fits { folder } else { SHORT_PARENT.into() }
+    let can_name = |path: &str| {
+        path.len() + LONGEST_SOCKET.len() <= SOCKET_PATH_MAX && !path.contains(ADDRESS_ENDS)
+    };
+    let folder = std::path::absolute(folder).ok();
+    let folder = folder.filter(|it| it.to_str().is_some_and(can_name));
+    folder.unwrap_or_else(|| SHORT_PARENT.into())
 }
 
 /// Called at the orderly exit of a process: releases its lock on the folder, and sweeps, as its launcher may have been killed.

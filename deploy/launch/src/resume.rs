@@ -208,6 +208,13 @@ fn check_changes(
         ));
     }
     let replay = folder.replay();
+    let [shards_before, shards] = [before, config].map(|it| it.replay.shards);
+    if config.local.durable && replay.is_dir() && shards_before != shards {
+        bail!(usage!(
+            "replay.shards = {shards}, but {} holds the transitions of {shards_before}: resume without this --set",
+            replay.display()
+        ));
+    }
     if !lockstep && config.local.durable && !before.local.durable && replay.is_dir() {
         bail!(usage!(
             "{} lacks what the run stored later, without --durable: remove that folder, then resume",

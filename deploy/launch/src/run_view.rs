@@ -261,6 +261,13 @@ impl RunView {
         self.replay.learner_finished || self.learner_status().is_some() && self.is_all_learned()
     }
 
+    /// The transitions stored and the updates made, to see whether the run stands still. A resumed run first refills its replay.
+    pub(crate) fn work_done(&self) -> (u64, u64) {
+        let replay = &self.replay;
+        let stored = replay.transitions_inserted + replay.transitions_refilled;
+        (stored, self.learner.updates)
+    }
+
     /// Whether, by the last answers, no more rows will be sampled and the learner has saved. That the learner has saved is not
     /// enough, as a learner that was stopped early has saved too.
     pub(crate) fn is_all_learned(&self) -> bool {
@@ -321,6 +328,18 @@ mod tests {
         for (rows, updates) in [(64_000, 1_000), (96_000, 2_000), (96_031, 2_000)] {
             assert_eq!(updates_served(&config, rows), updates);
         }
+    }
+
+    #[test]
+    fn a_run_that_refills_its_replay_does_not_stand_still() {
+        let done = |refilled| {
+            let mut view = RunView::new(Plan::default());
+            view.set_replay(vec![make(|it: &mut ReplayStatus| {
+                (it.transitions_inserted, it.transitions_refilled) = (9_000, refilled);
+            })]);
+            view.work_done()
+        };
+        assert_eq!([done(0), done(7)], [(9_000, 0), (9_007, 0)]);
     }
 
     #[test]

@@ -159,7 +159,7 @@ impl Launch<'_> {
     }
 
     fn watch(&mut self) -> anyhow::Result<Outcome> {
-        let (mut standstill, mut counts_before) = (Silence::default(), (0, 0));
+        let (mut standstill, mut work_before) = (Silence::default(), (0, 0));
         loop {
             if self.shutdown.drain.wait_timeout(POLL) {
                 return Ok(Outcome::Interrupted);
@@ -196,17 +196,17 @@ impl Launch<'_> {
             if view.is_all_learned() {
                 return Ok(Outcome::Finished);
             }
-            let counts = (view.replay.transitions_inserted, view.learner.updates);
+            let work = view.work_done();
             // While a replay server reads its replay back from disk, the other processes wait for it.
-            if counts != counts_before || view.recovering().next().is_some() {
+            if work != work_before || view.recovering().next().is_some() {
                 standstill.record_answer();
-                counts_before = counts;
+                work_before = work;
             } else if standstill.record_failure() > STALL_MAX {
                 bail!(
                     "no frame and no update for {}, at {} and {} ({}): see {}",
                     duration(STALL_MAX),
-                    count(counts.0, "frame"),
-                    count(counts.1, "update"),
+                    count(view.replay.transitions_inserted, "frame"),
+                    count(view.learner.updates, "update"),
                     view.replay.waiting,
                     self.run_dir.logs().display()
                 );

@@ -161,7 +161,10 @@ impl RunFolder {
 
     pub(crate) fn check_intact(&self) -> anyhow::Result<()> {
         let files = [self.config(), self.metrics(), self.episodes()];
-        let missing = files.iter().filter(|it| !it.exists());
+        // An error of a network's file system may pass.
+        let missing = files
+            .iter()
+            .filter(|it| matches!(it.try_exists(), Ok(false)));
         let missing: Vec<_> = missing.map(|it| it.display().to_string()).collect();
         anyhow::ensure!(
             missing.is_empty(),
