@@ -64,6 +64,8 @@ pub(super) struct DeliveryWorker {
     silence: Silence,
     /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
+    /// The last chunk for which the server expected an earlier one.
+    out_of_order: Option<u64>,
     /// The time since the shutdown.
     draining: Option<Silence>,
     retry_log: LogLimiter,
@@ -88,6 +90,7 @@ impl DeliveryWorker {
             window: 1,
             silence: Silence::with_try_timeout(limits.ack_timeout),
             held_since: None,
+            out_of_order: None,
             draining: None,
             retry_log: LogLimiter::default(),
             wait_log: LogLimiter::default(),
@@ -195,9 +198,7 @@ impl DeliveryWorker {
                     true => 1,
                     false => (self.window + 1).min(self.limits.chunks_in_flight_max),
                 };
-                if self.outgoing[0].in_shared_memory {
-                    self.pool.report_shared_arrival();
-                }
+                self.pool.report_arrival(self.outgoing[0].in_shared_memory);
                 Ok(Outcome::Stored)
             }
             Ok(InsertReply::Finished { inserted_total }) => {
@@ -214,8 +215,13 @@ impl DeliveryWorker {
                 self.mark_held(kept);
                 Ok(self.prepare_resend())
             }
-            // The reply is from when an earlier chunk waited; all earlier chunks are stored now.
-            Ok(InsertReply::OutOfOrder { .. }) => Ok(self.prepare_resend()),
+            // The reply is from when an earlier chunk waited; all earlier chunks are stored now. If it comes again, one was not needed.
+            Ok(InsertReply::OutOfOrder { .. }) => {
+                if self.out_of_order.replace(sequence) == Some(sequence) {
+                    self.pause();
+                }
+                Ok(self.prepare_resend())
+            }
             Ok(InsertReply::Refused { why }) => bail!("the replay server rejected a chunk: {why}"),
             Err(SessionError::Recovering(recovering)) => {
                 self.silence.record_answer();
