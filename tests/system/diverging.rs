@@ -10,10 +10,9 @@ use crate::{SHORT, system};
 
 /// Checks that every number in the tensor files of the checkpoints is finite.
 fn check_finite(run: &RunFolder) {
-    if !run.path().join("checkpoints").exists() {
-        return;
-    }
-    for checkpoint in run.checkpoints() {
+    let checkpoints = run.checkpoints();
+    assert!(!checkpoints.is_empty());
+    for checkpoint in checkpoints {
         for file in fs::read_dir(checkpoint).unwrap() {
             let path = file.unwrap().path();
             if path.extension().is_none_or(|it| it != "safetensors") {

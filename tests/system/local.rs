@@ -23,7 +23,8 @@ fn c51_leaves_a_whole_run_folder() {
     let columns =
         "seconds frames replay_ratio c51_kl total_loss waiting rss_mib_learner rss_mib_actor_0";
     for name in columns.split(' ') {
-        assert!(!run.column(name).is_empty());
+        let has_value = run.column(name).iter().any(|cell| !cell.is_empty());
+        assert!(has_value, "{name}");
     }
     for role in ["replay-server", "learner", "actor-0"] {
         let log = run.log(role);

@@ -184,7 +184,14 @@ fn resume_once(seed: u64) {
         assert!(store.is_empty() || !is_refilled, "{details}");
     }
     let episodes = run.episodes();
-    let is_sorted = episodes.is_sorted_by_key(|row| (row.episode, row.frames));
+    let pairs = episodes.windows(2);
+    let is_sorted = pairs
+        .map(|it| (&it[0], &it[1]))
+        .all(|(row, next)| row.episode < next.episode && row.frames <= next.frames);
+    for count in ["frames", "updates"] {
+        let column = run.numeric_column(count);
+        assert!(column.is_sorted(), "{count}: {column:?}, {details}");
+    }
     let is_past = episodes.iter().all(|row| row.frames <= after.frames);
     assert!(is_sorted && is_past, "{details}");
 }
