@@ -124,7 +124,7 @@ options=(--release --locked --features cuda -p driml --bin driml --target-dir "$
 [ "$offline" = no ] || options+=(--offline)
 say "building driml for compute capability $compute_cap with CUDA $version in $CUDA_HOME; candle's kernels take several minutes"
 # The program notes where CUDA's libraries are, for itself and for those that they load in turn.
-(cd "$root" && cargo rustc "${options[@]}" -- -C "link-args=-Wl,--disable-new-dtags -Wl,-rpath,$libraries")
+(cd "$root" && cargo rustc "${options[@]}" -- -C link-arg=-Wl,--disable-new-dtags -C "link-arg=-Wl,-rpath,$libraries")
 mkdir -p "$target/release"
 # Renamed into place, so that one that runs is not written over.
 cp "$built/release/driml" "$target/release/.driml.$$"

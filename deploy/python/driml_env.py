@@ -83,7 +83,10 @@ class Gymnasium:
 
     def __init__(self, make, copies, workers=False, channels=None):
         import gymnasium, numpy
-        from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+        try:
+            from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+        except ImportError:
+            sys.exit(f"driml_env.py needs gymnasium 1.1 or newer, and this is {gymnasium.__version__}: {sys.executable} -m pip install -U gymnasium")
 
         self.numpy = numpy
         if takes_copies(make):
@@ -145,6 +148,13 @@ class Gymnasium:
         return self.numpy.ascontiguousarray(self.numpy.moveaxis(frames, 1, -1) if self.channels_first else frames)
 
 
+def environments(held):
+    """What an attribute holds, as a list, if that is a Gymnasium environment or several."""
+    gymnasium = sys.modules["gymnasium"]
+    found = held if isinstance(held, (list, tuple)) else [held]
+    return found if all(isinstance(it, (gymnasium.Env, gymnasium.vector.VectorEnv)) for it in found) else []
+
+
 class Layers:
     """An environment, those that it wraps and those in a vector: what each of them holds, and how they take it back.
 
@@ -153,7 +163,8 @@ class Layers:
     cannot be saved.
     """
 
-    KEPT = {"env", "envs", "env_fns", "spec", "_cached_spec"}  # As they were made.
+    KEPT = {"env_fns", "spec", "_cached_spec"}  # As they were made.
+    INNER = ("env", "envs")  # Where wrappers and vectors hold environments, and others what they like.
 
     def __init__(self, env):
         self.layers = []
@@ -163,9 +174,13 @@ class Layers:
         self.layers.append(env)
         if is_ale(env):
             env.ale = Emulator(env.ale)
-        inner = [vars(env)["env"]] if "env" in vars(env) else vars(env).get("envs", ())
-        for env in inner:
-            self._add(env)
+        for name in self.INNER:
+            for inner in environments(vars(env).get(name)):
+                self._add(inner)
+
+    def _kept(self, layer):
+        """The names of a layer's attributes that are not saved with it: environments are layers too."""
+        return self.KEPT.union(name for name in self.INNER if environments(vars(layer).get(name)))
 
     def save(self):
         for layer in self.layers:
@@ -205,7 +220,8 @@ class Layers:
         if offers_state(layer):
             return layer.save_state()
         if not is_ale(layer):
-            return {name: value for name, value in vars(layer).items() if name not in self.KEPT}
+            kept = self._kept(layer)
+            return {name: value for name, value in vars(layer).items() if name not in kept}
         return layer.ale.save(), vars(layer).get("_np_random"), vars(layer).get("_np_random_seed")
 
     def _take(self, layer, saved):
@@ -215,7 +231,7 @@ class Layers:
             emulator, layer._np_random, layer._np_random_seed = saved
             layer.ale.load(*emulator)
         else:
-            for name in vars(layer).keys() - self.KEPT - saved.keys():
+            for name in vars(layer).keys() - self._kept(layer) - saved.keys():
                 delattr(layer, name)
             vars(layer).update(saved)
 
@@ -234,7 +250,7 @@ class Layers:
         for number, layer in enumerate(self.layers):
             places[number,] = layer
             for name, value in sorted(vars(layer).items()):
-                if name not in self.KEPT:
+                if name not in self._kept(layer):
                     add((number, name), value)
         return places, cells
 

@@ -8,13 +8,16 @@
 import argparse
 import csv
 import sys
-import tomllib
 from pathlib import Path
 
 try:
     import wandb
 except ModuleNotFoundError:
     sys.exit(f"wandb_offline.py needs the package wandb: {sys.executable} -m pip install wandb")
+try:
+    import tomllib
+except ModuleNotFoundError:
+    sys.exit("wandb_offline.py needs Python 3.11 or newer")
 
 
 def numbers(row):

@@ -48,6 +48,14 @@ class ChannelsFirst(Numbered):
         return np.arange(3 * 32 * 20, dtype=np.uint32).reshape(3, 32, 20).astype(np.uint8)
 
 
+class Holding(Numbered):
+    """Its attributes have the names under which wrappers and vectors keep what they hold."""
+
+    def __init__(self):
+        super().__init__()
+        self.env, self.envs = None, 3
+
+
 def check_episodes(world):
     assert (world.height, world.width, world.channels, world.actions) == (2, 2, 1, ["0", "1", "2"])
     copies = 2
@@ -260,7 +268,7 @@ if __name__ == "__main__":
         world = driml_env.Gymnasium(frames_of(*shape), 2, channels=channels)
         assert (world.height, world.width, world.channels) == expected, (shape, channels)
     check_refused("add --channels first or --channels last", frames_of(9, 9, 9))
-    for make in (Numbered, Chance, Own, wrapped, lambda: Chance(), ale("--atari"), ale("--atari", "--clip", "--size", "40")):
+    for make in (Numbered, Holding, Chance, Own, wrapped, lambda: Chance(), ale("--atari"), ale("--atari", "--clip", "--size", "40")):
         check_saved(make)
     check_saved(ale("--grey", "--size", "64"))
     check_saved(lambda: gymnasium.make("ALE/Pong-v5", frameskip=(2, 5)))

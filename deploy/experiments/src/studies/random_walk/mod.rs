@@ -245,12 +245,12 @@ fn convergence_figure(results: &Results) -> Figure {
     let settings = &results.settings;
     let times = |title: String, measure: UpdatesTo| {
         let at = |chain: &Chain, x_offset: f64| (1.0 + 0.035 * x_offset) / chain.spectral_gap();
-        let series = sampling_series(results, at, |one| results.updates_until(measure, one));
+        let series = sampling_series(results, at, |one| measure(one).map(|time| time as f64));
         let x = Axis::log("1 / (1 - \u{3bb}\u{2082}) [steps]");
         Panel::Chart(Chart::new(&title, x, Axis::log("updates"), series))
     };
     let at = |chain: &Chain, x_offset: f64| chain.alpha + 0.012 * x_offset;
-    let last = sampling_series(results, at, Trained::final_tv);
+    let last = sampling_series(results, at, |one| Some(one.final_tv()));
     let of_tv = format!("Updates until the law is within {}", settings.tv_reached);
     let share = 100.0 * (1.0 - settings.share_reached);
     let of_share = format!("Updates until {share:.0}% of I(S, S') is learnt");
@@ -277,11 +277,11 @@ fn convergence_figure(results: &Results) -> Figure {
 fn sampling_series(
     results: &Results,
     x: impl Fn(&Chain, f64) -> f64,
-    value: impl Fn(&Trained) -> f64,
+    value: impl Fn(&Trained) -> Option<f64>,
 ) -> Vec<Series> {
     let of = |(index, &sampling): (usize, &Sampling)| {
         let means = results.settings.alphas.iter().map(|&alpha| {
-            let values = results.select(sampling, alpha).map(&value);
+            let values = results.select(sampling, alpha).filter_map(&value);
             let x = x(&results.chain(alpha), index as f64 - 1.0);
             (x, values.collect())
         });

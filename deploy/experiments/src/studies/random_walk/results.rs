@@ -99,19 +99,16 @@ impl Results {
         Curve::from_values(means, Band::Range)
     }
 
-    /// Returns the updates until a training converged; for one that never did, one update more than a full training.
-    pub(super) fn updates_until(&self, measure: UpdatesTo, one: &Trained) -> f64 {
-        measure(one).unwrap_or(self.settings.updates + 1) as f64
-    }
-
     /// Returns for each seed the rank correlation over alpha between 1 / gap and the updates until convergence.
+    ///
+    /// A training that never converges counts as one update more than a full training.
     pub(super) fn gap_correlations(&self, sampling: Sampling, measure: UpdatesTo) -> Vec<f64> {
         let of_seed = |seed: u32| {
             let all = self.trained.iter();
             let of_seed = all.filter(|one| one.sampling == sampling && one.seed == seed);
             let pairs = of_seed.map(|one| {
-                let time = self.updates_until(measure, one);
-                (1.0 / one.chain.spectral_gap(), time)
+                let time = measure(one).unwrap_or(self.settings.updates + 1);
+                (1.0 / one.chain.spectral_gap(), time as f64)
             });
             rank_correlation(&pairs.collect::<Vec<_>>())
         };
