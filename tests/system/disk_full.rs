@@ -213,7 +213,9 @@ fn a_folder_that_cannot_be_used_is_said() {
         .fails("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
     server.stop(130);
     other(&flags.replace("c51", "driml-ada"))
-        .fails("replay holds the replay of another run (its run spec has the hash");
+        .wait()
+        .expect_code(64)
+        .expect_stderr("replay holds the replay of another run (its run spec has the hash");
 
     let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;

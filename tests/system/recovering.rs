@@ -219,7 +219,8 @@ fn a_server_with_an_unreadable_log_ends(system: &TestSystem, serve: &str) {
         }
     }
     let server = system.start_replay_server(serve);
-    server.fails("no segment can be read");
+    let ended = server.wait().expect_code(64);
+    ended.expect_stderr("no segment can be read");
 }
 
 #[test]

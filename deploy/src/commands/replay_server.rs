@@ -10,6 +10,7 @@ use driml_launch::{
 };
 use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::{GracefulShutdown, tls::Role};
+use driml_replay_server::PersistError;
 use driml_settings::flags::{self, RunFlags};
 
 use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_after, prepare_join};
@@ -74,5 +75,10 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         drain: shutdown.drain,
         config_toml: config.to_toml(),
     };
-    clean_up_after(driml_replay_server::run(run, &shutdown.immediate))
+    let ran = driml_replay_server::run(run, &shutdown.immediate);
+    clean_up_after(ran.map_err(|e| match e.downcast_ref() {
+        // The process would find the same again.
+        Some(PersistError::Unusable(..)) => usage!("{e:#}").into(),
+        _ => e,
+    }))
 }
