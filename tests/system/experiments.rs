@@ -336,5 +336,8 @@ fn a_grid_makes_every_combination_once() {
     system.run_ok("grid --report");
     assert_eq!(table().rows, made);
     // Another grid is rejected in the same folder.
-    system.rejects(&format!("{fixed} --frames 352"), "holds results made with axes = ");
+    system.rejects(
+        &format!("{fixed} --frames 352"),
+        "holds results made with axes = ",
+    );
 }

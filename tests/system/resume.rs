@@ -119,7 +119,7 @@ fn what_cannot_be_resumed() {
     system.run_ok(&run);
     system.rejects(
         "local --resume kept --frames 2000 --set replay.shards=2 --set local.actors=2",
-        "replay.shards = 2, but kept/replay holds the transitions of 1",
+        "replay.shards = 2, but kept/replay holds the transitions of 1 shard: resume",
     );
     system.run_ok("local --resume kept --frames 1600 --set local.durable=false");
     system.rejects_each(

@@ -76,7 +76,7 @@ impl Format {
 pub enum Look {
     /// A card with title and notes, and a legend in each chart: for a screen, where no caption explains the figure.
     Card,
-    /// The panels alone, with a legend only in the first: for a paper, whose caption explains the rest.
+    /// The panels alone, with one legend: for a paper, whose caption explains the rest.
     Plain,
 }
 

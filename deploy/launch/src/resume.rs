@@ -211,8 +211,9 @@ fn check_changes(
     let [shards_before, shards] = [before, config].map(|it| it.replay.shards);
     if config.local.durable && replay.is_dir() && shards_before != shards {
         bail!(usage!(
-            "replay.shards = {shards}, but {} holds the transitions of {shards_before}: resume without this --set",
-            replay.display()
+            "replay.shards = {shards}, but {} holds the transitions of {}: resume without this --set, or remove that folder",
+            replay.display(),
+            count(shards_before, "shard")
         ));
     }
     if !lockstep && config.local.durable && !before.local.durable && replay.is_dir() {

@@ -13,7 +13,7 @@ use super::{
 use crate::stats::{Spread, interval};
 
 const GRID_INTERVALS: usize = 240;
-/// The most points of a single run's curve. Of a longer curve the ends are drawn, and between them the lowest and highest of neighbours.
+/// About the most points of a single run's curve. Of a longer curve the ends are drawn, and between them the lowest and highest of neighbours.
 const POINTS_MAX: usize = 600;
 /// Curves without a common x are still averaged if the gap is at most this share of x: evaluations of seeds are some frames apart.
 const GAP_SHARE_MAX: f64 = 0.05;
@@ -53,7 +53,11 @@ impl Curve {
     }
 
     pub(crate) fn series(self, name: &str, index: usize) -> Series {
-        Series::line(name, index, self.points).with_band(self.band)
+        let points = match self.band[..] {
+            [] => thin(&self.points),
+            _ => self.points,
+        };
+        Series::line(name, index, points).with_band(self.band)
     }
 }
 
@@ -82,14 +86,17 @@ impl Group<'_> {
         if column != "mean_k" || !has_spread {
             return Ok(mean);
         }
-        let spread = self.combine_seeds(SD_OF_K, args)?;
-        let band = mean.points.iter().map(|&(x, k)| {
-            let sd = interpolate(&spread.points, x);
+        let (points, spread) = (
+            thin(&mean.points),
+            self.combine_seeds(SD_OF_K, args)?.points,
+        );
+        let band = points.iter().map(|&(x, k)| {
+            let sd = interpolate(&spread, x);
             (x, (k - sd).max(K_MIN), k + sd)
         });
         Ok(Curve {
             band: band.collect(),
-            points: mean.points.clone(),
+            points,
         })
     }
 
@@ -114,7 +121,7 @@ pub(crate) fn combine_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
     match &each[..] {
         [] => Curve::default(),
         [only] => Curve {
-            points: thin(only),
+            points: only.to_vec(),
             band: Vec::new(),
         },
         many => combine(many, band),

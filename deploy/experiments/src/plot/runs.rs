@@ -19,7 +19,7 @@ const TOTAL_LOSS: &str = "total_loss";
 /// The columns of `metrics.csv` that hold words instead of numbers.
 const TEXTS: [&str; 1] = ["waiting"];
 
-/// The beginnings of the names of settings that do not influence what is learned.
+/// The beginnings of the names of settings that do not influence what is learned. Time-outs, which end in `_ms`, do not either.
 const OF_MACHINE: [&str; 7] = [
     "local.",
     "transport.",
@@ -169,7 +169,8 @@ pub(crate) fn read_settings(config: &str, compared: &[String]) -> Option<(Settin
     }
     all.retain(|name, _| {
         let is_in = |prefix: &str| name.starts_with(prefix);
-        compared.iter().any(|it| is_in(it)) || !OF_MACHINE.into_iter().any(is_in)
+        let is_of_machine = name.ends_with("_ms") || OF_MACHINE.into_iter().any(is_in);
+        compared.iter().any(|it| is_in(it)) || !is_of_machine
     });
     Some((all, seed))
 }

@@ -9,6 +9,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_launch::{
     checkpoint_choice::read_config,
+    resume::newest_updates,
     run_folder::{Outcome, RunFolder, Summary, read_progress, write_atomically},
 };
 use driml_machine::error::usage;
@@ -65,9 +66,12 @@ impl Runs {
         };
         for (_, plan) in plans {
             let (folder, call) = (self.folder(plan), plan.call.with_seed(1));
-            if !self.is_made_by(plan) || !folder.config().exists() {
+            // The queue begins other runs again.
+            let is_used = self.get_finished(plan).is_some() || newest_updates(&folder).is_some();
+            if !self.is_made_by(plan) || !is_used {
                 continue;
             }
+            let next = "choose another --out, or remove that folder";
             let at = known.iter().position(|it| it.0 == call);
             let at = at.unwrap_or(known.len());
             if at == known.len() {
@@ -75,12 +79,13 @@ impl Runs {
                 known.push((call, now));
             }
             let now = &known[at].1;
-            let made = settings(read_config(&folder)?);
+            let made = read_config(&folder).map_err(|e| usage!("{e:#}; {next}"))?;
+            let made = settings(made);
             let mut keys = made.keys().chain(now.keys());
             if let Some(key) = keys.find(|key| made.get(*key) != now.get(*key)) {
                 let [made, now] = [&made, now].map(|it| it.get(key).map_or("unset", |it| it));
                 bail!(usage!(
-                    "{} was made with {key} = {made}, and this call now means {now}: choose another --out, or remove that folder",
+                    "{} was made with {key} = {made}, and this call has {now}: {next}",
                     folder.display()
                 ));
             }
@@ -229,7 +234,7 @@ pub(super) mod tests {
         assert_eq!(check(), Ok(()), "another call made it");
         runs.write_call(&plans[0].1, "abc", false).unwrap();
         let problem = check().unwrap_err();
-        let expected = "beta1 = 0.8, and this call now means 0.9";
+        let expected = "beta1 = 0.8, and this call has 0.9";
         assert!(problem.contains(expected), "{problem}");
         fs::write(folder.config(), config).unwrap();
         assert_eq!(check(), Ok(()));

@@ -11,11 +11,7 @@ mod results;
 
 use std::{collections::BTreeMap, time::Instant};
 
-use driml_launch::{
-    checkpoint_choice::read_config,
-    console::{self, print},
-    evaluate::Levels,
-};
+use driml_launch::{checkpoint_choice::read_config, console::print, evaluate::Levels};
 use driml_machine::error::usage;
 use driml_settings::{config::RunConfig, presets};
 use minijinja::context;
@@ -23,7 +19,7 @@ use minijinja::context;
 use self::{
     menu::{DialLevel, Point, Settings},
     plan::{Cost, choose_levels},
-    results::{Numbers, PointResult, Results, SeedResult, is_resumed},
+    results::{Numbers, PointResult, Results, SeedResult},
 };
 use crate::{
     cache::{self, Session},
@@ -67,8 +63,8 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let mut settings = Settings::from_args(args, world, stored)?;
     let report_only = args.queue.report;
     if !report_only {
-        let base = settings.common.config(&settings.levels[0].base)?;
-        base.world.install(&mut console::eprintln)?;
+        let base = settings.common.plan_run(&settings.levels[0].base, 1);
+        install_worlds(&[((), base)], false)?;
     }
     // The budget is the machine time for the runs of this call.
     let (started, budget_seconds) = (Instant::now(), f64::from(args.budget) * 60.0);
@@ -84,7 +80,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let left = || (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
     let measured = tradeoff.measure_speeds();
     let chosen = measured.and_then(|()| tradeoff.choose_levels(left()));
-    // The length of the runs is settled once there is a run.
+    // The length of the runs is settled once a level fits.
     if is_new && (args.plan || !chosen.as_ref().is_ok_and(|it| it.contains(&true))) {
         tradeoff.session.forget_settings()?;
     }
@@ -100,10 +96,10 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
             false => "no level and its base both have a finished run",
         };
         let next = match report_only {
-            true => "run the same command without --report first",
-            false => "raise --budget",
+            true => ": run the same command without --report first",
+            false => ", and none fits into the budget: raise --budget",
         };
-        return Err(usage!("{what}, and none fits into the budget: {next}").into());
+        return Err(usage!("{what}{next}").into());
     }
     report::write_report(tradeoff.session, &results)
 }
@@ -140,7 +136,10 @@ impl Tradeoff<'_> {
         let (smoke, settings) = (self.args.flags.smoke, &self.settings);
         let (units, common) = (self.piece_units(), &settings.common);
         let program = cache::program_id()?;
-        let source = format!("{program}, {:?}, {:?}", common.preset, common.sets);
+        let source = format!(
+            "{program}, {}, {:?}, {:?}",
+            common.env, common.preset, common.sets
+        );
         for point in settings.levels.iter().flat_map(DialLevel::points) {
             if self.speeds.contains_key(&point.key) {
                 continue;
@@ -279,10 +278,7 @@ impl Tradeoff<'_> {
             }
             result.seeds.push(SeedResult {
                 seed: plan.call.seed,
-                curve: match is_resumed(&run) {
-                    true => Vec::new(),
-                    false => Run::read(&run.folder)?.values("seconds", "mean_return")?,
-                },
+                curve: Run::read(&run.folder)?.values("seconds", "mean_return")?,
                 run,
                 greedy: greedy.unwrap_or_default(),
             });

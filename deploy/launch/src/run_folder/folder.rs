@@ -161,7 +161,7 @@ impl RunFolder {
 
     pub(crate) fn check_intact(&self) -> anyhow::Result<()> {
         let files = [self.config(), self.metrics(), self.episodes()];
-        // An error of a network's file system may pass.
+        // An error of a network file system may be temporary.
         let missing = files
             .iter()
             .filter(|it| matches!(it.try_exists(), Ok(false)));

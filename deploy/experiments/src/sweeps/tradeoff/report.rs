@@ -103,27 +103,27 @@ struct EqualTime {
 }
 
 impl EqualTime {
-    /// Compares training returns of finished runs, because the agent at an earlier time was not kept. `None` if a side has no return at
-    /// `seconds`.
+    /// Compares training returns of finished runs, because the agent at an earlier time was not kept. The times of resumed runs are left
+    /// out. `None` if a side has no return at `seconds`.
     fn from_row(row: &Row<'_>) -> Option<Self> {
         let sides = [row.base, row.result];
         let [base, level] = sides.map(|point| {
-            let ends = point.seeds.iter().filter_map(|it| it.curve.last());
+            let ends = point.uninterrupted().filter_map(|it| it.curve.last());
             mean(&ends.map(|end| end.0).collect::<Vec<_>>())
         });
         let seconds = base?.min(level?);
-        let returns_at = |seconds: f64| {
-            sides.map(|point| -> Vec<f64> {
-                let curves = point.seeds.iter().map(|it| &it.curve);
-                curves.filter_map(|it| value_at(it, seconds)).collect()
-            })
-        };
+        let then = sides.map(|point| -> Vec<f64> {
+            let seeds = point.uninterrupted();
+            seeds
+                .filter_map(|it| value_at(&it.curve, seconds))
+                .collect()
+        });
         let comparison = Self {
             agent: row.point.agent.clone(),
             base: row.dial.agent.clone(),
             seconds,
-            end: returns_at(f64::INFINITY),
-            then: returns_at(seconds),
+            end: sides.map(|point| point.values(TRAINING)),
+            then,
         };
         (!comparison.then.iter().any(Vec::is_empty)).then_some(comparison)
     }

@@ -21,7 +21,7 @@ pub(super) struct PointResult {
 pub(super) struct SeedResult {
     pub(super) seed: u32,
     pub(super) run: FinishedRun,
-    /// Training return over seconds; empty for a resumed run.
+    /// Training return over seconds.
     pub(super) curve: Vec<(f64, f64)>,
     pub(super) greedy: Vec<f64>,
 }
@@ -42,11 +42,6 @@ pub(super) struct Measure {
     pub(super) get: fn(&SeedResult) -> Option<f64>,
 }
 
-/// Whether the run was resumed. Its time then includes filling its replay and starting its processes again, so it is not reported.
-pub(super) const fn is_resumed(run: &FinishedRun) -> bool {
-    run.summary.resumed_after_updates > 0
-}
-
 const fn measure(name: &'static str, get: fn(&SeedResult) -> Option<f64>) -> Measure {
     Measure { name, get }
 }
@@ -54,16 +49,16 @@ const fn measure(name: &'static str, get: fn(&SeedResult) -> Option<f64>) -> Mea
 pub(super) const GREEDY: Measure = measure("greedy_return", |it| mean(&it.greedy));
 /// The mean return of the last 100 training episodes.
 pub(super) const TRAINING: Measure = measure("training_return", |it| it.run.summary.mean_return);
+/// `None` for a resumed run, whose time includes filling its replay and starting its processes again.
 pub(super) const FRAMES_PER_SECOND: Measure = measure("frames_per_second", |it| {
-    (!is_resumed(&it.run)).then_some(it.run.summary.frames_per_second)
+    let summary = &it.run.summary;
+    (summary.resumed_after_updates == 0).then_some(summary.frames_per_second)
 });
 pub(super) const MEASURES: [Measure; 7] = [
     GREEDY,
     TRAINING,
     FRAMES_PER_SECOND,
-    measure("wall_seconds", |it| {
-        (!is_resumed(&it.run)).then_some(it.run.summary.wall_seconds)
-    }),
+    measure("wall_seconds", |it| Some(it.run.summary.wall_seconds)),
     // The sum over all processes of their highest resident memory.
     measure("rss_mib", |it| {
         Some(it.run.summary.rss_mib_max.values().flatten().sum())
@@ -81,6 +76,12 @@ pub(super) const MEASURES: [Measure; 7] = [
 impl PointResult {
     pub(super) fn values(&self, measure: Measure) -> Vec<f64> {
         self.seeds.iter().filter_map(measure.get).collect()
+    }
+
+    /// The seeds whose runs were not resumed: the time of others includes filling the replay and starting processes again.
+    pub(super) fn uninterrupted(&self) -> impl Iterator<Item = &SeedResult> {
+        let seeds = self.seeds.iter();
+        seeds.filter(|it| it.run.summary.resumed_after_updates == 0)
     }
 
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
