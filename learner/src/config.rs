@@ -27,7 +27,7 @@ pub struct Config {
     pub batch_size: u32,
     /// Number format of an update's matrix products. Weights, moments, losses and sums are f32 in either format.
     pub precision: Precision,
-    /// Whether equal states of a batch are computed once, on the CPU.
+    /// Whether equal states of a batch are computed once. Only the CPU kernels do this.
     pub deduplicate_states: bool,
     /// Batches requested ahead of the one being learned from.
     pub batches_in_flight: u32,

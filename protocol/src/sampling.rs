@@ -12,7 +12,8 @@ pub enum Sampling {
     /// Each transition that can be an anchor is equally likely. The braces make serde reject unknown fields, which a unit variant accepts.
     Uniform {},
     /// By priority, the proportional rule of Schaul et al. 2016: P(i) = p_i^alpha / sum_j p_j^alpha, where p_i is the C51 loss of
-    /// transition i at the last update that used it, and j runs over the shard's transitions. A row's loss is weighted by (N P(i))^-beta, divided by the batch's largest weight.
+    /// transition i at the last update that used it, and j runs over the shard's transitions. A row's loss is weighted by
+    /// (N P(i))^-beta, divided by the batch's largest weight.
     Prioritised {
         /// How much priorities count, 0 to 1: at 0 all rows are equally likely.
         alpha: f64,

@@ -215,9 +215,15 @@ impl DeliveryWorker {
                 self.mark_held(kept);
                 Ok(self.prepare_resend())
             }
-            // The reply is from when an earlier chunk waited; all earlier chunks are stored now. If it comes again, one was not needed.
-            Ok(InsertReply::OutOfOrder { .. }) => {
+            // The reply is from when an earlier chunk waited; all earlier chunks are stored now. A second one means that the server still
+            // expects a chunk that it declined.
+            Ok(InsertReply::OutOfOrder { expected }) => {
                 if self.out_of_order.replace(sequence) == Some(sequence) {
+                    if let Some(suppressed) = self.retry_log.admit() {
+                        tracing::warn!(
+                            "chunk {sequence} waits: the replay server expects {expected}{suppressed}"
+                        );
+                    }
                     self.pause();
                 }
                 Ok(self.prepare_resend())

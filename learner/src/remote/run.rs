@@ -136,7 +136,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         folder,
         counters,
         saved_counts: None,
-        first_failure: None,
     };
     let learned = learn(
         &mut learner,
@@ -161,7 +160,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     }
     let saved = checkpointer.save_last(&learner);
     if let (Err(_), Err(e)) = (&learned, &saved) {
-        tracing::warn!("no last checkpoint: {e:#}");
+        tracing::warn!("the last checkpoint was not saved: {e:#}");
     }
     if learned.is_ok() && !learner.publication_is_due() {
         publisher.publish(learner.export_weights()?);
@@ -247,7 +246,6 @@ fn learn(
                 "no checkpoint after {} updates, trying again at the next period: {e:#}",
                 learner.updates()
             );
-            checkpointer.first_failure.get_or_insert(e);
         }
     }
     Ok(false)
@@ -260,8 +258,6 @@ struct Checkpointer {
     counters: Arc<Counters>,
     /// Updates and frames in the newest checkpoint that this process saved.
     saved_counts: Option<(u64, u64)>,
-    /// The first failure since that checkpoint.
-    first_failure: Option<CheckpointError>,
 }
 
 impl Checkpointer {
@@ -270,7 +266,6 @@ impl Checkpointer {
         self.saved_counts = Some(Self::counts(learner));
         let saved_updates = &self.counters.saved_updates;
         saved_updates.store(learner.updates(), Ordering::Release);
-        self.first_failure = None;
         Ok(())
     }
 
@@ -280,11 +275,10 @@ impl Checkpointer {
 
     /// Saves a last checkpoint, if updates were made or frames stored since the newest one.
     fn save_last(mut self, learner: &Learner) -> Result<(), CheckpointError> {
-        let saved = match self.saved_counts == Some(Self::counts(learner)) {
+        match self.saved_counts == Some(Self::counts(learner)) {
             true => Ok(()),
             false => self.save(learner),
-        };
-        self.first_failure.map_or(saved, Err)
+        }
     }
 }
 

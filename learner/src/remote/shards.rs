@@ -260,7 +260,7 @@ impl PartialBatch {
         }
     }
 
-    /// Draws the rows of shards that cannot send any, as they hold nothing to draw from, from the other shards. Their shares stay, because
+    /// Draws the rows of shards that cannot send any, as they hold nothing to draw from, from the other shards. The shares of all stay, because
     /// importance weights do not depend on a factor that all rows have. A shard that held nothing when the batch began gets its share now.
     pub(super) fn reassign_rows(&mut self, rng: &mut impl Rng) {
         let total: u64 = self.shards.iter().map(|it| it.held).sum();

@@ -49,14 +49,15 @@ impl Trust {
 
     /// Records that a message in shared memory was not answered. The next ones go through the socket; after two losses in a row, all do.
     pub fn record_loss(&mut self) {
-        self.avoid_left = AVOID_COUNT;
-        self.losses_in_a_row += 1;
-        if self.losses_in_a_row == LOSSES_MAX {
+        // Messages that are lost together are one loss.
+        self.losses_in_a_row += u32::from(self.may_use());
+        if self.may_use() && self.losses_in_a_row == LOSSES_MAX {
             tracing::warn!(
                 "messages in shared memory do not arrive, so all go through sockets from now on, which is slower; the other side may \
                  not be allowed to lock memory: raise its `ulimit -l`, or --set transport.shared_memory=false"
             );
         }
+        self.avoid_left = AVOID_COUNT;
     }
 
     /// Records whether shared memory was free for a message; if not, the message goes through the socket.
@@ -198,8 +199,12 @@ mod tests {
             assert!(trust.may_use());
             trust.record_arrival(true);
         }
-        trust.record_loss();
-        trust.record_loss();
+        for _ in 0..2 {
+            trust.record_loss();
+            trust.record_loss();
+            assert!(!trust.may_use());
+            (0..AVOID_COUNT).for_each(|_| trust.record_arrival(false));
+        }
         (0..10 * AVOID_COUNT).for_each(|_| trust.record_arrival(false));
         assert!(!trust.may_use());
     }

@@ -38,8 +38,8 @@ impl Replay {
             Some(_) if done == 0 && join.updates == 0 => {}
             Some(_) if done == 0 => {
                 return Err(format!(
-                    "another learner has begun this run anew, and this one is after {} updates: start the replay server and the actors \
-                     again, then this learner",
+                    "another learner has begun this run anew, and this learner has a checkpoint after {} updates: start the replay server \
+                     again without its stored replay (another --replay-dir), then the actors and this learner",
                     join.updates
                 ));
             }

@@ -308,7 +308,7 @@ fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
         let mut replay = with_three_chunks(None);
         // A run without any update accepts any learner that has none either.
         replay.join_learner(learner(0, 0, 0, 0)).unwrap();
-        let begun = "another learner has begun this run anew, and this one is after 5 updates";
+        let begun = "another learner has begun this run anew, and this learner has a checkpoint after 5 updates";
         let further = replay.join_learner(other_run(5, 40)).unwrap_err();
         assert!(further.starts_with(begun), "{further}");
         replay.join_learner(learner(1, 0, 0, 0)).unwrap();

@@ -25,11 +25,11 @@ fn leading_dimensions_and_a_plain_bias_are_kept() -> Result<()> {
 
 #[test]
 fn relu_passes_no_gradient_at_exactly_zero() -> Result<()> {
-    let x = Var::new(&[-1.0f32, 0.0, -0.0, 2.0], &Device::Cpu)?;
+    let x = Var::new(&[-1.0, 0.0, -0.0, 2.0, f32::NEG_INFINITY], &Device::Cpu)?;
     let y = relu(&x)?;
-    assert_eq!(values(&y), [0.0, 0.0, 0.0, 2.0]);
+    assert_eq!(values(&y), [0.0, 0.0, 0.0, 2.0, 0.0]);
     let grads = (y * 3.0)?.sum_all()?.backward()?;
-    assert_eq!(values(grads.get(&x).unwrap()), [0.0, 0.0, 0.0, 3.0]);
+    assert_eq!(values(grads.get(&x).unwrap()), [0.0, 0.0, 0.0, 3.0, 0.0]);
     Ok(())
 }
 

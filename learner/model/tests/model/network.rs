@@ -159,6 +159,8 @@ fn inputs_that_do_not_fit_are_errors() {
     for taken in [&[0, 5][..], &[0]] {
         assert!(network.taken_logits(&features.f4, taken, None).is_err());
     }
+    let none = features.f4.narrow(0, 0, 0).unwrap();
+    assert!(network.taken_logits(&none, &[], None).is_err());
     let narrow = features.f4.narrow(1, 0, 5).unwrap();
     assert!(network.logits(&narrow, None).is_err());
 }

@@ -37,10 +37,7 @@ impl<E> RawTile<E> {
     pub(super) fn taps(&self) -> usize {
         let run = self.steps * self.step_stride;
         // Not `row_stride * taps`: the stride of a single row is any number, and the product may wrap.
-        let fits = |taps: &usize| {
-            let are_multiples = [self.steps, run].iter().all(|it| it.is_multiple_of(*taps));
-            are_multiples && self.row_stride == run / taps
-        };
+        let fits = |taps: &usize| self.steps.is_multiple_of(*taps) && self.row_stride == run / taps;
         [2, 3].into_iter().find(fits).unwrap_or(1)
     }
 }
