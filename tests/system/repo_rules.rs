@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_475),
-    ("actor", 10_905),
+    ("protocol", 7_485),
+    ("actor", 10_910),
     ("replay-server", 11_215),
     ("learner", 22_920),
-    ("deploy", 31_400),
-    ("tests", 10_585),
+    ("deploy", 31_415),
+    ("tests", 10_590),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;
