@@ -125,32 +125,3 @@ impl ExactAffinity {
         ratios
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::affinity::tests::EXACT;
-
-    fn affinity_of_15() -> ExactAffinity {
-        ExactAffinity::new(Alphabet::raw(15).unwrap(), EXACT).unwrap()
-    }
-
-    /// The same holds for the learned estimate: pairs that were never seen say nothing about how one action follows another.
-    #[test]
-    fn actions_that_tell_nothing_leave_a_uniform() {
-        let uniform = |row: &[f32]| row.iter().all(|a| (a * 15.0 - 1.0).abs() < 1e-4);
-        let (mut always_1, mut odd_ones) = (affinity_of_15(), affinity_of_15());
-        for _ in 0..100 {
-            always_1.observe(&[(1, 1); 64]).unwrap();
-            // Actions 1 and 3 are independent of each other; the even actions never occur.
-            odd_ones
-                .observe(&[(1, 1), (1, 3), (3, 1), (3, 3)].repeat(64))
-                .unwrap();
-        }
-        for exact in [always_1, odd_ones] {
-            for (action, row) in exact.matrix().chunks_exact(15).enumerate() {
-                assert!(uniform(row), "action {action}: {row:?}");
-            }
-        }
-    }
-}

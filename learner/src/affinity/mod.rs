@@ -88,7 +88,7 @@ mod tests {
         eps: 1e-8,
         keep: 0.9,
     };
-    pub(super) const EXACT: ExactSettings = ExactSettings {
+    const EXACT: ExactSettings = ExactSettings {
         decay: 0.999,
         smoothing: 1.0,
     };
