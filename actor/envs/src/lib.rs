@@ -69,7 +69,7 @@ pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenEr
 pub use registry::{WorldConfig, WorldName, WorldNameError};
 pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{BuildResult, Levels, Variants, WorldSettings};
-pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return};
+pub use worlds::chain::{ChainConfig, ChainWorld};
 pub use worlds::exec::{ExecConfig, ExecWorld, probe_command as probe_exec_command};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};
