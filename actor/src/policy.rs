@@ -189,40 +189,6 @@ pub(crate) mod tests {
         NetworkPolicy::new(&model, None, &weights, Precision::F32).unwrap()
     }
 
-    /// How often each action is chosen in `STATES` equal states.
-    fn counts(policy: &mut dyn Policy, epsilon: f64) -> [usize; ACTIONS] {
-        let rng = &mut ChaCha8Rng::seed_from_u64(2);
-        let mut actions = vec![0; STATES];
-        let acted = policy.act(&[9; 16 * STATES], epsilon, rng, &mut actions);
-        acted.unwrap();
-        let count = |action: usize| actions.iter().filter(|&&it| it == action as u8).count();
-        std::array::from_fn(count)
-    }
-
-    /// Chi-square against these shares, four degrees of freedom: above 18.5 once in a thousand.
-    fn check_shares(counts: [usize; ACTIONS], shares: [f64; ACTIONS]) {
-        let squares = counts.iter().zip(shares).map(|(&count, share)| {
-            let expected = share * STATES as f64;
-            (count as f64 - expected).powi(2) / expected
-        });
-        let chi_square: f64 = squares.sum();
-        assert!(chi_square < 18.5, "{counts:?}, not {shares:?}");
-    }
-
-    #[test]
-    fn each_action_is_random_with_probability_epsilon_and_else_greedy() {
-        let mut policy = policy_with(HeadConfig::PLAIN, 1);
-        let greedy = counts(&mut policy, 0.0);
-        let best = greedy.iter().position(|&count| count > 0).unwrap();
-        assert_eq!(greedy[best], STATES);
-        for epsilon in [0.1, 0.5, 1.0] {
-            // Chance may choose the greedy action too.
-            let mut shares = [epsilon / ACTIONS as f64; ACTIONS];
-            shares[best] += 1.0 - epsilon;
-            check_shares(counts(&mut policy, epsilon), shares);
-        }
-    }
-
     /// The actions and the random numbers drawn are the same as if the network chose in every state before random actions replaced some.
     #[test]
     fn states_in_which_chance_decides_need_no_network() {
