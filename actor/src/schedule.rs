@@ -76,27 +76,15 @@ mod tests {
     }
 
     #[test]
-    fn epsilon_falls_along_a_line_over_the_run_s_frames_and_stays() {
+    fn without_a_ladder_all_actors_have_the_settings_line() {
         for actor in [0, 5] {
-            let schedule = Schedule::new(&CONFIG, actor).unwrap();
-            for (frames, epsilon) in [
-                (0, 0.1),
-                (1, 0.1 - 0.09e-5),
-                (25_000, 0.0775),
-                (50_000, 0.055),
-                (99_999, 0.01 + 0.09e-5),
-                (100_000, 0.01),
-                (u64::MAX, 0.01),
-            ] {
-                let found = schedule.epsilon(frames);
-                assert!((found - epsilon).abs() < 1e-12, "{frames}: {found}");
-            }
+            let line = Schedule {
+                start: 0.1,
+                end: 0.01,
+                decay_frames: 100_000,
+            };
+            assert_eq!(Schedule::new(&CONFIG, actor).unwrap(), line);
         }
-        let at_once = Config {
-            epsilon_decay_frames: 0,
-            ..CONFIG
-        };
-        assert_eq!(Schedule::new(&at_once, 0).unwrap().epsilon(0), 0.01);
     }
 
     /// Closed form: with alpha 7, eight actors have the powers 1, 2, .., 8 of 0.4.
