@@ -110,9 +110,12 @@ pub fn decode_from<M: Message>(
     pool: &BufferPool,
     spec_hash: Option<u64>,
 ) -> Result<(M, Buffer), CodecError> {
+    let need = PREFIX_BYTES;
     let mut prefix = [0; PREFIX_BYTES];
-    let has_prefix = bytes.read_exact(&mut prefix).is_ok();
-    let prefix = Prefix::decode(has_prefix.then_some(&prefix), len)?;
+    bytes
+        .read_exact(&mut prefix)
+        .map_err(|_| CodecError::Length { have: len, need })?;
+    let prefix = Prefix::decode(&prefix, len)?;
     let mut sum = prefix.start_checksum();
     let mut header = vec![0; prefix.header_len()];
     copy_and_sum(&mut bytes, &mut header, &mut sum);
@@ -160,12 +163,6 @@ impl Prefix {
         bytes
     }
 
-    /// Decodes the fields of received bytes, without checking them.
-    fn from_bytes(bytes: &[u8; PREFIX_BYTES]) -> Self {
-        let read = bincode::serde::decode_from_slice(bytes, PREFIX_ENCODING);
-        read.expect("any 32 bytes are seven integers").0
-    }
-
     /// Starts a checksum with the fields before `checksum`; the caller adds header and payload.
     fn start_checksum(self) -> crc32fast::Hasher {
         let mut sum = crc32fast::Hasher::new();
@@ -174,11 +171,9 @@ impl Prefix {
     }
 
     /// Decodes the prefix of a message of `len` bytes in all, and checks its magic, version and lengths.
-    fn decode(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
-        let this = Self::from_bytes(bytes.ok_or(CodecError::Length {
-            have: len,
-            need: PREFIX_BYTES,
-        })?);
+    fn decode(bytes: &[u8; PREFIX_BYTES], len: usize) -> Result<Self, CodecError> {
+        let read = bincode::serde::decode_from_slice(bytes, PREFIX_ENCODING);
+        let this: Self = read.expect("any 32 bytes are seven integers").0;
         if this.magic != Self::MAGIC {
             return Err(CodecError::Magic);
         }
