@@ -12,7 +12,6 @@ use crate::{
     session::{self, SessionError},
     wire::{
         codec,
-        error::CodecError,
         keys::Keys,
         message::{Keyed, Request},
     },
@@ -30,16 +29,8 @@ const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a process could not join a run.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "each message says it")]
-pub enum JoinError {
-    #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_WAIT_MAX.as_secs())]
-    NoReplayServer { last: SessionError },
-    #[error("reading the replay server's run info: {0}")]
-    Codec(#[from] CodecError),
-    /// Another process has the same role and does not exit, or the replay server rejects this one.
-    #[error("{0}")]
-    Refused(String),
-}
+#[error("{0}")]
+pub struct JoinError(String);
 
 /// Fetches the run's settings from the replay server. Waits up to 60 s for the server to start, and without a limit while the server reads
 /// its replay back from disk. Returns `None` if `shutdown` is set first.
@@ -94,7 +85,10 @@ impl ServerWait {
     /// Records a failed attempt, and logs now and then what this process waits for. Returns an error if a retry is useless.
     fn record_failure(&mut self, e: SessionError) -> Result<(), JoinError> {
         let e = match e {
-            SessionError::Unreadable { why, .. } => return Err(why.into()),
+            SessionError::Unreadable { why, .. } => {
+                let what = "reading the replay server's run info";
+                return Err(JoinError(format!("{what}: {why}")));
+            }
             SessionError::Recovering(recovering) => {
                 self.record_wait(recovering.progress.is_slow(), &recovering);
                 return Ok(());
@@ -103,7 +97,10 @@ impl ServerWait {
         };
         let since = self.silence.record_failure();
         if since > SERVER_WAIT_MAX {
-            return Err(JoinError::NoReplayServer { last: e });
+            let max = SERVER_WAIT_MAX.as_secs();
+            return Err(JoinError(format!(
+                "no replay server answered within {max} s: is it running, and is the endpoint right? ({e})"
+            )));
         }
         if since > QUIET_WAIT_MAX && self.silence_log.admit().is_some() {
             let (since, max) = (since.as_secs(), SERVER_WAIT_MAX.as_secs());
@@ -138,7 +135,7 @@ pub fn join(
             Ok(JoinReply::Welcome(welcome)) => return Ok(Some(welcome)),
             Ok(JoinReply::Refused { why }) => {
                 let why = format!("the replay server rejects this process: {why}");
-                return Err(JoinError::Refused(why));
+                return Err(JoinError(why));
             }
             Ok(JoinReply::Wait { why }) => server_wait.record_wait(true, &why),
             Ok(JoinReply::Taken { why }) => match &mut predecessor {
@@ -146,7 +143,7 @@ pub fn join(
                     if silence.record_failure() > PREDECESSOR_WAIT_MAX {
                         let seconds = PREDECESSOR_WAIT_MAX.as_secs();
                         let why = format!("{why}; it has not exited within {seconds} s");
-                        return Err(JoinError::Refused(why));
+                        return Err(JoinError(why));
                     }
                 }
                 None => {
