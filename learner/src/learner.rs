@@ -80,7 +80,10 @@ impl Learner {
             affinity.map(AffinityEstimator::settings)
         });
         if configured != saved {
-            return Err(CheckpointError::OtherAffinity(folder.to_owned()));
+            return Err(CheckpointError::Other(format!(
+                "in {} has another estimator of the action affinity: resume with the settings it was made with, or choose another folder",
+                folder.display()
+            )));
         }
         self.state = LearnerState {
             agent: apply_settings(restored.agent, &self.config),

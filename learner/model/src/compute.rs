@@ -140,24 +140,8 @@ pub enum DeviceName {
 
 /// The reason why a device cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "each message says it")]
-pub enum DeviceError {
-    #[error("{0:?} is not a device: use cpu, cuda or cuda:N")]
-    Name(String),
-    /// Only this project's CPU kernels support another precision than f32.
-    #[error(
-        "{device} computes only in f32: set learner.precision = \"f32\", or compute {precision} on the CPU"
-    )]
-    Precision {
-        device: DeviceName,
-        precision: Precision,
-    },
-    #[error("{device} cannot be used: {why}; `driml doctor` says what is missing")]
-    Open {
-        device: DeviceName,
-        why: candle_core::Error,
-    },
-}
+#[error("{0}")]
+pub struct DeviceError(String);
 
 impl DeviceName {
     /// Checks that a device of this kind supports `precision`, whether or not it is present.
@@ -166,10 +150,10 @@ impl DeviceName {
     /// `precision` is bf16 and the device is a GPU.
     pub fn check_precision(self, precision: Precision) -> Result<(), DeviceError> {
         match (self, precision) {
-            (Self::Cuda(_), Precision::Bf16) => Err(DeviceError::Precision {
-                device: self,
-                precision,
-            }),
+            // Only this project's CPU kernels support another precision than f32.
+            (Self::Cuda(_), Precision::Bf16) => Err(DeviceError(format!(
+                "{self} computes only in f32: set learner.precision = \"f32\", or compute {precision} on the CPU"
+            ))),
             _ => Ok(()),
         }
     }
@@ -184,8 +168,11 @@ impl DeviceName {
             Self::Cpu => Ok(Compute::cpu(precision)),
             Self::Cuda(ordinal) => {
                 // All threads share one stream. `Device::new_cuda` gives each thread another stream, without ordering between them.
-                let device = Device::new_cuda_with_stream(ordinal)
-                    .map_err(|why| DeviceError::Open { device: self, why })?;
+                let device = Device::new_cuda_with_stream(ordinal).map_err(|why| {
+                    DeviceError(format!(
+                        "{self} cannot be used: {why}; `driml doctor` says what is missing"
+                    ))
+                })?;
                 Ok(Compute {
                     kernels: Kernels::Candle,
                     device,
@@ -222,7 +209,7 @@ impl FromStr for DeviceName {
     type Err = DeviceError;
 
     fn from_str(name: &str) -> Result<Self, DeviceError> {
-        let unknown = || DeviceError::Name(name.to_owned());
+        let unknown = || DeviceError(format!("{name:?} is not a device: use cpu, cuda or cuda:N"));
         match name.split_once(':') {
             None if name == "cpu" => Ok(Self::Cpu),
             None if name == "cuda" => Ok(Self::Cuda(0)),

@@ -86,11 +86,10 @@ impl StateFile {
         if let Ok(Version { format }) = serde_json::from_slice(text)
             && format != FORMAT
         {
-            return Err(CheckpointError::OtherFormat {
-                folder: folder.to_owned(),
-                format,
-                ours: FORMAT,
-            });
+            return Err(CheckpointError::Other(format!(
+                "{} was written by another version of this program (format {format}, this one reads {FORMAT}): use that version",
+                folder.display()
+            )));
         }
         let read = serde_json::from_slice(text).map_err(|e| e.to_string());
         let checked = read.and_then(|state: Self| state.check_valid().map(|()| state));

@@ -23,15 +23,9 @@ pub enum CheckpointError {
         file.display(), file.parent().unwrap_or(file).display()
     )]
     Damaged { file: PathBuf, why: String },
-    #[error(
-        "the checkpoint {} was written by another version of this program (format {format}, this one reads {ours}): use that version",
-        folder.display()
-    )]
-    OtherFormat {
-        folder: PathBuf,
-        format: u32,
-        ours: u32,
-    },
+    /// Another version of this program wrote the checkpoint, or its run had another network or another estimator of the affinity.
+    #[error("the checkpoint {0}")]
+    Other(String),
     #[error(
         "{folder} belongs to a run with specification {found}, this run's is {expected}: \
          resume with the settings it was made with, or choose another folder"
@@ -41,21 +35,6 @@ pub enum CheckpointError {
         found: String,
         expected: String,
     },
-    #[error(
-        "the checkpoint {} was saved with {key} = {found}, this run has {key} = {expected}: \
-         resume with the settings it was made with, or choose another folder", folder.display()
-    )]
-    OtherModel {
-        folder: PathBuf,
-        key: String,
-        found: String,
-        expected: String,
-    },
-    #[error(
-        "the checkpoint in {} has another estimator of the action affinity: resume with the settings it was made with, or choose another folder",
-        .0.display()
-    )]
-    OtherAffinity(PathBuf),
     /// No learner could be restored from the state, for example because a weight is not finite.
     #[error("the checkpoint was not saved, and the newest one is still that before it: {0}")]
     Unsound(UpdateError),

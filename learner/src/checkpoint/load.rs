@@ -109,12 +109,11 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
     let torso = description::first_difference("model.torso", &saved["torso"], &ours["torso"]);
     match torso.or_else(|| description::first_difference("model", saved, &ours)) {
         None => Ok(()),
-        Some((key, found, expected)) => Err(CheckpointError::OtherModel {
-            folder: path.to_owned(),
-            key,
-            found,
-            expected,
-        }),
+        Some((key, found, expected)) => Err(CheckpointError::Other(format!(
+            "{} was saved with {key} = {found}, this run has {key} = {expected}: resume with the settings it was made with, or choose \
+             another folder",
+            path.display()
+        ))),
     }
 }
 
