@@ -23,11 +23,7 @@ pub enum WeightDtype {
 impl fmt::Display for WeightDtype {
     /// Writes the name that settings use.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-            Self::Bf16 => "bf16",
-        })
+        self.serialize(f)
     }
 }
 

@@ -34,15 +34,6 @@ pub(crate) struct TorsoSettings<'a> {
 }
 
 impl TorsoName {
-    /// The name that settings use.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Nature => "nature",
-            Self::Impala => "impala",
-            Self::Impoola => "impoola",
-        }
-    }
-
     /// Returns the settings that only other torsos use.
     pub const fn settings_of_others(self) -> &'static [&'static str] {
         match self {
@@ -109,7 +100,8 @@ impl TorsoName {
 }
 
 impl fmt::Display for TorsoName {
+    /// Writes the name that settings use.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
+        self.serialize(f)
     }
 }
