@@ -1,16 +1,13 @@
 //! The actor's settings, and the other tables of a run's settings that an actor reads.
 //! No number has a default here: presets give each one, with its source.
 
-use std::{
-    fmt::Display,
-    ops::{Bound, RangeBounds},
-};
+use std::ops::Bound;
 
 use driml_envs::{EnvError, WorldName};
 use driml_protocol::{
     BufferPool, RunSpec, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
-    config::{ConfigError, Settings, TransportConfig, check},
+    config::{ConfigError, Settings, TransportConfig, check, check_range},
     transitions_max,
 };
 use serde::{Deserialize, Serialize};
@@ -127,10 +124,9 @@ impl ActorSettings {
         self.actor.validate()?;
         self.check_chunk_bytes()?;
         let longest = u64::from(envs) * u64::from(self.actor.chunk_steps(1));
-        check(longest <= allowed, "actor.envs", envs, || {
-            "its chunks are longer than the replay server accepts in this run, whose settings limit actor.envs * \
-             actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)"
-        })
+        let why = "its chunks are longer than the replay server accepts in this run, whose settings limit actor.envs * \
+                   actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)";
+        check(longest <= allowed, "actor.envs", envs, why)
     }
 
     /// Takes the world's code from `world`, the name given on this machine, and not from the run's settings.
@@ -157,12 +153,9 @@ impl ActorSettings {
     pub fn check_chunk_bytes(&self) -> Result<(), ConfigError> {
         let transitions = u64::from(self.actor.envs) * u64::from(self.actor.chunk_steps(1));
         let bytes = transitions * self.transition_bytes() as u64;
-        check(
-            bytes <= PAYLOAD_BYTES_MAX as u64,
-            "actor.steps_per_chunk",
-            self.actor.steps_per_chunk,
-            || "a chunk of so many steps of so many environments (actor.envs) is larger than a message may be, 512 MiB: use fewer",
-        )
+        let (key, steps) = ("actor.steps_per_chunk", self.actor.steps_per_chunk);
+        let why = "a chunk of so many steps of so many environments (actor.envs) is larger than a message may be, 512 MiB: use fewer";
+        check(bytes <= PAYLOAD_BYTES_MAX as u64, key, steps, why)
     }
 
     const fn transition_bytes(&self) -> usize {
@@ -197,38 +190,38 @@ impl Config {
     /// Checks every field's range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let why = "an actor steps 1 to 4096 environments";
-        check_range("envs", self.envs, 1..=4096, why)?;
+        check_range("actor.envs", self.envs, 1..=4096, why)?;
         let why = "a chunk has 1 to 4096 steps";
-        check_range("steps_per_chunk", self.steps_per_chunk, 1..=4096, why)?;
-        let (key, why) = ("chunks_in_flight_max", "1 to 64 chunks may wait");
+        check_range("actor.steps_per_chunk", self.steps_per_chunk, 1..=4096, why)?;
+        let (key, why) = ("actor.chunks_in_flight_max", "1 to 64 chunks may wait");
         check_range(key, self.chunks_in_flight_max, 1..=64, why)?;
         let why = "a probability lies between 0 and 1";
-        check_range("epsilon_start", self.epsilon_start, 0.0..=1.0, why)?;
-        check_range("epsilon_end", self.epsilon_end, 0.0..=1.0, why)?;
+        check_range("actor.epsilon_start", self.epsilon_start, 0.0..=1.0, why)?;
+        check_range("actor.epsilon_end", self.epsilon_end, 0.0..=1.0, why)?;
         if let Some(ladder) = &self.epsilon_ladder {
             let why = "the first actor's probability lies between 0 and 1, without the two";
             let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
-            check_range("epsilon_ladder.base", ladder.base, open, why)?;
+            check_range("actor.epsilon_ladder.base", ladder.base, open, why)?;
             let why = "epsilons fall from actor to actor, so it is a number of at least 0";
-            check_range("epsilon_ladder.alpha", ladder.alpha, 0.0..=f64::MAX, why)?;
+            let finite = 0.0..=f64::MAX;
+            check_range("actor.epsilon_ladder.alpha", ladder.alpha, finite, why)?;
             let why = "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand";
-            check_range("epsilon_ladder.actors", ladder.actors, 2..=ACTORS_MAX, why)?;
+            let range = 2..=ACTORS_MAX;
+            check_range("actor.epsilon_ladder.actors", ladder.actors, range, why)?;
         }
-        let (why, range) = ("a wait lasts 100 ms to one day", 100..=86_400_000);
-        check_range("ack_timeout_ms", self.ack_timeout_ms, range.clone(), why)?;
-        check_range("unreachable_max_ms", self.unreachable_max_ms, range, why)
+        for (key, wait) in [
+            ("actor.ack_timeout_ms", self.ack_timeout_ms),
+            ("actor.unreachable_max_ms", self.unreachable_max_ms),
+        ] {
+            check_range(
+                key,
+                wait,
+                100..=86_400_000,
+                "a wait lasts 100 ms to one day",
+            )?;
+        }
+        Ok(())
     }
-}
-
-/// Checks that the value of a key of the `[actor]` table lies in `range`.
-fn check_range<T: PartialOrd + Display>(
-    key: &str,
-    value: T,
-    range: impl RangeBounds<T>,
-    why: &str,
-) -> Result<(), ConfigError> {
-    let key = format!("actor.{key}");
-    check(range.contains(&value), &key, value, || why)
 }
 
 #[cfg(test)]

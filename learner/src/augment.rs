@@ -1,7 +1,7 @@
 //! Augmentation: crops and recolours states at random for the auxiliary loss, bytes in, bytes out.
 //! C51 always sees the plain states. This module knows neither networks nor losses, and holds no random generator.
 
-use driml_protocol::config::{ConfigError, check};
+use driml_protocol::config::{ConfigError, check_range};
 use rand::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -52,7 +52,7 @@ impl AugmentSettings {
             ("hue", self.hue, 0.0..=0.5, turn),
         ] {
             let key = format!("learner.augment.{key}");
-            check(range.contains(&value), &key, value, || why)?;
+            check_range(&key, value, range, why)?;
         }
         Ok(())
     }

@@ -4,7 +4,7 @@
 use driml_model::{InputSize, ModelConfig, Precision, WeightDtype};
 use driml_protocol::{
     RunSpec, Sampling,
-    config::{ConfigError, Settings, TransportConfig, check},
+    config::{ConfigError, Settings, TransportConfig, check, check_range},
 };
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -120,8 +120,8 @@ impl AffinityConfig {
         check(
             found == num_actions,
             "learner.affinity.visible",
-            format!("{found} actions"),
-            || format!("the world has {num_actions}"),
+            format_args!("{found} actions"),
+            format_args!("the world has {num_actions}"),
         )?;
         let estimator = match self.estimator {
             EstimatorKind::Exact => {
@@ -144,11 +144,11 @@ impl Config {
     /// The first invalid field, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let within = |key: &str, value: u64, most: u64| {
-            let (key, is_fine) = (format!("learner.{key}"), (1..=most).contains(&value));
-            check(is_fine, &key, value, || match most {
+            let why = match most {
                 u64::MAX => "it must be at least 1".into(),
                 most => format!("it must lie between 1 and {most}"),
-            })
+            };
+            check_range(&format!("learner.{key}"), value, 1..=most, why)
         };
         let (publish, checkpoint) = (self.publish_period_updates, self.checkpoint_period_updates);
         within("batch_size", self.batch_size.into(), 65_536)?;

@@ -1,7 +1,7 @@
 //! How a process reads its own tables from the run's resolved settings, and how it reports a value that cannot work.
 //! The content of the tables is not known here: each crate defines its Config.
 
-use std::fmt::Display;
+use std::{fmt::Display, ops::RangeBounds};
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -18,16 +18,26 @@ impl ConfigError {
 }
 
 /// Returns the error [`ConfigError::new`] unless `is_valid`.
-pub fn check<W: Display>(
+pub fn check(
     is_valid: bool,
     key: &str,
     value: impl Display,
-    why: impl FnOnce() -> W,
+    why: impl Display,
 ) -> Result<(), ConfigError> {
     match is_valid {
         true => Ok(()),
-        false => Err(ConfigError::new(key, value, why())),
+        false => Err(ConfigError::new(key, value, why)),
     }
+}
+
+/// Returns the error [`ConfigError::new`] unless `value` lies in `range`.
+pub fn check_range<T: PartialOrd + Display>(
+    key: &str,
+    value: T,
+    range: impl RangeBounds<T>,
+    why: impl Display,
+) -> Result<(), ConfigError> {
+    check(range.contains(&value), key, value, why)
 }
 
 /// Describes in one line what is wrong with a table, and at which of its keys.

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::{
-    config::{ConfigError, check},
+    config::{ConfigError, check, check_range},
     wire::codec,
 };
 
@@ -161,27 +161,25 @@ impl RunSpec {
             ("run.frame_channels", self.frame_channels, 16),
             ("run.frame_stack", self.frame_stack, FRAME_STACK_MAX),
         ] {
-            let why = || format!("it lies between 1 and {max}");
-            check((1..=max).contains(&value), key, value, why)?;
+            let why = format_args!("it lies between 1 and {max}");
+            check_range(key, value, 1..=max, why)?;
             bytes *= u64::from(value);
         }
         let fits = u32::try_from(bytes).is_ok();
         let why = "with these sizes a state has 4 GiB or more";
-        check(fits, "run.frame_height", self.frame_height, || why)?;
-        let fits = (1..=255).contains(&self.num_actions);
+        check(fits, "run.frame_height", self.frame_height, why)?;
         let why = "a world has 1 to 255 actions";
-        check(fits, "run.num_actions", self.num_actions, || why)?;
-        let fits = (1..=1000).contains(&self.n_step);
+        check_range("run.num_actions", self.num_actions, 1..=255, why)?;
         let why = "a return spans 1 to 1000 steps";
-        check(fits, "run.n_step", self.n_step, || why)?;
-        let fits = (0.0..=1.0).contains(&self.gamma);
+        check_range("run.n_step", self.n_step, 1..=1000, why)?;
         let why = "a discount lies between 0 and 1";
-        check(fits, "run.gamma", self.gamma, || why)?;
-        let (horizon, k_max) = (self.horizon, self.horizon.k_max());
-        let fits = horizon == Horizon::None {} || (1..=1000).contains(&k_max);
-        check(fits, "run.horizon", k_max, || "k lies between 1 and 1000")?;
-        let fits = horizon.positives() <= POSITIVES_MAX;
-        let why = "a row carries at most 32 positives";
-        check(fits, "run.horizon", k_max, || why)
+        check_range("run.gamma", self.gamma, 0.0..=1.0, why)?;
+        if matches!(self.horizon, Horizon::None {}) {
+            return Ok(());
+        }
+        let (key, k_max) = ("run.horizon", self.horizon.k_max());
+        check_range(key, k_max, 1..=1000, "k lies between 1 and 1000")?;
+        let fits = self.horizon.positives() <= POSITIVES_MAX;
+        check(fits, key, k_max, "a row carries at most 32 positives")
     }
 }

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check};
+use crate::config::{ConfigError, check, check_range};
 
 /// The rule by which the replay draws the rows of a batch: the setting `replay.sampling`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -70,15 +70,14 @@ impl Sampling {
             ("replay.sampling.beta_start", beta_start),
             ("replay.sampling.beta_end", beta_end),
         ] {
-            let fits = (0.0..=1.0).contains(&value);
-            check(fits, key, value, || "it lies between 0 and 1")?;
+            check_range(key, value, 0.0..=1.0, "it lies between 0 and 1")?;
         }
         let key = "replay.sampling.beta_end";
         let why = "beta rises: use at least beta_start";
-        check(beta_end >= beta_start, key, beta_end, || why)?;
+        check(beta_end >= beta_start, key, beta_end, why)?;
         let key = "replay.sampling.beta_updates";
         let why = "beta rises over at least one update";
-        check(beta_updates > 0, key, beta_updates, || why)
+        check(beta_updates > 0, key, beta_updates, why)
     }
 }
 

@@ -4,7 +4,7 @@
 use driml_protocol::{
     BatchHeader, RunSpec, Sampling, TRANSITION_BYTES,
     codec::{PAYLOAD_BYTES_MAX, VALUE_BYTES_MAX},
-    config::{ConfigError, check},
+    config::{ConfigError, check, check_range},
 };
 use serde::{Deserialize, Serialize};
 
@@ -121,15 +121,14 @@ impl Config {
 
     /// Checks that no disk setting is given for a replay in memory. `keep_flags` names the flags that would keep the replay on disk.
     pub fn check_in_memory(&self, keep_flags: &str) -> Result<(), ConfigError> {
+        let why = format!(
+            "this replay is only in memory; add {keep_flags} to keep it on disk, or leave the setting out"
+        );
         for (key, set) in [
             ("replay.disk_bytes_max", self.disk_bytes_max),
             ("replay.fsync_ms", self.fsync_ms),
         ] {
-            check(set.is_none(), key, set.unwrap_or(0), || {
-                format!(
-                    "this replay is only in memory; add {keep_flags} to keep it on disk, or leave the setting out"
-                )
-            })?;
+            check(set.is_none(), key, set.unwrap_or(0), &why)?;
         }
         Ok(())
     }
@@ -139,11 +138,10 @@ impl Config {
         let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
         let is_prioritised = self.sampling.is_prioritised();
         let fits = !is_prioritised || capacity / u64::from(self.shards) <= PRIORITIES_MAX;
-        check(fits, key, capacity, || {
-            format!(
-                "each shard of a prioritised replay on disk holds at most {PRIORITIES_MAX}: hold fewer, use more shards, or keep it in memory"
-            )
-        })
+        let why = format_args!(
+            "each shard of a prioritised replay on disk holds at most {PRIORITIES_MAX}: hold fewer, use more shards, or keep it in memory"
+        );
+        check(fits, key, capacity, why)
     }
 
     /// Checks every value, alone and against `batch_size`, the rows of the learner's batches.
@@ -156,68 +154,58 @@ impl Config {
         let (warmup, slack) = (self.warmup_transitions, self.slack_transitions);
         let is_ratio = ratio.is_finite() && ratio > 0.0;
         let why = "rows per transition must be a number above 0";
-        check(is_ratio, "replay.replay_ratio", ratio, || why)?;
+        check(is_ratio, "replay.replay_ratio", ratio, why)?;
         self.sampling.validate()?;
         let rows_max = rows_max(spec, &self.sampling);
-        let fits = (1..=rows_max).contains(&batch_size);
-        check(fits, "learner.batch_size", batch_size, || {
-            format!("a batch of this run has 1 to {rows_max} rows")
-        })?;
-        let fits = (1..=SHARDS_MAX).contains(&self.shards);
-        check(fits, "replay.shards", self.shards, || {
-            format!("a replay has 1 to {SHARDS_MAX} shards")
-        })?;
+        let why = format_args!("a batch of this run has 1 to {rows_max} rows");
+        check_range("learner.batch_size", batch_size, 1..=rows_max, why)?;
+        let why = format_args!("a replay has 1 to {SHARDS_MAX} shards");
+        check_range("replay.shards", self.shards, 1..=SHARDS_MAX, why)?;
         let window = u64::from(lookahead_steps(spec)) + u64::from(spec.frame_stack);
         let fits = capacity / u64::from(self.shards) >= window;
-        check(fits, "replay.capacity_transitions", capacity, || {
-            format!(
-                "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each environment"
-            )
-        })?;
+        let why = format_args!(
+            "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each environment"
+        );
+        check(fits, "replay.capacity_transitions", capacity, why)?;
         let bytes = capacity.checked_mul(spec.frame_bytes() as u64);
         let fits = bytes.is_some_and(|bytes| bytes <= isize::MAX as u64);
         let why = "this many frames exceed any machine's address space; hold fewer";
-        check(fits, "replay.capacity_transitions", capacity, || why)?;
+        check(fits, "replay.capacity_transitions", capacity, why)?;
         if let Some(max) = self.compressed_bytes_max {
             let key = "replay.compressed_bytes_max";
             let fits = self.compression != Compression::None;
             let why = "nothing is compressed; use compression = \"lz4\", or capacity_transitions";
-            check(fits, key, max, || why)?;
+            check(fits, key, max, why)?;
             let least = window * spec.frame_bytes() as u64 * u64::from(self.shards);
-            check(max >= least, key, max, || {
-                format!(
-                    "one sample spans {window} transitions, which may not compress; use at least {least}"
-                )
-            })?;
+            let why = format_args!(
+                "one sample spans {window} transitions, which may not compress; use at least {least}"
+            );
+            check(max >= least, key, max, why)?;
         }
         if let Some(max) = self.disk_bytes_max {
             let least = disk_bytes_min(spec, self);
-            check(max >= least, "replay.disk_bytes_max", max, || {
-                format!(
-                    "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
-                )
-            })?;
+            let why = format_args!(
+                "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
+            );
+            check(max >= least, "replay.disk_bytes_max", max, why)?;
         }
         let fits = warmup <= capacity;
-        check(fits, "replay.warmup_transitions", warmup, || {
-            format!(
-                "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {capacity}"
-            )
-        })?;
+        let why = format_args!(
+            "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {capacity}"
+        );
+        check(fits, "replay.warmup_transitions", warmup, why)?;
         let batch = (f64::from(batch_size) / ratio).ceil();
         let fits = slack as f64 * ratio >= f64::from(batch_size);
-        check(fits, "replay.slack_transitions", slack, || {
-            format!(
-                "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {batch}"
-            )
-        })?;
+        let why = format_args!(
+            "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {batch}"
+        );
+        check(fits, "replay.slack_transitions", slack, why)?;
         if let (Some(max), None) = (self.transitions_max, self.since) {
             let least = warmup as f64 + batch;
-            check(max as f64 >= least, "replay.transitions_max", max, || {
-                format!(
-                    "the run would end before its first batch; use at least warmup_transitions + learner.batch_size / replay_ratio = {least}"
-                )
-            })?;
+            let why = format_args!(
+                "the run would end before its first batch; use at least warmup_transitions + learner.batch_size / replay_ratio = {least}"
+            );
+            check(max as f64 >= least, "replay.transitions_max", max, why)?;
         }
         Ok(())
     }

@@ -61,9 +61,8 @@ impl Replay {
     ) -> Result<Self, ConfigError> {
         config.validate(spec, batch_size)?;
         let shards = config.shards;
-        check(shard < shards, "replay.shards", shards, || {
-            format!("there is no shard {shard}; the first is shard 0")
-        })?;
+        let why = format_args!("there is no shard {shard}; the first is shard 0");
+        check(shard < shards, "replay.shards", shards, why)?;
         let shards = u64::from(config.shards);
         let capacity = config.capacity_transitions / shards;
         let bytes_max = config.compressed_bytes_max.map(|bytes| bytes / shards);
