@@ -9,9 +9,8 @@ use zenoh::{
 };
 
 use crate::{
-    session::{self, PendingBytes, SessionError},
+    session::{self, PendingReply, SessionError},
     wire::{
-        buffers::{Buffer, BufferPool},
         codec,
         error::CodecError,
         keys::{Keys, Peer},
@@ -142,12 +141,8 @@ impl RunClient {
         payload: ZBytes,
         timeout: Duration,
     ) -> Result<PendingReply<M>, SessionError> {
-        let bytes = session::send(&self.session, &key, payload, K::PRIORITY, timeout)?;
-        Ok(PendingReply {
-            bytes,
-            spec_hash: self.spec_hash,
-            message: PhantomData,
-        })
+        let (session, hash) = (&self.session, Some(self.spec_hash));
+        session::send(session, key, payload, K::PRIORITY, timeout, hash)
     }
 
     /// Publishes a message to all current subscribers. A message that is lost on the way is not sent again.
@@ -181,36 +176,4 @@ impl RunClient {
         let token = self.session.liveliness();
         token.declare_token(self.keys.liveliness_key(who)).wait()
     }
-}
-
-/// A reply that has yet to arrive.
-#[derive(Debug)]
-pub struct PendingReply<M> {
-    bytes: PendingBytes,
-    spec_hash: u64,
-    message: PhantomData<fn() -> M>,
-}
-
-impl<M: Message> PendingReply<M> {
-    /// Waits for a reply without a payload.
-    pub fn wait(mut self) -> Result<M, SessionError> {
-        self.bytes.wait_for(|bytes| decode(bytes, self.spec_hash))
-    }
-
-    /// Waits for the reply for at most `wait_max`; returns `None` if it has not arrived by then.
-    pub fn wait_within(&mut self, wait_max: Duration) -> Result<Option<M>, SessionError> {
-        let read = |bytes: &ZBytes| decode(bytes, self.spec_hash);
-        self.bytes.wait_for_within(wait_max, read)
-    }
-
-    /// Waits for the reply and copies its payload into private memory from `pool`.
-    pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
-        self.bytes.wait_for(|bytes| {
-            codec::decode_from(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))
-        })
-    }
-}
-
-fn decode<M: Message>(bytes: &ZBytes, spec_hash: u64) -> Result<M, CodecError> {
-    codec::decode(&bytes.to_bytes(), Some(spec_hash)).map(|(message, _)| message)
 }

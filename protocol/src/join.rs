@@ -11,7 +11,6 @@ use crate::{
     process::{log_limiter::LogLimiter, shutdown::Shutdown, silence::Silence},
     session::{self, SessionError},
     wire::{
-        codec,
         keys::Keys,
         message::{Keyed, Request},
     },
@@ -61,8 +60,7 @@ pub fn fetch_run_info_once(
     wait_max: Duration,
 ) -> Result<RunInfo, SessionError> {
     let (key, nothing) = (keys.key::<RunInfo>(), ZBytes::new());
-    session::send(session, &key, nothing, RunInfo::PRIORITY, wait_max)?
-        .wait_for(|bytes| codec::decode(&bytes.to_bytes(), None).map(|(run_info, _)| run_info))
+    session::send::<RunInfo>(session, key, nothing, RunInfo::PRIORITY, wait_max, None)?.wait()
 }
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.

@@ -38,7 +38,7 @@ mod run_spec;
 mod sampling;
 mod wire;
 
-pub use client::{EncodedMessage, PendingReply, RunClient};
+pub use client::{EncodedMessage, RunClient};
 pub use messages::{
     affinity::AffinityUpdate,
     batch::{Batch, NO_ACTION, RowScalars},
@@ -70,6 +70,7 @@ pub use process::{
 pub use query_workers::{Incoming, Responder, answer_queries};
 pub use run_spec::{FRAME_STACK_MAX, Horizon, RunSpec, TimeoutRule};
 pub use sampling::Sampling;
+pub use session::PendingReply;
 pub use wire::{
     buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},

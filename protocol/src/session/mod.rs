@@ -7,8 +7,8 @@ use std::{sync::Arc, time::Duration};
 
 use zenoh::{Session, Wait};
 
-pub(crate) use requests::{PendingBytes, reply_error, send};
-pub use requests::{SessionError, answer, ask};
+pub use requests::{PendingReply, SessionError, answer, ask};
+pub(crate) use requests::{reply_error, send};
 
 use crate::{
     process::shutdown::Shutdown,

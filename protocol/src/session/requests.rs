@@ -1,6 +1,9 @@
 //! Sends requests over a session, answers them, and defines why either may fail.
 
-use std::time::{Duration, Instant};
+use std::{
+    marker::PhantomData,
+    time::{Duration, Instant},
+};
 
 use zenoh::{
     Session, Wait,
@@ -14,7 +17,12 @@ use crate::{
     messages::recovering::Recovering,
     reach::Unreachable,
     tls::TlsError,
-    wire::{codec, error::CodecError},
+    wire::{
+        buffers::{Buffer, BufferPool},
+        codec,
+        error::CodecError,
+        message::Message,
+    },
 };
 
 /// Why a message could not be exchanged.
@@ -42,24 +50,29 @@ pub enum SessionError {
 /// zenoh's error reply if no process replies in time.
 const TIMEOUT_TEXT: &str = "Timeout";
 
+/// A reply of type `M` that has yet to arrive.
 #[derive(Debug)]
-pub(crate) struct PendingBytes {
+pub struct PendingReply<M> {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
+    /// The hash of the run that the reply must belong to, if this process knows it.
+    spec_hash: Option<u64>,
     /// The error of the last reply, if no reply so far was accepted.
     failed: Option<SessionError>,
+    message: PhantomData<fn() -> M>,
 }
 
-pub(crate) fn send(
+pub(crate) fn send<M>(
     session: &Session,
-    key: &str,
+    key: String,
     payload: ZBytes,
     priority: Priority,
     timeout: Duration,
-) -> Result<PendingBytes, SessionError> {
+    spec_hash: Option<u64>,
+) -> Result<PendingReply<M>, SessionError> {
     let replies = session
-        .get(key)
+        .get(&key)
         .payload(payload)
         // Queries foreign processes too: with a single target, zenoh might choose one of them.
         .target(QueryTarget::All)
@@ -69,17 +82,52 @@ pub(crate) fn send(
         .timeout(timeout)
         .wait()
         .map_err(|e| SessionError::Failed(format!("{key}: {e}")))?;
-    Ok(PendingBytes {
-        key: key.into(),
+    Ok(PendingReply {
+        key,
         timeout,
         replies,
+        spec_hash,
         failed: None,
+        message: PhantomData,
     })
 }
 
-impl PendingBytes {
+impl<M: Message> PendingReply<M> {
+    /// Waits for a reply without a payload.
+    pub fn wait(mut self) -> Result<M, SessionError> {
+        let spec_hash = self.spec_hash;
+        self.wait_for(|bytes| decode(bytes, spec_hash))
+    }
+
+    /// Waits for the reply for at most `wait_max`; returns `None` if it has not arrived by then.
+    pub fn wait_within(&mut self, wait_max: Duration) -> Result<Option<M>, SessionError> {
+        let (deadline, spec_hash) = (Instant::now() + wait_max, self.spec_hash);
+        loop {
+            let reply = match self.replies.recv_deadline(deadline) {
+                Ok(None) => return Ok(None),
+                Ok(reply) => reply,
+                Err(_) => None,
+            };
+            if let Some(answer) = self.read(reply, |bytes| decode(bytes, spec_hash))? {
+                return Ok(Some(answer));
+            }
+        }
+    }
+
+    /// Waits for the reply and copies its payload into private memory from `pool`.
+    pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
+        let spec_hash = self.spec_hash;
+        self.wait_for(|bytes| codec::decode_from(bytes.reader(), bytes.len(), pool, spec_hash))
+    }
+}
+
+fn decode<M: Message>(bytes: &ZBytes, spec_hash: Option<u64>) -> Result<M, CodecError> {
+    codec::decode(&bytes.to_bytes(), spec_hash).map(|(message, _)| message)
+}
+
+impl<M> PendingReply<M> {
     /// Waits for the first reply that `read` accepts. Without certificates, foreign processes may reply too.
-    pub(crate) fn wait_for<T>(
+    fn wait_for<T>(
         &mut self,
         read: impl Fn(&ZBytes) -> Result<T, CodecError>,
     ) -> Result<T, SessionError> {
@@ -87,25 +135,6 @@ impl PendingBytes {
             let reply = self.replies.recv().ok();
             if let Some(answer) = self.read(reply, &read)? {
                 return Ok(answer);
-            }
-        }
-    }
-
-    /// Like [`PendingBytes::wait_for`] for at most `wait_max`; returns `None` if no such reply has arrived by then.
-    pub(crate) fn wait_for_within<T>(
-        &mut self,
-        wait_max: Duration,
-        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
-    ) -> Result<Option<T>, SessionError> {
-        let deadline = Instant::now() + wait_max;
-        loop {
-            let reply = match self.replies.recv_deadline(deadline) {
-                Ok(None) => return Ok(None),
-                Ok(reply) => reply,
-                Err(_) => None,
-            };
-            if let Some(answer) = self.read(reply, &read)? {
-                return Ok(Some(answer));
             }
         }
     }
@@ -153,7 +182,8 @@ pub fn ask(
     priority: Priority,
     timeout: Duration,
 ) -> Result<ZBytes, SessionError> {
-    send(session, key, payload, priority, timeout)?.wait_for(|bytes| Ok(bytes.clone()))
+    send::<()>(session, key.into(), payload, priority, timeout, None)?
+        .wait_for(|bytes| Ok(bytes.clone()))
 }
 
 /// Answers `query` with `payload`. If the requester has gone away, this is logged and ignored.
