@@ -119,7 +119,8 @@ impl BatchSampler {
         let (mut frames, mut stacks) = (Vec::new(), Vec::new());
         let mut places = HashMap::new();
         for &NeededFrame { row, index } in states {
-            for index in self.rules.stack_indices(ring, index) {
+            let stack = self.rules.stack_indices(ring, index);
+            for index in stack.expect("an anchor whose stack is held") {
                 let place = places.entry(index).or_insert_with(|| {
                     frames.push(NeededFrame { row, index });
                     frames.len() as u32 - 1

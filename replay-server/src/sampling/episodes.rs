@@ -76,38 +76,28 @@ impl AnchorRules {
     /// Whether the held transition `t` can be an anchor apart from the steps after it: it has a return, and its stack's frames are held.
     pub(crate) fn has_return_and_stack(&self, ring: &Ring, t: u64) -> bool {
         let timed_out = ring.step(t).end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap;
-        !timed_out && self.stack_is_held(ring, t)
+        !timed_out && self.stack_indices(ring, t).is_some()
     }
 
-    fn stack_is_held(&self, ring: &Ring, t: u64) -> bool {
-        let mut index = t;
-        for _ in 1..self.frame_stack {
-            match ring.previous(index) {
-                Previous::Start => return true,
-                Previous::Held(previous) => index = previous,
-                Previous::Gone => return false,
-            }
-        }
-        true
-    }
-
-    /// Returns the ring indices of the frames that make the state at `index`, oldest first.
+    /// Returns the ring indices of the frames that make the state at `index`, oldest first; `None` if one of them is gone. If an anchor's
+    /// stack is held, so is that of every state of its window, as none reaches further back.
     ///
-    /// At the start of a level, the level's first frame also takes the places of the frames before it. The stack must be held. That is true
-    /// for every state of a window, as no state's stack reaches further back than the anchor's.
-    pub(crate) fn stack_indices(&self, ring: &Ring, mut index: u64) -> impl Iterator<Item = u64> {
+    /// At the start of a level, the level's first frame also takes the places of the frames before it.
+    pub(crate) fn stack_indices(
+        &self,
+        ring: &Ring,
+        mut index: u64,
+    ) -> Option<impl Iterator<Item = u64>> {
         let mut indices = [index; FRAME_STACK_MAX as usize];
         for slot in (0..self.frame_stack - 1).rev() {
             match ring.previous(index) {
                 Previous::Start => {}
                 Previous::Held(previous) => index = previous,
-                Previous::Gone => {
-                    unreachable!("the stack of {index} was checked with its anchor")
-                }
+                Previous::Gone => return None,
             }
             indices[slot] = index;
         }
-        indices.into_iter().take(self.frame_stack)
+        Some(indices.into_iter().take(self.frame_stack))
     }
 }
 
