@@ -129,11 +129,6 @@ impl BlockLayout {
         1 + PARTS_MAX * self.part_frames
     }
 
-    /// Returns the number of parts of a block of `frames` frames, key included.
-    const fn part_count(&self, frames: usize) -> usize {
-        1 + (frames - 1).div_ceil(self.part_frames)
-    }
-
     /// Returns the part that holds a frame of the block; 0 is the key.
     pub(crate) const fn part_of(&self, frame: usize) -> usize {
         frame.div_ceil(self.part_frames)
@@ -157,7 +152,7 @@ impl Block {
         let count = frames.len() / layout.frame_bytes;
         let (mut bytes, mut scratch) = (Vec::new(), Vec::new());
         let mut part_ends = [0; 1 + PARTS_MAX];
-        let parts = layout.part_count(count);
+        let parts = 1 + layout.part_of(count - 1);
         for (part, end) in part_ends.iter_mut().enumerate().take(parts) {
             let range = layout.frames_in_part(part, count);
             let plain = &frames[range.start * layout.frame_bytes..range.end * layout.frame_bytes];
