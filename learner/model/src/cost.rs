@@ -130,20 +130,11 @@ mod tests {
         dueling.head.dueling = true;
         let of_head = |config: &ModelConfig| {
             let layers = config.layer_costs().into_iter();
-            let layers: Vec<_> = layers.filter(|layer| layer.is_in("head")).collect();
-            let sum = |cost: fn(&LayerCost) -> u64| layers.iter().map(cost).sum::<u64>();
-            let names: Vec<_> = layers.iter().map(|layer| layer.name.clone()).collect();
-            (
-                sum(|it| it.parameters),
-                sum(|it| it.forward),
-                sum(|it| it.backward),
-                names,
-            )
+            let costs = layers.filter(|layer| layer.is_in("head"));
+            let costs = costs.map(|layer| (layer.forward, layer.backward));
+            costs.fold((0, 0), |sum, cost| (sum.0 + cost.0, sum.1 + cost.1))
         };
-        let (plain, dueling) = (of_head(&plain), of_head(&dueling));
-        assert_eq!((plain.1, plain.2), (dueling.1, dueling.2));
-        assert_eq!(dueling.0 - plain.0, 6 * 7 + 6);
-        assert_eq!(dueling.3, ["head.value", "head.advantage"]);
+        assert_eq!(of_head(&plain), of_head(&dueling));
     }
 
     /// The residual network of the Procgen paper on 64 x 64 x 3: maps of 64 x 64, and pooled 32 x 32, 16 x 16 and 8 x 8.

@@ -422,11 +422,8 @@ mod tests {
     fn shards_that_do_not_make_one_replay_are_refused() {
         let run_info = |config: &str, shard| RunInfo {
             config_toml: config.into(),
-            inserted_total: 0,
-            has_learner: false,
-            after_updates: 0,
             shard,
-            shared_memory: true,
+            ..RunInfo::default()
         };
         let connect = ["a".to_owned(), "b".to_owned()];
         let said = |run_infos: &[RunInfo]| single_run(&connect, run_infos).unwrap_err().to_string();
