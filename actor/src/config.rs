@@ -209,16 +209,12 @@ impl Config {
             let range = 2..=ACTORS_MAX;
             check_range("actor.epsilon_ladder.actors", ladder.actors, range, why)?;
         }
+        let why = "a wait lasts 100 ms to one day";
         for (key, wait) in [
             ("actor.ack_timeout_ms", self.ack_timeout_ms),
             ("actor.unreachable_max_ms", self.unreachable_max_ms),
         ] {
-            check_range(
-                key,
-                wait,
-                100..=86_400_000,
-                "a wait lasts 100 ms to one day",
-            )?;
+            check_range(key, wait, 100..=86_400_000, why)?;
         }
         Ok(())
     }
