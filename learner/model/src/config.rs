@@ -133,24 +133,19 @@ impl ModelConfig {
     /// `v_max`, either beyond +-1e30, no convolution or stage, a setting of another torso, or an invalid loss layer name.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
-        let check = |name: &str, size: usize| match size {
-            1..=DIMENSION_MAX => Ok(()),
-            _ => fail(format!("{name} is {size}, must be 1 to {DIMENSION_MAX}")),
+        let check_within = |max: usize, name: &str, size: usize| match (1..=max).contains(&size) {
+            true => Ok(()),
+            false => fail(format!("{name} is {size}, must be 1 to {max}")),
         };
+        let check = |name: &str, size| check_within(DIMENSION_MAX, name, size);
         check("height", self.height)?;
         check("width", self.width)?;
         check("input_channels", self.input_channels)?;
-        check("num_actions", self.num_actions)?;
+        check_within(ACTIONS_MAX, "num_actions", self.num_actions)?;
         check("atoms", self.atoms)?;
         check("hidden", self.hidden)?;
         check("embedding_dim", self.embedding_dim)?;
         check("action_embed", self.action_embed)?;
-        if self.num_actions > ACTIONS_MAX {
-            return fail(format!(
-                "num_actions is {}, must be 1 to {ACTIONS_MAX}",
-                self.num_actions
-            ));
-        }
         if self.atoms < 2 {
             return fail(format!("atoms is {}, must be at least 2", self.atoms));
         }
