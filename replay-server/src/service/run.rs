@@ -9,8 +9,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, Request, RunClient, RunSpec,
-    Sampling, Shutdown, answer_queries,
+    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, Recovering, Request, RunClient,
+    RunSpec, Sampling, Shutdown, answer_queries,
     config::{Settings, TransportConfig},
     fail_point, join_within,
     session::{self, Endpoints},
@@ -299,7 +299,10 @@ impl<'a> Queries<'a> {
         let gate = self.gate.clone();
         let answer = move |incoming: Incoming<R>| match gate.service.get() {
             Some(service) => answer(service, incoming),
-            None => incoming.into_responder().retry_later(&gate.retry_reply()),
+            None => incoming.into_responder().retry_later(&Recovering {
+                progress: gate.recovery.progress(),
+                config_toml: gate.config_toml.clone(),
+            }),
         };
         let gate = self.gate.clone();
         let reject_long = move |bytes| match gate.service.get() {
@@ -327,12 +330,14 @@ fn watch_members(
     let (sender, receiver) = mpsc::channel::<(Peer, SampleKind)>();
     let next = move || {
         fail_point::reach("members");
-        receiver.recv().ok()
+        receiver.recv()
     };
     let thread = std::thread::Builder::new()
         .name("members".into())
         .spawn(move || {
-            std::iter::from_fn(next).for_each(|(who, kind)| service.update_connection(who, kind));
+            while let Ok((who, kind)) = next() {
+                service.update_connection(who, kind);
+            }
         })?;
     let subscriber = client
         .session()

@@ -9,8 +9,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiter, Recovering, Request,
-    Responder, RunClient, Shutdown, lock,
+    BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiter, Request, Responder,
+    RunClient, Shutdown, lock,
 };
 
 use super::{
@@ -169,15 +169,6 @@ pub(super) struct ServiceGate {
     pub(super) service: OnceLock<Arc<Service>>,
     pub(super) recovery: RecoveryControl,
     pub(super) config_toml: String,
-}
-
-impl ServiceGate {
-    pub(super) fn retry_reply(&self) -> Recovering {
-        Recovering {
-            progress: self.recovery.progress(),
-            config_toml: self.config_toml.clone(),
-        }
-    }
 }
 
 #[cfg(test)]
