@@ -107,25 +107,21 @@ impl Player {
         self
     }
 
-    /// Plays whole episodes on the given levels. Returns their returns; none if the world does not have these levels. Once `is_over` returns
-    /// true, the rest is not played.
+    /// Plays whole episodes on the given levels. Returns their returns. Once `is_over` returns true, the rest is not played.
     ///
     /// # Errors
-    /// The policy or the world failed, or episodes do not end.
-    pub fn play_levels(
+    /// The world does not have these levels; the policy or the world failed, or episodes do not end.
+    pub fn returns(
         &self,
         policy_kind: PolicyKind,
         levels: Levels,
-        episodes: u32,
+        episodes: usize,
         seed: u64,
         is_over: impl Fn() -> bool,
-    ) -> anyhow::Result<Option<Vec<f64>>> {
-        let Ok(world) = world_with_levels(&self.config.world, levels) else {
-            return Ok(None);
-        };
+    ) -> anyhow::Result<Vec<f64>> {
+        let world = world_with_levels(&self.config.world, levels)?;
         let watch = &mut stop_when(is_over);
-        let played = self.play(policy_kind, &world, episodes as usize, seed, watch);
-        played.map(Some)
+        self.play(policy_kind, &world, episodes, seed, watch)
     }
 
     /// Plays whole episodes in `world`, which is the run's world, perhaps with other levels. Returns their returns. `watch` sees every
@@ -199,9 +195,7 @@ pub fn random_returns(
 }
 
 /// A watcher that ends the play once `is_over` returns true.
-pub(crate) fn stop_when(
-    is_over: impl Fn() -> bool,
-) -> impl FnMut(&Step<'_>, &[f64]) -> ControlFlow<()> {
+fn stop_when(is_over: impl Fn() -> bool) -> impl FnMut(&Step<'_>, &[f64]) -> ControlFlow<()> {
     move |_: &Step<'_>, _: &[f64]| match is_over() {
         true => ControlFlow::Break(()),
         false => ControlFlow::Continue(()),

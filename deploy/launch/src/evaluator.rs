@@ -14,7 +14,7 @@ use driml_settings::config::{EvaluationConfig, RunConfig};
 use crate::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice, checkpoint_path, read_config},
     console::Screen,
-    evaluate::{Levels, Player, PolicyKind, stop_when, world_with_levels},
+    evaluate::{Levels, Player, PolicyKind},
     managed_process::ManagedProcess,
     output::check_file,
     run_folder::{Candidate, EvaluationRow, RunFolder},
@@ -54,10 +54,8 @@ pub fn evaluate_and_keep(
     let candidate = Candidate::read(&path)?;
     let evaluate = |path: &Path| -> anyhow::Result<EvaluationRow> {
         let player = Player::load_checkpoint(read_config(folder)?, path, WeightsChoice::default())?;
-        let world = world_with_levels(&player.config.world, Levels::Train)?;
-        let count = episodes as usize;
-        let watch = &mut stop_when(is_stopped);
-        let returns = player.play(PolicyKind::Agent, &world, count, SELECTION_SEED, watch)?;
+        let (agent, count) = (PolicyKind::Agent, episodes as usize);
+        let returns = player.returns(agent, Levels::Train, count, SELECTION_SEED, is_stopped)?;
         if returns.len() < count {
             return Err(Interrupted.into());
         }

@@ -9,7 +9,7 @@ use driml_settings::config::RunConfig;
 use crate::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice},
     console,
-    evaluate::{Levels, Player, PolicyKind, stop_when, world_with_levels},
+    evaluate::{Levels, Player, PolicyKind},
     run_folder::{LastPlay, ReturnInterval, RunFolder, Summary},
 };
 
@@ -50,15 +50,14 @@ pub(crate) fn play(
 fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<Option<LastPlay>> {
     let started = Instant::now();
     let player = Player::load(folder, CheckpointChoice::Newest, WeightsChoice::Average)?;
-    let world = world_with_levels(&player.config.world, Levels::Train)?;
-    let watch = &mut stop_when(|| is_stopped() || started.elapsed() > FIRST_BATCH_MAX);
+    let is_over = || is_stopped() || started.elapsed() > FIRST_BATCH_MAX;
     let (mut agent, mut random) = (Vec::new(), Vec::new());
     for batch in 0..BATCHES_MAX {
         // The next batch takes about as long as the mean batch before it.
         if batch > 0 && started.elapsed() * (batch + 1) > PLAY_MAX * batch {
             break;
         }
-        let mut play = |policy| player.play(policy, &world, BATCH, batch.into(), watch);
+        let play = |policy| player.returns(policy, Levels::Train, BATCH, batch.into(), is_over);
         let both = [play(PolicyKind::Agent)?, play(PolicyKind::Random)?];
         if both.iter().any(|returns| returns.len() < BATCH) {
             break;

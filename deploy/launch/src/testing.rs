@@ -53,6 +53,6 @@ pub(crate) fn untrained_player(world: &str, agent: &str) -> Player {
 }
 
 pub(crate) fn play_returns(player: &Player) -> Vec<f64> {
-    let played = player.play_levels(PolicyKind::Agent, Levels::Train, 4, 3, || false);
-    played.unwrap().unwrap()
+    let played = player.returns(PolicyKind::Agent, Levels::Train, 4, 3, || false);
+    played.unwrap()
 }

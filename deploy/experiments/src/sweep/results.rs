@@ -3,7 +3,7 @@
 
 use driml_launch::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice, read_config},
-    evaluate::{Levels, Player, PolicyKind, random_returns},
+    evaluate::{Levels, Player, PolicyKind, random_returns, world_with_levels},
     run_folder::RunFolder,
 };
 use driml_learner::checkpoint::{self, AVERAGE};
@@ -62,11 +62,13 @@ impl PlaySettings {
         let each = self.episodes.div_ceil(chosen.len().max(1) as u32);
         let returns = chosen.into_iter().map(|choice| {
             let player = Player::load(folder, choice, WeightsChoice::default())?;
-            let is_over = || progress.is_interrupted();
-            let returns =
-                player.play_levels(PolicyKind::Agent, self.levels, each, SEED, is_over)?;
+            if world_with_levels(&player.config.world, self.levels).is_err() {
+                return Ok(None);
+            }
+            let (agent, is_over) = (PolicyKind::Agent, || progress.is_interrupted());
+            let returns = player.returns(agent, self.levels, each as usize, SEED, is_over)?;
             progress.advance(0)?;
-            Ok(returns)
+            Ok(Some(returns))
         });
         let all = returns.collect::<anyhow::Result<Option<Vec<_>>>>()?;
         Ok(all.map(|all| all.concat()))
