@@ -3,7 +3,7 @@
 
 use std::{fs, path::Path};
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use driml_learner::{
     Compute,
     checkpoint::{METADATA_KEY, describe, read_description},
@@ -48,31 +48,21 @@ struct Exported {
 pub fn load(name: &Path) -> anyhow::Result<Option<Player>> {
     let shown = name.display().to_string();
     if let Some(game) = shown.strip_prefix(PREFIX) {
-        return load_built_in(BUILT_IN, game).map(Some);
+        let built_in = BUILT_IN.iter().find(|(known, _)| *known == game);
+        let (_, bytes) = built_in.with_context(|| {
+            let games = BUILT_IN.iter().map(|(known, _)| *known);
+            let near = did_you_mean(game, games.clone());
+            let known: Vec<_> = games.map(|it| format!("{PREFIX}{it}")).collect();
+            let known = known.join(", ");
+            usage!("no pretrained weights of {game:?}{near}; there are {known}")
+        })?;
+        return load_bytes(&shown, bytes).map(Some);
     }
     if name.extension().is_none_or(|it| it != EXTENSION) || name.is_dir() {
         return Ok(None);
     }
     let bytes = fs::read(name).map_err(|e| usage!("reading {shown}: {e}"))?;
     load_bytes(&shown, &bytes).map(Some)
-}
-
-fn load_built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
-    let games: Vec<_> = all.iter().map(|(game, _)| *game).collect();
-    let Some((_, bytes)) = all.iter().find(|(known, _)| *known == game) else {
-        let near = did_you_mean(game, games.iter().copied());
-        let known = match games.len() {
-            0 => "this program has none".into(),
-            _ => format!("there are {PREFIX}{}", games.join(&format!(", {PREFIX}"))),
-        };
-        bail!(usage!("no pretrained weights of {game:?}{near}; {known}"));
-    };
-    let player = load_bytes(&format!("{PREFIX}{game}"), bytes)?;
-    let world = &player.config.run.world;
-    if world.rsplit(':').next() != Some(game) {
-        bail!("{PREFIX}{game} holds weights of {world}");
-    }
-    Ok(player)
 }
 
 fn load_bytes(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
@@ -127,15 +117,22 @@ mod tests {
     use super::*;
     use crate::testing::{play_returns, untrained_player};
 
-    fn said(all: &[(&str, &[u8])], game: &str) -> String {
-        format!("{:#}", load_built_in(all, game).map(drop).unwrap_err())
+    fn said(bytes: &[u8]) -> String {
+        format!("{:#}", load_bytes("a.file", bytes).map(drop).unwrap_err())
     }
 
     #[test]
-    fn every_built_in_network_can_be_read() {
-        for (game, _) in BUILT_IN {
-            load_built_in(BUILT_IN, game).unwrap();
+    fn every_built_in_network_is_of_its_game() {
+        for (game, bytes) in BUILT_IN {
+            let player = load_bytes(game, bytes).unwrap();
+            assert_eq!(player.config.run.world, format!("procgen:{game}"));
         }
+        let said = load(Path::new("pretrained:bigfsh")).map(drop).unwrap_err();
+        assert_eq!(
+            said.to_string(),
+            "no pretrained weights of \"bigfsh\" (did you mean \"bigfish\"?); there are pretrained:bigfish, pretrained:coinrun, \
+             pretrained:fruitbot, pretrained:starpilot"
+        );
     }
 
     #[test]
@@ -143,7 +140,7 @@ mod tests {
         let player = untrained_player("chain", "driml-ada");
         let bytes = export(&player).unwrap();
         assert_eq!(bytes, export(&player).unwrap());
-        let read = load_built_in(&[("chain", &bytes[..])], "chain").unwrap();
+        let read = load_bytes("x", &bytes).unwrap();
         assert_eq!((read.updates, read.weights_name()), (7, "averaged"));
         assert_eq!(read.config.run, player.config.run);
         for (name, var) in read.network.iter() {
@@ -158,7 +155,7 @@ mod tests {
         }
         assert_eq!(play_returns(&read).len(), 4);
         // Exporting what was read rounds nothing again.
-        let again = load_built_in(&[("chain", &export(&read).unwrap()[..])], "chain").unwrap();
+        let again = load_bytes("x", &export(&read).unwrap()).unwrap();
         assert_eq!(play_returns(&read), play_returns(&again));
         assert_eq!(play_returns(&read), play_returns(&read.with_f32()));
     }
@@ -166,26 +163,7 @@ mod tests {
     #[test]
     fn what_does_not_fit_names_both_sides() {
         let bytes = export(&untrained_player("chain", "c51")).unwrap();
-        let other = export(&untrained_player("mspacman", "c51")).unwrap();
-        let all: &[(&str, &[u8])] = &[("chain", &bytes[..]), ("ising", &other[..])];
-        for (all, game, why) in [
-            (
-                all,
-                "chian",
-                "no pretrained weights of \"chian\" (did you mean \"chain\"?); there are pretrained:chain, pretrained:ising",
-            ),
-            (
-                &[],
-                "chain",
-                "no pretrained weights of \"chain\"; this program has none",
-            ),
-            (all, "ising", "pretrained:ising holds weights of mspacman"),
-        ] {
-            assert_eq!(said(all, game), why);
-        }
-        assert!(
-            said(&[("chain", &bytes[..99])], "chain").contains("is damaged, or not a safetensors")
-        );
+        assert!(said(&bytes[..99]).contains("is damaged, or not a safetensors"));
 
         // Weights of one network beside the settings of another.
         let mut mixed = untrained_player("chain", "c51");
@@ -205,13 +183,12 @@ mod tests {
             let bytes = network
                 .to_described_safetensors(WeightDtype::F16, METADATA_KEY, &description.to_string())
                 .unwrap();
-            let text = said(&[("chain", &bytes[..])], "chain");
-            let is_told = text.contains(why) && text.contains("pretrained:chain");
-            assert!(is_told, "{text}");
+            let text = said(&bytes);
+            assert!(text.contains(why) && text.contains("a.file"), "{text}");
         }
         mixed.network = untrained_player("mspacman", "c51").network;
         let bytes = export(&mixed).unwrap();
-        let why = said(&[("chain", &bytes[..])], "chain");
+        let why = said(&bytes);
         assert!(why.contains("has shape") && why.contains("wanted"), "{why}");
     }
 }
