@@ -277,17 +277,6 @@ mod tests {
         view
     }
 
-    /// Scripts read the file by these names.
-    #[test]
-    fn the_columns_of_the_file_keep_their_names_and_their_order() {
-        let view = of_two_losses(ReplayStatus::default(), Some(LearnerStatus::default()));
-        let names: Vec<_> = csv_cells(&view).into_iter().map(|(name, _)| name).collect();
-        let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
-                      dim_3t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon";
-        assert!(names.join(",").starts_with(before), "{names:?}");
-        assert!(names.ends_with(&["rss_mib_actor_0", "rss_mib_actor_1"].map(String::from)));
-    }
-
     #[test]
     fn what_is_not_known_is_left_out() {
         let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = 7);

@@ -90,13 +90,4 @@ mod tests {
         let expected = "3.00 (one seed) 2.0 [-0.5, 4.5] +2.000 [-0.484, +4.484]";
         assert_eq!(printed, expected);
     }
-
-    #[test]
-    fn the_deviation_is_the_samples() {
-        let two = (2.0, Some(2.0_f64.sqrt()));
-        assert_eq!(mean_and_deviation(&[1.0, 3.0]), two);
-        assert_eq!(mean_and_deviation(&[4.0]), (4.0, None));
-        let texts = [None, Some(0.5)].map(describe_deviation);
-        assert_eq!(texts, ["", ", standard deviation 0.500"]);
-    }
 }
