@@ -74,9 +74,10 @@ impl TrainingEpisodes {
     }
 
     fn create(folder: &RunFolder, mut rows: Table, unknown: Option<u64>) -> anyhow::Result<Self> {
-        let known: Vec<Row> = rows.parse_rows().unwrap_or_default();
+        let path = folder.episodes();
+        let known: Vec<Row> = rows.parse_rows(&path)?;
         rows.header = HEADER.split(',').map(String::from).collect();
-        let table = AppendLog::create(&folder.episodes(), &rows.to_csv())?;
+        let table = AppendLog::create(&path, &rows.to_csv())?;
         let mut returns: Vec<_> = known.iter().filter_map(|it| it.episode_return).collect();
         let newest = returns.split_off(returns.len().saturating_sub(RETURNS_MAX));
         let last = known.last();
@@ -167,7 +168,8 @@ impl TrainingEpisodes {
     /// of shards that count more episodes than they have rows. The first `unknown` episodes do not count.
     fn set_received(&mut self, shards: &[ReplayStatus], rows: &Table, unknown: u64) {
         let mut rows_of_shards = vec![0; shards.len()];
-        for row in rows.parse_rows::<Row>().unwrap_or_default() {
+        let rows = rows.parse_rows::<Row>(&self.folder.episodes());
+        for row in rows.unwrap_or_default() {
             rows_of_shards[row.actor as usize % shards.len()] += u64::from(row.episode > unknown);
         }
         let mut unreceived: u64 = shards.iter().map(|it| it.episodes).sum();

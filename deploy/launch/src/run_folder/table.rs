@@ -12,7 +12,10 @@ use std::{
 
 use anyhow::Context;
 use csv::StringRecord;
-use driml_machine::{error::usage, units::count};
+use driml_machine::{
+    error::{Usage, usage},
+    units::count,
+};
 use driml_protocol::atomic_write;
 use serde::de::DeserializeOwned;
 
@@ -82,12 +85,18 @@ impl Table {
         csv_row(&self.header).into_iter().chain(rows).collect()
     }
 
-    /// The rows as `T`, whose fields have the names of the columns; none if a row does not fit.
-    pub(super) fn parse_rows<T: DeserializeOwned>(&self) -> Option<Vec<T>> {
+    /// The rows as `T`, whose fields have the names of the columns. The error names the file at `path` and the row that does not fit.
+    pub(super) fn parse_rows<T: DeserializeOwned>(&self, path: &Path) -> Result<Vec<T>, Usage> {
         let header = StringRecord::from(&self.header[..]);
-        let rows = self.rows.iter();
-        rows.map(|row| row.deserialize(Some(&header)).ok())
-            .collect()
+        let parse = |row: &StringRecord| {
+            row.deserialize(Some(&header)).map_err(|_| {
+                let of = path.file_stem().unwrap_or_default().display();
+                let row = row.iter().collect::<Vec<_>>().join(",");
+                let path = path.display();
+                usage!("{path}: {row:?} is not a row of {of}: correct or remove it")
+            })
+        };
+        self.rows.iter().map(parse).collect()
     }
 
     /// Keeps the rows for which `is_kept` returns true. The others are written into a new file beside `path`, which a printed line
@@ -97,21 +106,13 @@ impl Table {
         path: &Path,
         is_kept: impl Fn(T) -> bool,
     ) -> anyhow::Result<bool> {
-        let header = StringRecord::from(&self.header[..]);
+        let parsed = self.parse_rows(path)?;
         let mut set_aside = Self {
             header: self.header.clone(),
             rows: Vec::new(),
         };
-        for row in std::mem::take(&mut self.rows) {
-            let read = row.deserialize(Some(&header)).map_err(|_| {
-                let of = path.file_stem().unwrap_or_default().display();
-                let row = row.iter().collect::<Vec<_>>().join(",");
-                usage!(
-                    "{}: {row:?} is not a row of {of}: correct or remove it",
-                    path.display()
-                )
-            })?;
-            match is_kept(read) {
+        for (row, parsed) in std::mem::take(&mut self.rows).into_iter().zip(parsed) {
+            match is_kept(parsed) {
                 true => self.rows.push(row),
                 false => set_aside.rows.push(row),
             }
@@ -229,8 +230,6 @@ pub(super) fn csv_row<T: AsRef<[u8]>>(cells: impl IntoIterator<Item = T>) -> Vec
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use super::*;
 
     #[test]
@@ -247,20 +246,6 @@ mod tests {
         fs::write(&path, "frames,loss\n1\n").unwrap();
         let said = Table::read(&path).unwrap_err().to_string();
         assert!(said.ends_with("; correct or remove that line"), "{said}");
-    }
-
-    #[test]
-    fn rows_that_are_not_kept_stand_in_a_file_beside_the_table() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("x.csv");
-        let mut table = Table::parse(b"a,b\n1,2\n3,\"4, of five\"\n5,6\n").unwrap();
-        let is_kept = |row: BTreeMap<String, String>| row["a"] != "3";
-        table.keep_rows(&path, is_kept).unwrap();
-        assert_eq!(table.to_csv(), b"a,b\n1,2\n5,6\n");
-        let aside = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
-        assert_eq!(aside, b"a,b\n3,\"4, of five\"\n");
-        let log = AppendLog::create(&path, &table.to_csv()).unwrap();
-        assert_eq!((log.name.as_str(), log.unit), ("x.csv", "row"));
     }
 
     #[test]
