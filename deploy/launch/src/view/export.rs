@@ -3,7 +3,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    path::{Path, PathBuf},
+    path::Path,
 };
 
 use driml_machine::error::Usage;
@@ -50,26 +50,9 @@ pub(crate) fn run_json(view: &RunView) -> serde_json::Result<String> {
     Ok(serde_json::to_string(&answer)? + "\n")
 }
 
-/// The file for Prometheus, which is rewritten after each poll.
-pub(crate) struct PrometheusFile {
-    path: PathBuf,
-    has_warned: bool,
-}
-
-impl PrometheusFile {
-    pub(crate) fn new(path: &Path) -> Self {
-        Self {
-            path: path.into(),
-            has_warned: false,
-        }
-    }
-
-    /// Writes the file, whole or not at all. Returns an error the first time that it cannot be written.
-    pub(crate) fn write(&mut self, view: &RunView) -> Option<Usage> {
-        let text = prometheus_text(view);
-        let failed = write_file("--prometheus", &self.path, text.as_bytes()).err()?;
-        (!std::mem::replace(&mut self.has_warned, true)).then_some(failed)
-    }
+/// Writes the file for Prometheus, whole or not at all.
+pub(crate) fn write_prometheus(path: &Path, view: &RunView) -> Result<(), Usage> {
+    write_file("--prometheus", path, prometheus_text(view).as_bytes())
 }
 
 /// The text of the file. Labels on each line distinguish the runs of one machine.

@@ -8,7 +8,7 @@ mod poll;
 
 pub(crate) use self::{
     advice::{actions_needed, describe_recovery},
-    export::{PrometheusFile, run_json},
+    export::{run_json, write_prometheus},
     live::Display,
     page::status_page,
 };

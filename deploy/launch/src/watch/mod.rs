@@ -20,7 +20,7 @@ use crate::{
     run_folder::{
         Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_progress,
     },
-    view::{Poller, PrometheusFile, actions_needed, describe_recovery, run_json, status_page},
+    view::{Poller, actions_needed, describe_recovery, run_json, status_page, write_prometheus},
 };
 
 /// What `driml watch` does with a run.
@@ -113,10 +113,8 @@ pub fn run(found: anyhow::Result<Poller>, flags: &WatchFlags) -> anyhow::Result<
 fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     print_status(&mut poller, None, false, flags.json)?;
     poller.close();
-    if let Some(path) = &flags.prometheus
-        && let Some(failed) = PrometheusFile::new(path).write(&poller.view)
-    {
-        bail!(failed);
+    if let Some(path) = &flags.prometheus {
+        write_prometheus(path, &poller.view)?;
     }
     let needed = actions_needed(&poller.view).join("; ");
     ensure!(needed.is_empty(), "the run needs attention: {needed}");
@@ -155,9 +153,8 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
     poller.poll();
-    let mut file = flags.prometheus.as_deref().map(PrometheusFile::new);
-    if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-        bail!(failed);
+    if let Some(path) = &flags.prometheus {
+        write_prometheus(path, &poller.view)?;
     }
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
@@ -166,6 +163,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
         wait_until_known(&mut poller, &interrupted)?;
     }
     let mut watched = WatchedRun::new(&poller, folder.as_ref(), flags.tensorboard)?;
+    let mut has_warned = false;
     let ended = loop {
         match watched.show_and_record(&mut poller) {
             Ok(false) => {}
@@ -180,7 +178,10 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
             break Ok(Outcome::Interrupted);
         }
         poller.poll();
-        if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
+        if let Some(path) = &flags.prometheus
+            && let Err(failed) = write_prometheus(path, &poller.view)
+            && !std::mem::replace(&mut has_warned, true)
+        {
             watched.display.screen.print_line(&failed.0);
         }
     };
