@@ -61,7 +61,7 @@ macro_rules! columns {
 columns! {
     "seconds", "seconds", "run", "Time":
         "Time since the run began, without interruptions.",
-        Value::Counter(|it| it.seconds());
+        Value::Counter(|it| it.recorded_s.or_else(|| it.uptime_s()));
     "frames", "frames", "run", "Frames":
         "Transitions that the replay has stored.",
         Value::Counter(|it| Some(it.replay.transitions_inserted as f64));
@@ -124,7 +124,7 @@ columns! {
         Value::Words(|it| it.replay.waiting.to_string());
     "epsilon", "probability of a random action", "run", "Epsilon":
         "Probability of a random action; empty where actors differ in it.",
-        Value::Gauge(|it| it.epsilon());
+        Value::Gauge(|it| Some(it.plan.epsilon?.epsilon(it.replay.transitions_inserted)));
     "transitions_lost", "transitions", "faults", "Lost transitions":
         "Transitions that actors produced and that never arrived.",
         Value::Counter(|it| Some(it.replay.transitions_lost as f64));

@@ -291,16 +291,6 @@ impl RunView {
         is_known.then_some(&self.learner)
     }
 
-    /// Seconds since the run began. In a recorded run, the time between an interruption and the resume does not count.
-    pub(crate) fn seconds(&self) -> Option<f64> {
-        self.recorded_s.or_else(|| self.uptime_s())
-    }
-
-    /// The probability with which all actors act at random; none if they differ in it.
-    pub(crate) fn epsilon(&self) -> Option<f64> {
-        Some(self.plan.epsilon?.epsilon(self.replay.transitions_inserted))
-    }
-
     /// The learner's status for the metrics. In a recorded run this is its last status, even if it does not answer.
     pub(crate) fn learner_shown(&self) -> Option<&LearnerStatus> {
         match self.recorded_s {

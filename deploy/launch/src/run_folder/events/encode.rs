@@ -67,11 +67,10 @@ fn histogram(counts: &[u64]) -> Vec<u8> {
         sum += value as f64 * n as f64;
         squares += (value * value) as f64 * n as f64;
     }
-    let is_counted = |(_, n): &(usize, &u64)| **n > 0;
-    let least = counts.iter().enumerate().find(is_counted);
-    let most = counts.iter().enumerate().rfind(is_counted);
-    let [least, most] = [(least, -0.5), (most, 0.5)]
-        .map(|(found, half)| found.map_or(0.0, |(value, _)| value as f64 + half));
+    let least = counts.iter().position(|&n| n > 0);
+    let least = least.map_or(0.0, |value| value as f64 - 0.5);
+    let most = counts.iter().rposition(|&n| n > 0);
+    let most = most.map_or(0.0, |value| value as f64 + 0.5);
     let facts = [(1, least), (2, most), (3, total), (4, sum), (5, squares)];
     let facts = facts.map(|(field, value)| fixed(field, FIXED64, &f64::to_le_bytes(value)));
     // A first, empty bucket ends where the bucket of 0 begins.
