@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
 use driml_envs::EnvError;
 use driml_learner::{BatchPart, Learner, LearnerConfig, checkpoint};
@@ -57,9 +57,8 @@ impl SavedState {
     fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;
-        let bytes = checkpoint::read_companion(path)?.filter(|it| !it.is_empty());
-        let bytes = bytes
-            .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
+        // `resume::prepare` has checked that the checkpoint is of a run in lockstep.
+        let bytes = checkpoint::read_companion(path)?.unwrap_or_default();
         let content = bytes.strip_prefix(&SAVED_STATE_FORMAT.to_le_bytes()).with_context(|| {
             let path = path.display();
             usage!("{path} is a lockstep checkpoint of another version of driml: resume with that version")
@@ -122,12 +121,13 @@ impl Lockstep {
         let learner = Learner::new(settings, &compute)?.resume(&run_dir.checkpoints())?;
         let replay = open(config, run_dir, Some(saved.replay))?;
         let (actors, turn) = (saved.actors, saved.turn);
-        let (found, wanted) = (actors.len(), config.local.actors as usize);
+        let wanted = config.local.actors;
         let resuming = "resuming the actors from the checkpoint";
-        if found != wanted || turn.unwanted.len() != wanted || turn.next_actor >= wanted {
-            let found = count(found, "actor");
-            bail!("{resuming}: it holds {found}, and this run has {wanted}");
-        }
+        ensure!(
+            actors.len() == wanted as usize,
+            "{resuming}: it holds {}, and this run has {wanted}",
+            count(actors.len(), "actor")
+        );
         let mut this = Self::assemble(config, learner, replay, turn).context(resuming)?;
         for (actor, state) in this.actors.iter_mut().zip(actors) {
             actor.restore(state).context(resuming)?;
@@ -247,10 +247,7 @@ impl Lockstep {
                     break;
                 }
                 InsertReply::OutOfOrder { expected } => {
-                    bail!(
-                        "actor {id} is at chunk {}, not {expected}",
-                        chunk.header.sequence
-                    )
+                    bail!("actor {id} must continue at chunk {expected}")
                 }
                 InsertReply::Refused { why } => bail!("the replay rejected a chunk: {why}"),
             }
