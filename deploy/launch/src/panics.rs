@@ -27,8 +27,9 @@ pub fn abort_on_panic() {
                 std::thread::park();
             }
         }
+        // The paths of this program's own sources are relative to the root of the repository.
         let scarce = match panic.location() {
-            Some(place) if !is_own_source(place.file()) => limits::scarce_resources(),
+            Some(place) if place.file().starts_with('/') => limits::scarce_resources(),
             _ => Vec::new(),
         };
         write_stderr(&panic_line(panic, thread.name(), &scarce));
@@ -54,11 +55,6 @@ fn write_stderr(text: &str) {
     let _ = nix::unistd::write(std::io::stderr(), format!("{text}\n").as_bytes());
 }
 
-/// Whether a file is one of this program's own sources, whose paths are relative to the root of the repository.
-fn is_own_source(file: &str) -> bool {
-    !file.starts_with('/')
-}
-
 fn panic_line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]) -> String {
     let message = panic.payload();
     let text = message.downcast_ref::<String>().map(String::as_str);
@@ -81,7 +77,7 @@ mod tests {
     use std::{
         fs::File,
         os::unix::process::ExitStatusExt,
-        process::{Command, Output},
+        process::Command,
         sync::atomic::{AtomicBool, Ordering},
         time::{Duration, Instant},
     };
@@ -92,68 +88,59 @@ mod tests {
 
     pub(super) static STOPPED: AtomicBool = AtomicBool::new(false);
 
-    /// Set in the child process that panics, to `ends` if the process notes that it ends before the panic.
+    /// Set in the child process that panics, to the name of the case.
     const CHILD: &str = "DRIML_TEST_PANICS";
 
-    /// Runs one of these tests in a child process that panics, started by a shell script.
-    fn run_as_child(script: &str, name: &str, says: &str) -> Output {
-        let mut command = Command::new("sh");
-        command.args(["-c", script]);
-        command.arg(std::env::current_exe().unwrap());
-        command.args(["--exact", name, "--nocapture"]);
-        command.env(CHILD, says).output().unwrap()
-    }
-
-    #[test]
-    fn a_panic_while_the_process_ends_does_not_change_how() {
-        if let Ok(says) = std::env::var(CHILD) {
-            abort_on_panic();
-            if says == "ends" {
-                mark_process_ending();
-            }
-            let thread = std::thread::spawn(|| panic!("too late"));
-            let started = Instant::now();
-            while says == "ends" && started.elapsed() < Duration::from_secs(60) {
-                if STOPPED.load(Ordering::Acquire) {
-                    std::process::exit(3);
-                }
-                std::thread::yield_now();
-            }
-            // A backtrace may take longer.
-            let _ = thread.join();
-            std::process::exit(4);
-        }
-        let child = |says: &str| {
-            let name = "panics::tests::a_panic_while_the_process_ends_does_not_change_how";
-            let ended = run_as_child("exec \"$0\" \"$@\"", name, says);
-            let stderr = String::from_utf8(ended.stderr).unwrap();
-            (ended.status, stderr.contains("panicked at"))
-        };
-        let (status, said) = child("ends");
-        assert_eq!((status.code(), said), (Some(3), false));
-        let (status, said) = child("continues");
-        assert_eq!((status.signal(), said), (Some(6), true));
-    }
-
-    #[test]
-    fn a_library_s_panic_names_what_was_scarce() {
-        if std::env::var(CHILD).is_ok() {
-            abort_on_panic();
+    fn panic_in_child(case: &str) -> ! {
+        abort_on_panic();
+        if case == "library" {
             let pool = ShmProviderBuilder::default_backend(1 << 12).wait().unwrap();
             let open = || File::open("/dev/null").ok();
             let _files: Vec<_> = std::iter::from_fn(open).collect();
             // zenoh makes its metadata with the first allocation.
             let _ = pool.alloc(1).wait();
-            std::process::exit(5);
         }
-        let name = "panics::tests::a_library_s_panic_names_what_was_scarce";
-        let ended = run_as_child("ulimit -n 60 && exec \"$0\" \"$@\"", name, "");
-        assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
-        let stderr = String::from_utf8(ended.stderr).unwrap();
-        let mut lines = stderr.lines();
-        let line = lines.find(|line| line.starts_with("error: ")).unwrap();
-        assert!(line.contains("zenoh-shm"), "{line}");
+        if case == "ending" {
+            mark_process_ending();
+        }
+        let thread = std::thread::spawn(|| panic!("too late"));
+        let started = Instant::now();
+        while case == "ending" && started.elapsed() < Duration::from_secs(60) {
+            if STOPPED.load(Ordering::Acquire) {
+                std::process::exit(3);
+            }
+            std::thread::yield_now();
+        }
+        // A backtrace may take longer.
+        let _ = thread.join();
+        std::process::exit(4);
+    }
+
+    /// A library's panic also names what was scarce. While the process ends, a panic does not change how.
+    #[test]
+    fn a_panic_aborts_a_process_that_does_not_end_already() {
+        if let Ok(case) = std::env::var(CHILD) {
+            panic_in_child(&case);
+        }
         let scarce = "; the program aborts, and the system is short of this: 60 of at most 60 files are open: raise the limit";
-        assert!(line.contains(scarce), "{line}");
+        for (case, code, signal, said) in [
+            ("ending", Some(3), None, [""; 2]),
+            ("running", None, Some(6), [" panicked at ", ": too late; "]),
+            ("library", None, Some(6), ["zenoh-shm", scarce]),
+        ] {
+            let mut command = Command::new("sh");
+            command.args(["-c", "ulimit -n 60 && exec \"$0\" \"$@\""]);
+            command.arg(std::env::current_exe().unwrap());
+            let name = "panics::tests::a_panic_aborts_a_process_that_does_not_end_already";
+            command.args(["--exact", name, "--nocapture"]);
+            let ended = command.env(CHILD, case).output().unwrap();
+            let status = (ended.status.code(), ended.status.signal());
+            assert_eq!(status, (code, signal), "{ended:?}");
+            let stderr = String::from_utf8(ended.stderr).unwrap();
+            let line = stderr.lines().find(|line| line.starts_with("error: "));
+            let line = line.unwrap_or_default();
+            assert_eq!(line.is_empty(), said[0].is_empty(), "{stderr}");
+            assert!(said.iter().all(|it| line.contains(it)), "{stderr}");
+        }
     }
 }

@@ -82,7 +82,7 @@ impl Display {
         let position = frames.min(view.plan.frames_planned);
         self.screen.show(position, |is_bar| match is_bar {
             true => console::wrap(&texts.join("\n"), "  ", 0),
-            false => plain_line(self.began.elapsed(), &texts),
+            false => format!("{}  {}", duration(self.began.elapsed()), texts.join("  ")),
         });
     }
 
@@ -116,11 +116,6 @@ impl Display {
             ),
         ]
     }
-}
-
-/// The line of a display without a terminal, `elapsed` after the run began.
-fn plain_line(elapsed: Duration, texts: &[String]) -> String {
-    format!("{}  {}", duration(elapsed), texts.join("  "))
 }
 
 fn waiting_text(replay: &ReplayStatus) -> String {
