@@ -26,7 +26,7 @@ use crate::{
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_atomically},
-    run_view::{Plan, RunView, updates_served},
+    run_view::updates_served,
     view::{Display, Poller, ServerConnection},
 };
 
@@ -101,7 +101,7 @@ pub fn run(
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
-        poller: None,
+        poller: Poller::starting_at(config, Vec::new(), resume_point),
         recorder,
     };
 
@@ -149,11 +149,7 @@ impl Launch<'_> {
             }
             connections.push(connection?);
         }
-        let mut poller = Poller::new(self.config, connections);
-        let point = &self.resume_point;
-        poller.view = RunView::starting_at(poller.view.plan, point.frames, point.updates);
-        self.poller = Some(poller);
-
+        self.poller = Poller::starting_at(self.config, connections, self.resume_point);
         self.start_up_to(self.names.len())?;
         self.watch()
     }
@@ -166,8 +162,7 @@ impl Launch<'_> {
             }
             self.run_dir.check_intact()?;
             self.restart_dead()?;
-            let poller = self.poller.as_mut();
-            let poller = poller.expect("it was set before the run is watched");
+            let poller = &mut self.poller;
             poller.poll();
             let view = &poller.view;
             for (name, silence) in [
@@ -241,23 +236,20 @@ impl Launch<'_> {
         self.wait_for_final_checkpoint(&abort);
         let learner = self.processes.iter_mut().skip(shards).take(1);
         let mut others = stop_processes(learner, true, LEARNER_DRAIN_MAX, &abort);
-        if let Some(poller) = &mut self.poller {
-            if let Err(e) = poller.poll_replay() {
-                tracing::debug!("the replay server's last answer: {e:#}");
-            }
-            let fetch = |shard, since| poller.fetch_episodes(shard, since, true);
-            self.recorder.record_episodes(&poller.view, fetch);
-            // Closed before the replay server, which is the session's router: otherwise it would try to reconnect.
-            poller.close();
+        let poller = &mut self.poller;
+        if let Err(e) = poller.poll_replay() {
+            tracing::debug!("the replay server's last answer: {e:#}");
         }
+        let fetch = |shard, since| poller.fetch_episodes(shard, since, true);
+        self.recorder.record_episodes(&poller.view, fetch);
+        // Closed before the replay server, which is the session's router: otherwise it would try to reconnect.
+        poller.close();
         let servers = self.processes.iter_mut().take(shards);
         others.extend(stop_processes(servers, true, REPLAY_DRAIN_MAX, &abort));
         // By the last answers, all transitions are stored and learned from, and the result is saved.
-        let is_learned = |Poller { view, .. }: &Poller| {
-            let served = updates_served(self.config, view.replay.rows_sampled);
-            view.is_all_learned() && view.learner.updates >= served
-        };
-        let is_complete = finished || self.poller.as_ref().is_some_and(is_learned);
+        let view = &self.poller.view;
+        let served = updates_served(self.config, view.replay.rows_sampled);
+        let is_complete = finished || view.is_all_learned() && view.learner.updates >= served;
         let result = match watched {
             _ if is_complete => self.run_dir.check_intact().map(|()| Outcome::Finished),
             _ if abort() => Err(anyhow::anyhow!(
@@ -283,13 +275,13 @@ impl Launch<'_> {
 
     /// Tells the learner to stop, then polls its status until it reports that it has saved or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let learner = self.processes.get_mut(self.endpoints.len());
-        let (Some(learner), Some(poller)) = (learner, &mut self.poller) else {
+        let Some(learner) = self.processes.get_mut(self.endpoints.len()) else {
             return;
         };
         if learner.exit_status().is_some() {
             return;
         }
+        let poller = &mut self.poller;
         // Ask once before the signal: a learner that has finished may exit right after it.
         if let Err(e) = poller.poll_learner() {
             tracing::debug!("a question before the last: {e:#}");
@@ -314,15 +306,8 @@ impl Launch<'_> {
         outcome: Outcome,
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
-        let updates = self.resume_point.updates;
-        let no_view = &mut RunView::starting_at(Plan::new(self.config), 0, updates);
-        let view = match &mut self.poller {
-            None => no_view,
-            Some(poller) => {
-                self.recorder.record(&mut poller.view, &[]);
-                &mut poller.view
-            }
-        };
+        let view = &mut self.poller.view;
+        self.recorder.record(view, &[]);
         let logs = self.processes.iter().filter_map(|it| it.log.loss_message());
         let missing = console::join_losses(self.recorder.loss_messages().into_iter().chain(logs));
         missing.iter().for_each(|line| console::eprintln(line));

@@ -74,7 +74,8 @@ pub(super) struct Launch<'a> {
     pub(super) evaluator: Evaluator,
     pub(super) server_restarts: u32,
     pub(super) actor_restarts: u32,
-    pub(super) poller: Option<Poller>,
+    /// Has no connection until all replay servers listen.
+    pub(super) poller: Poller,
     /// Dropped last: until then its lock keeps other launchers out of the folder.
     pub(super) recorder: RunRecorder,
 }
@@ -151,9 +152,7 @@ impl Launch<'_> {
 
     /// Whether an actor has exited although frames are missing. Asks the replay server again, so that its answer is newer than the exit.
     fn is_actor_needed(&mut self) -> bool {
-        let Some(poller) = &mut self.poller else {
-            return false;
-        };
+        let poller = &mut self.poller;
         let actors = self.processes.iter_mut().skip(self.endpoints.len() + 1);
         let mut exits = actors.map(ManagedProcess::exit_status);
         if poller.view.replay.finished || !exits.any(|it| it.is_some()) {

@@ -16,6 +16,7 @@ use zenoh::{Session, Wait};
 
 use crate::{
     endpoint::DEFAULT_NAMESPACE,
+    run_folder::ResumePoint,
     run_view::{PAUSE_MIN, Plan, RunView, ServerAnswer},
 };
 
@@ -50,6 +51,18 @@ impl Poller {
             config: config.clone(),
             servers,
             polled: Instant::now(),
+        }
+    }
+
+    /// The same for a run that begins now, at `point`.
+    pub(crate) fn starting_at(
+        config: &RunConfig,
+        servers: Vec<ServerConnection>,
+        point: ResumePoint,
+    ) -> Self {
+        Self {
+            view: RunView::starting_at(Plan::new(config), point.frames, point.updates),
+            ..Self::new(config, servers)
         }
     }
 
@@ -126,9 +139,7 @@ impl Poller {
 
     /// Asks only the learner.
     pub fn poll_learner(&mut self) -> anyhow::Result<()> {
-        let first = self.servers.first();
-        let first = first.context("a run has at least one replay server")?;
-        let learner: LearnerStatus = first.client.fetch(ANSWER_MAX)?;
+        let learner: LearnerStatus = self.servers[0].client.fetch(ANSWER_MAX)?;
         self.view.set_learner(Some(learner));
         Ok(())
     }
