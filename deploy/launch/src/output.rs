@@ -81,14 +81,7 @@ mod tests {
         write_file("--out", &link, b"newer").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"newer");
         assert!(link.is_symlink());
-        for (path, why) in [
-            ("none/x", "No such file"),
-            ("", "Is a directory"),
-            ("a.csv/x", "Not a dir"),
-        ] {
-            let path = folder.path().join(path);
-            let said = check_file("--out", &path).unwrap_err().0;
-            assert!(said.starts_with("--out /") && said.contains(why), "{said}");
-        }
+        let said = check_file("--out", &path.join("x")).unwrap_err().0;
+        assert!(said.contains("Not a directory"), "{said}");
     }
 }
