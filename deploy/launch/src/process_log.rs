@@ -30,9 +30,8 @@ pub(crate) struct ProcessLog {
 #[derive(Debug)]
 struct LogState {
     file: AppendLog,
+    /// The last lines. They begin with the error line with which the process ended, if there is one: its causes may take several lines.
     tail: VecDeque<String>,
-    /// The error line with which the process ended, and how many lines followed it: the causes may take several lines.
-    error: Option<(String, usize)>,
 }
 
 impl ProcessLog {
@@ -43,7 +42,6 @@ impl ProcessLog {
         let state = LogState {
             file: AppendLog::open(&path, format!("the log of {name}"), "line", WAITING_MAX)?,
             tail: VecDeque::new(),
-            error: None,
         };
         Ok(Self {
             name: name.into(),
@@ -80,15 +78,13 @@ impl ProcessLog {
     /// The error with which the process ended, if it printed one, or else its last lines.
     pub(crate) fn last_lines(&self) -> String {
         let state = lock(&self.state);
-        let last = |count: usize| -> String {
-            let lines = state.tail.range(state.tail.len().saturating_sub(count)..);
-            lines.map(|line| format!("\n  {line}")).collect()
-        };
-        match &state.error {
+        let lines = state.tail.iter().map(|line| format!("\n  {line}"));
+        let lines: String = lines.collect();
+        match lines.strip_prefix("\n  error: ") {
             // The error and the lines after it say everything.
-            Some((error, followed)) => format!(": {error}{}", last(*followed)),
-            None if state.tail.is_empty() => String::new(),
-            None => format!("; its last lines:{}", last(TAIL_LINES_MAX)),
+            Some(error) => format!(": {error}"),
+            None if lines.is_empty() => String::new(),
+            None => format!("; its last lines:{lines}"),
         }
     }
 
@@ -110,13 +106,12 @@ impl LogState {
     /// Adds a line. Returns a warning the first time that a line cannot be written.
     fn add(&mut self, line: String) -> Option<String> {
         let warning = self.file.add([format!("{line}\n").into_bytes()]);
-        if self.tail.len() == TAIL_LINES_MAX {
-            self.tail.pop_front();
-        }
-        match (line.strip_prefix("error: "), &mut self.error) {
-            (Some(error), _) => self.error = Some((error.into(), 0)),
-            (None, Some((_, followed))) => *followed += 1,
-            (None, None) => {}
+        let is_error = |line: &String| line.starts_with("error: ");
+        if is_error(&line) {
+            self.tail.clear();
+        } else if self.tail.len() == TAIL_LINES_MAX {
+            let has_error = self.tail.front().is_some_and(is_error);
+            self.tail.remove(has_error.into());
         }
         self.tail.push_back(line);
         warning
