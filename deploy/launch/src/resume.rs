@@ -119,45 +119,35 @@ pub(crate) fn print_next_steps(
 pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     folder.lock()?;
     let checkpoints = folder.checkpoints();
-    let is_saved = || match checkpoints.is_dir().then(|| checkpoint::lock(&checkpoints)) {
-        Some(Err(CheckpointError::InUse(_))) => Ok(false),
-        locked => locked.transpose().map(|_| true),
-    };
+    let lock = || checkpoints.is_dir().then(|| checkpoint::lock(&checkpoints));
+    let is_saved = || !matches!(lock(), Some(Err(CheckpointError::InUse(_))));
     let why = format!(
         "a learner still uses {} (stop it if it runs with --keep-alive)",
         checkpoints.display()
     );
-    if !wait_until(is_saved, SAVING_MAX, &why)? {
-        checkpoint::lock(&checkpoints)?;
-    }
+    wait_until(is_saved, SAVING_MAX, &why);
+    lock().transpose()?;
     // The replay server exits last: until then it holds its replay and its endpoint.
     let have_exited = || {
         let place = std::fs::read(folder.rendezvous());
         let is_used = |place: Vec<u8>| rendezvous::is_used(Path::new(OsStr::from_bytes(&place)));
-        Ok(!place.is_ok_and(is_used))
+        !place.is_ok_and(is_used)
     };
     let why = format!("processes of the run in {} are exiting", folder.display());
-    wait_until(have_exited, ENDING_MAX, &why).map(drop)
+    wait_until(have_exited, ENDING_MAX, &why);
+    Ok(())
 }
 
-/// Waits until `is_done` returns true, and prints `why` if it has to wait. Returns false after `max`.
-fn wait_until(
-    is_done: impl Fn() -> Result<bool, CheckpointError>,
-    max: Duration,
-    why: &str,
-) -> anyhow::Result<bool> {
+/// Waits until `is_done` returns true, for at most `max`, and prints `why` if it has to wait.
+fn wait_until(is_done: impl Fn() -> bool, max: Duration, why: &str) {
     let started = Instant::now();
     let mut is_reported = false;
-    while !is_done()? {
-        if started.elapsed() >= max {
-            return Ok(false);
-        }
+    while !is_done() && started.elapsed() < max {
         if !std::mem::replace(&mut is_reported, true) {
             console::eprintln(&format!("{why}: waiting"));
         }
         std::thread::sleep(WAIT_POLL);
     }
-    Ok(true)
 }
 
 /// Whether and how a run can be resumed.
