@@ -78,7 +78,7 @@ pub fn run(
     write_atomically(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let rendezvous_path = rendezvous.path().as_os_str().as_encoded_bytes();
     write_atomically(&run_dir.rendezvous(), rendezvous_path)?;
-    let display = Display::new(config.frames(), Instant::now(), resume_point.updates);
+    let display = Display::new(config.frames(), Instant::now());
     // Frees the shared memory that killed processes left behind.
     session::remove_orphaned_shared_memory();
     let shared_memory = config.transport.shared_memory && {

@@ -53,7 +53,7 @@ pub fn run(
     let point = resumed.unwrap_or_default();
     let (frames, updates) = (point.frames, point.updates);
     let mut view = RunView::starting_at(Plan::new(config), frames, updates);
-    let mut display = Display::new(config.frames(), Instant::now(), updates);
+    let mut display = Display::new(config.frames(), Instant::now());
     let screen = display.screen.clone();
     let mut evaluate = |updates, is_last| {
         let Some(episodes) = schedule.take_episodes(updates, is_last) else {

@@ -26,8 +26,6 @@ pub struct RunRecorder {
     /// While this lock is held, no other launcher writes to the folder.
     _lock: File,
     resume_point: ResumePoint,
-    /// Seconds that the run took before it was resumed.
-    seconds_before: f64,
     before_replay: BeforeReplay,
     metrics: AppendLog,
     events: Option<Events>,
@@ -93,7 +91,6 @@ impl RunRecorder {
         Ok(Self {
             _lock: lock,
             resume_point,
-            seconds_before: seconds,
             before_replay,
             metrics: AppendLog::create(&folder.metrics(), &rows.to_csv())?,
             events: events.transpose()?,
@@ -108,7 +105,7 @@ impl RunRecorder {
     /// Notes that the run took at least this many seconds before this recorder started.
     pub(crate) fn raise_seconds_before(&mut self, seconds: f64) {
         self.are_times_unknown = true;
-        self.seconds_before = self.seconds_before.max(seconds);
+        self.before_replay.seconds = self.before_replay.seconds.max(seconds);
     }
 
     /// k over all rows of the run, including those before a resume.
@@ -136,7 +133,7 @@ impl RunRecorder {
     }
 
     fn seconds(&self) -> f64 {
-        self.seconds_before + self.started.elapsed().as_secs_f64()
+        self.before_replay.seconds + self.started.elapsed().as_secs_f64()
     }
 
     /// Records the episodes that ended since the last call. `ask(shard, count)` requests the episodes of a shard after the first

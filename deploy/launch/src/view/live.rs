@@ -50,19 +50,17 @@ fn two_decimals(value: Option<f64>) -> String {
 #[derive(Debug)]
 pub(crate) struct Display {
     pub(crate) screen: Screen,
-    /// Updates at the start of the display, and when the first update beyond them was seen.
-    updates_before: u64,
+    /// When the first update since the run's last start was seen.
     learning_since: Option<Instant>,
     /// When the run began; a terminal's bar has a separate clock.
     pub(crate) began: Instant,
 }
 
 impl Display {
-    /// The display of a run of `frames` frames that began at `began` and has done `updates_before` updates.
-    pub(crate) fn new(frames: u64, began: Instant, updates_before: u64) -> Self {
+    /// The display of a run of `frames` frames that began at `began`.
+    pub(crate) fn new(frames: u64, began: Instant) -> Self {
         Self {
             screen: Screen::new(frames, PROGRESS_TEMPLATE),
-            updates_before,
             learning_since: None,
             began,
         }
@@ -70,7 +68,7 @@ impl Display {
 
     /// Shows the state of the run, and notes below it, such as which process does not answer.
     pub(crate) fn show(&mut self, view: &RunView) {
-        if view.learner.updates > self.updates_before {
+        if view.learner.updates > view.after_updates.unwrap_or(0) {
             self.learning_since.get_or_insert_with(Instant::now);
         }
         let mut texts = self.lines(view).to_vec();
@@ -155,7 +153,7 @@ mod tests {
     };
 
     fn display() -> Display {
-        Display::new(8_000, Instant::now(), 0)
+        Display::new(8_000, Instant::now())
     }
 
     fn plan(frames: u64, updates: u64) -> Plan {

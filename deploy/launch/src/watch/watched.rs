@@ -42,7 +42,7 @@ impl WatchedRun {
         let up = Duration::try_from_secs_f64(up_s).unwrap_or_default();
         let now = Instant::now();
         let began = now.checked_sub(up).unwrap_or(now);
-        let display = Display::new(config.frames(), began, view.learner.updates);
+        let display = Display::new(poller.config.frames(), began);
         if let Some(bar) = display.screen.bar() {
             // The bar's clock shows the time of the run. All clones of a bar are the same bar.
             drop(bar.clone().with_elapsed(up));
