@@ -139,14 +139,12 @@ impl Evaluator {
     /// Evaluates the last checkpoint. Waits for the result up to an hour, or until the run is told to stop.
     pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
         let deadline = Instant::now() + LAST_EVALUATION_MAX;
-        let mut is_last_begun = false;
         loop {
             self.report_result(screen);
             if self.process.is_none() {
-                if is_last_begun || !self.start_if_due(true, screen) {
+                if !self.start_if_due(true, screen) {
                     return;
                 }
-                is_last_begun = true;
                 screen.print_line("playing the last checkpoint (skip it with Ctrl-C)");
             }
             if abort() || Instant::now() > deadline {
@@ -190,18 +188,16 @@ impl Evaluator {
         let Some(process) = &mut self.process else {
             return;
         };
-        if process.exit_status().is_none() {
+        let Some(status) = process.exit_status() else {
             return;
-        }
-        process.wait_until(Instant::now(), || false);
-        let failed = process.exit_status().is_some_and(|it| !it.success());
-        let report = match (failed, EvaluationRow::all(&self.run_dir)) {
-            (true, _) => format!(
+        };
+        let report = match (status.success(), EvaluationRow::all(&self.run_dir)) {
+            (false, _) => format!(
                 "the run continues without an evaluation: {}",
                 process.exit_report()
             ),
-            (false, Ok(all)) => all.last().map(EvaluationRow::describe).unwrap_or_default(),
-            (false, Err(e)) => format!("{e:#}"),
+            (true, Ok(all)) => all.last().map(EvaluationRow::describe).unwrap_or_default(),
+            (true, Err(e)) => format!("{e:#}"),
         };
         screen.print_line(&report);
         self.process = None;
