@@ -35,7 +35,6 @@ pub struct ManagedProcess {
     pub name: String,
     child: Child,
     started: Instant,
-    exit_status: Option<ExitStatus>,
     pub(crate) log: ProcessLog,
 }
 
@@ -93,7 +92,6 @@ impl ManagedProcess {
             name: name.into(),
             child,
             started: Instant::now(),
-            exit_status: None,
             log,
         })
     }
@@ -116,11 +114,8 @@ impl ManagedProcess {
 
     /// The exit status of the process, if it has ended.
     pub fn exit_status(&mut self) -> Option<ExitStatus> {
-        if self.exit_status.is_none() {
-            // An error means that the child does not exist any more, which cannot happen before it was waited for.
-            self.exit_status = self.child.try_wait().ok().flatten();
-        }
-        self.exit_status
+        // An error means that the child does not exist any more, which cannot happen before it was waited for.
+        self.child.try_wait().ok().flatten()
     }
 
     /// Asks the process to drain and exit.
@@ -148,10 +143,11 @@ impl ManagedProcess {
         while self.exit_status().is_none() && Instant::now() < deadline && !abort() {
             std::thread::sleep(POLL);
         }
-        if self.exit_status.is_some() {
+        let status = self.exit_status();
+        if status.is_some() {
             self.log.finish();
         }
-        self.exit_status
+        status
     }
 
     /// Resident memory, MiB; none once the process has ended.
@@ -165,8 +161,8 @@ impl ManagedProcess {
 
     /// How the process ended, and its error or the last lines of its log, as one message.
     pub fn exit_report(&mut self) -> String {
-        self.wait_until(Instant::now(), || false);
-        let how = match self.exit_status.map(|it| (it.code(), it.signal())) {
+        let status = self.wait_until(Instant::now(), || false);
+        let how = match status.map(|it| (it.code(), it.signal())) {
             None => "is still running".into(),
             Some((Some(code), _)) => format!("exited with code {code}"),
             Some((None, Some(signal))) => {
