@@ -120,17 +120,15 @@ impl ManagedProcess {
 
     /// Asks the process to drain and exit.
     pub fn ask_to_stop(&mut self) {
-        self.signal(Signal::SIGTERM);
+        if self.exit_status().is_none() {
+            ask_to_stop(&self.child, &self.name);
+        }
     }
 
     /// Kills the process at once.
     pub fn kill(&mut self) {
-        self.signal(Signal::SIGKILL);
-    }
-
-    fn signal(&mut self, signal: Signal) {
-        if self.exit_status().is_none() {
-            send_signal(&self.child, &self.name, signal);
+        if let Err(e) = self.child.kill() {
+            tracing::debug!("killing {}: {e}", self.name);
         }
     }
 
@@ -194,13 +192,9 @@ pub(crate) fn is_orderly_exit(status: ExitStatus) -> bool {
 
 /// Asks a child process to drain and exit. The child must not have been waited for yet.
 pub fn ask_to_stop(child: &Child, name: &str) {
-    send_signal(child, name, Signal::SIGTERM);
-}
-
-fn send_signal(child: &Child, name: &str, signal: Signal) {
     // No caller has waited for the child, so its PID cannot belong to another process yet.
-    if let Err(e) = kill(Pid::from_raw(child.id() as i32), signal) {
-        tracing::debug!("sending {signal} to {name}: {e}");
+    if let Err(e) = kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM) {
+        tracing::debug!("asking {name} to stop: {e}");
     }
 }
 
