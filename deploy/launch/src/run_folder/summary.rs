@@ -60,19 +60,6 @@ pub(crate) struct LastPlay {
     pub(crate) random: ReturnInterval,
 }
 
-impl LastPlay {
-    fn describe(&self) -> String {
-        let ReturnInterval { mean, low, high } = self.agent;
-        let agent = format!("{mean:.2}, 95% interval {low:.2} to {high:.2}");
-        let ReturnInterval { mean, low, high } = self.random;
-        let random = format!("{mean:.2} ({low:.2} to {high:.2})");
-        let (weights, episodes) = (&self.weights, self.episodes);
-        format!(
-            "Greedy return ({weights} weights): {agent}, {episodes} episodes; a random policy earns {random}.\n"
-        )
-    }
-}
-
 /// The contents of `summary.json`: how a run ended and what it counted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
@@ -175,11 +162,9 @@ impl Summary {
 
     pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.summary();
-        match fs::remove_file(&path) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
-                Err(e).with_context(|| format!("removing {}", path.display()))
-            }
-            _ => Ok(()),
+        match path.exists() {
+            true => fs::remove_file(&path).with_context(|| format!("removing {}", path.display())),
+            false => Ok(()),
         }
     }
 
@@ -213,8 +198,17 @@ impl Summary {
     }
 
     fn describe_returns(&self) -> String {
-        let played = self.played.as_ref();
-        played.map(LastPlay::describe).unwrap_or_default()
+        let Some(played) = &self.played else {
+            return String::new();
+        };
+        let ReturnInterval { mean, low, high } = played.agent;
+        let agent = format!("{mean:.2}, 95% interval {low:.2} to {high:.2}");
+        let ReturnInterval { mean, low, high } = played.random;
+        let random = format!("{mean:.2} ({low:.2} to {high:.2})");
+        let (weights, episodes) = (&played.weights, played.episodes);
+        format!(
+            "Greedy return ({weights} weights): {agent}, {episodes} episodes; a random policy earns {random}.\n"
+        )
     }
 
     pub(crate) fn describe_counts(&self) -> String {
