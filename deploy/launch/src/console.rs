@@ -47,11 +47,11 @@ pub(crate) fn print_unless_closed(text: &str) -> anyhow::Result<bool> {
 
 /// [`print_unless_closed`] for a page. On a terminal the page replaces the one before; elsewhere pages follow each other.
 pub(crate) fn print_page(text: &str) -> anyhow::Result<bool> {
-    let on_terminal = io::stdout().is_terminal().then(Term::stdout);
-    match on_terminal.map(|it| it.clear_screen()) {
-        Some(Err(e)) if !is_closed(&e) => Err(e.into()),
-        _ => print_unless_closed(text),
+    if io::stdout().is_terminal() {
+        // If this fails, so does the printing.
+        let _ = Term::stdout().clear_screen();
     }
+    print_unless_closed(text)
 }
 
 /// [`print`] for lines that a narrow terminal would break inside words: a wrapped line continues after `indent` blanks.

@@ -89,16 +89,14 @@ pub fn print_status(
 /// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
 /// that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
 pub fn run(found: anyhow::Result<Poller>, flags: &WatchFlags) -> anyhow::Result<()> {
-    if found.is_err()
-        && let Some(path) = &flags.prometheus
-    {
-        let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
-        write_file("--prometheus", path, down)?;
-    }
     match found {
         Ok(poller) if flags.once => check_once(poller, flags),
         Ok(poller) => watch(poller, flags),
         Err(e) => {
+            if let Some(path) = &flags.prometheus {
+                let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
+                write_file("--prometheus", path, down)?;
+            }
             let unreachable = e.downcast::<UnreachableRun>()?;
             unreachable.print(flags.json)?;
             ensure!(
