@@ -265,18 +265,6 @@ mod tests {
         testing::{make, view},
     };
 
-    /// The view of a run that is recorded, or, without `learner`, of a run that is not recorded and whose learner does not answer.
-    fn of_two_losses(replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
-        let is_recorded = learner.is_some();
-        let plan = make(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
-        let mut view = view(plan, replay, learner);
-        if is_recorded {
-            view.recorded_s = Some(12.5);
-            view.rss_mib = vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)];
-        }
-        view
-    }
-
     #[test]
     fn what_is_not_known_is_left_out() {
         let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = 7);
@@ -284,10 +272,12 @@ mod tests {
             it.losses = vec![("dim_4t4".into(), 2.0)];
             (it.updates, it.c51_kl) = (3, 0.5);
         });
-        let unknown = json(&of_two_losses(replay.clone(), None));
+        let plan = make(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
+        let unknown = json(&view(plan.clone(), replay.clone(), None));
         assert_eq!(unknown["updates"], serde_json::Value::Null);
         assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
-        let known = of_two_losses(replay, Some(learner));
+        let mut known = view(plan, replay, Some(learner));
+        known.rss_mib = vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)];
         let text = serde_json::to_string(&json(&known)).unwrap();
         for part in [
             r#""frames":7,"#,
