@@ -38,7 +38,7 @@ pub fn check_connect_endpoints(endpoints: &[String], tls: bool) -> Result<(), Us
     })
 }
 
-/// Rejects endpoints to listen on that zenoh cannot open or that do not fit `--tls-dir`. Without `--allow-allow_insecure`, also rejects
+/// Rejects endpoints to listen on that zenoh cannot open or that do not fit `--tls-dir`. Without `--allow-insecure`, also rejects
 /// endpoints that other machines can reach without a certificate.
 pub fn check_listen_endpoints(
     endpoints: &[String],
