@@ -41,9 +41,8 @@ pub(super) struct Property {
     range: &'static str,
     /// Each promise in words, including the unit of its error, and the largest allowed error; 0 if none is allowed.
     promises: Vec<(&'static str, f64)>,
-    checks: Vec<(Inputs, Box<Check>)>,
-    /// The results: a row for each promise at each kind of extreme.
-    pub(super) rows: Vec<Row>,
+    /// Each check with the kind of extreme that its inputs have.
+    checks: Vec<(String, Inputs, Box<Check>)>,
 }
 
 /// The source of a check's inputs.
@@ -65,7 +64,6 @@ impl Property {
             range,
             promises: Vec::new(),
             checks: Vec::new(),
-            rows: Vec::new(),
         }
     }
 
@@ -81,22 +79,12 @@ impl Property {
         inputs: Inputs,
         check: impl Fn(&mut Cases<'_>) -> anyhow::Result<()> + 'static,
     ) -> Self {
-        self.checks.push((inputs, Box::new(check)));
-        for &(promise, bound) in &self.promises {
-            self.rows.push(Row {
-                routine: self.routine,
-                range: self.range,
-                extreme: extreme.to_owned(),
-                is_drawn: matches!(inputs, Drawn(_)),
-                promise,
-                bound,
-                tally: Tally::default(),
-            });
-        }
+        self.checks
+            .push((extreme.to_owned(), inputs, Box::new(check)));
         self
     }
 
-    /// Runs all checks, and returns what they saw in the order of the rows.
+    /// Runs all checks, and returns what they saw of each promise, one check after the other.
     pub(super) fn run(
         &self,
         settings: &Settings,
@@ -112,7 +100,7 @@ impl Property {
             tallies: Vec::new(),
         };
         let mut all = Vec::new();
-        for (inputs, check) in &self.checks {
+        for (_, inputs, check) in &self.checks {
             cases.tallies = vec![Tally::default(); self.promises.len()];
             let (is_listed, mut count) = match *inputs {
                 Listed => (true, 1),
@@ -138,25 +126,39 @@ impl Property {
         Ok(all)
     }
 
-    /// Adds the results of one seed.
-    pub(super) fn add_seed(&mut self, tallies: Vec<Tally>) {
-        assert_eq!(self.rows.len(), tallies.len(), "each seed has all rows");
-        for (row, tally) in self.rows.iter_mut().zip(tallies) {
-            row.tally.add(tally.cases, tally.worst, || tally.input);
-        }
-    }
-
-    /// Returns the rows that have cases. For a promise without any case it adds one row, which counts as not kept.
-    pub(super) fn into_tried_rows(self) -> Vec<Row> {
-        let rows = self.rows.into_iter();
-        let (mut tried, untried): (Vec<_>, Vec<_>) = rows.partition(|row| row.tally.cases > 0);
-        for mut row in untried {
-            if tried.iter().all(|it| it.promise != row.promise) {
-                (row.extreme, row.is_drawn) = ("none was tried".into(), false);
-                tried.push(row);
+    /// Returns a row for each promise at each kind of extreme of which some seed has cases. For a promise without any case it adds one row,
+    /// which counts as not kept.
+    pub(super) fn rows(&self, seeds: Vec<Vec<Tally>>) -> Vec<Row> {
+        let row = |extreme: &str, is_drawn, (promise, bound), tally| Row {
+            routine: self.routine,
+            range: self.range,
+            extreme: extreme.to_owned(),
+            is_drawn,
+            promise,
+            bound,
+            tally,
+        };
+        let mut totals = vec![Tally::default(); self.checks.len() * self.promises.len()];
+        for tallies in seeds {
+            for (total, tally) in totals.iter_mut().zip(tallies) {
+                total.add(tally.cases, tally.worst, || tally.input);
             }
         }
-        tried
+        let of_checks = totals.chunks(self.promises.len());
+        let mut rows = Vec::new();
+        for ((extreme, inputs, _), tallies) in self.checks.iter().zip(of_checks) {
+            let is_drawn = matches!(inputs, Drawn(_));
+            for (&promise, tally) in self.promises.iter().zip(tallies) {
+                rows.push(row(extreme, is_drawn, promise, tally.clone()));
+            }
+        }
+        rows.retain(|row| row.tally.cases > 0);
+        for &promise in &self.promises {
+            if rows.iter().all(|it| it.promise != promise.0) {
+                rows.push(row("none was tried", false, promise, Tally::default()));
+            }
+        }
+        rows
     }
 }
 
@@ -285,7 +287,7 @@ mod tests {
 
     #[test]
     fn a_row_keeps_the_worst_of_all_combinations_and_no_number_is_worst_of_all() {
-        let mut halving = Property::new("halving", "any")
+        let halving = Property::new("halving", "any")
             .promise("error", 310.0)
             .promise("other bits", 0.0)
             .promise("untried", 0.0)
@@ -305,9 +307,7 @@ mod tests {
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
         let tallies = halving.run(&settings, rng, progress).unwrap();
-        halving.add_seed(tallies.clone());
-        halving.add_seed(tallies);
-        let rows = halving.into_tried_rows();
+        let rows = halving.rows(vec![tallies.clone(), tallies]);
         let expected = [
             ("listed", 12, 310.0, "310", true),
             ("listed", 12, 0.0, "", true),
