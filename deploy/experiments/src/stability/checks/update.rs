@@ -87,21 +87,20 @@ impl Setting {
             tanh_clip: self.tanh_clip,
             ..run.learner.update
         };
-        let mut weights = || -> anyhow::Result<Vec<f32>> {
+        let mut draw = || -> anyhow::Result<Parameters> {
             let drawn = Parameters::init(&model, rng, &Device::Cpu)?;
             let values = small::scalars(&model, &drawn)?.into_iter();
-            Ok(values.map(|value| value * self.scale).collect())
+            let scaled: Vec<f32> = values.map(|value| value * self.scale).collect();
+            Ok(small::parameters(&model, &scaled)?)
         };
-        let (online, target) = (weights()?, weights()?);
-        let agent = |compute: &Compute| -> anyhow::Result<Agent> {
+        let (online, target) = (draw()?, draw()?.without_dim()?);
+        let agent = |compute: &Compute| {
             let parameters = NetworkParameters {
-                online: small::parameters(&model, &online)?,
-                target: small::parameters(&model, &target)?.without_dim()?,
+                online: online.clone(),
+                target: target.clone(),
                 key_encoder: None,
             };
-            let (model, settings) = (model.clone(), settings.clone());
-            let agent = Agent::from_parameters(model, settings, compute, parameters);
-            Ok(agent?)
+            Agent::from_parameters(model.clone(), settings.clone(), compute, parameters)
         };
         Ok([agent(&Compute::CPU)?, agent(&REFERENCE)?])
     }
