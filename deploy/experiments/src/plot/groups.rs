@@ -115,17 +115,34 @@ impl Group<'_> {
     }
 }
 
-/// Combines one or several curves into one, with a band if there are several.
+/// Returns the only curve; or the mean and band of several curves over their common range of x, or at the middle of a small gap between
+/// them.
 pub(crate) fn combine_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
-    let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).collect();
-    match &each[..] {
-        [] => Curve::default(),
-        [only] => Curve {
-            points: only.to_vec(),
+    let curves: Vec<_> = each.iter().filter(|it| !it.is_empty()).collect();
+    if let [only] = curves[..] {
+        return Curve {
+            points: only.clone(),
             band: Vec::new(),
-        },
-        many => combine(many, band),
+        };
     }
+    let starts = curves.iter().map(|curve| curve[0].0);
+    let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
+    let mut start = starts.fold(f64::NEG_INFINITY, f64::max);
+    let mut end = ends.fold(f64::INFINITY, f64::min);
+    if curves.is_empty() || start > end * (1.0 + GAP_SHARE_MAX) {
+        return Curve::default();
+    }
+    if start > end {
+        end = f64::midpoint(start, end);
+        start = end;
+    }
+    let last = if start == end { 0 } else { GRID_INTERVALS };
+    let means = (0..=last).map(|i| {
+        let x = start + (end - start) * i as f64 / GRID_INTERVALS as f64;
+        let values = curves.iter().map(|points| interpolate(points, x));
+        (x, values.collect())
+    });
+    Curve::from_values(means, band)
 }
 
 /// Replaces each point by the mean over the points within `width` of x before it.
@@ -162,28 +179,6 @@ fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         .chain(inner)
         .chain([points[end]])
         .collect()
-}
-
-/// Returns mean and band of several curves over their common range of x, or at the middle of a small gap between them.
-fn combine(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
-    let starts = curves.iter().map(|curve| curve[0].0);
-    let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
-    let mut start = starts.fold(f64::NEG_INFINITY, f64::max);
-    let mut end = ends.fold(f64::INFINITY, f64::min);
-    if start > end * (1.0 + GAP_SHARE_MAX) {
-        return Curve::default();
-    }
-    if start > end {
-        end = f64::midpoint(start, end);
-        start = end;
-    }
-    let last = if start == end { 0 } else { GRID_INTERVALS };
-    let means = (0..=last).map(|i| {
-        let x = start + (end - start) * i as f64 / GRID_INTERVALS as f64;
-        let values = curves.iter().map(|points| interpolate(points, x));
-        (x, values.collect())
-    });
-    Curve::from_values(means, band)
 }
 
 /// Interpolates `points` linearly at `x`; beyond the ends, the value at the end. `points` must be sorted by x and not empty.
@@ -228,14 +223,14 @@ mod tests {
             (Band::Sd, 0.697, 4.303),
             (Band::Ci, -1.979, 6.979),
         ] {
-            let curve = combine(&curves.each_ref(), band);
+            let curve = combine_seeds(&curves, band);
             assert_eq!(curve.points[0], (0.0, 2.5));
             let (_, found_low, found_high) = curve.band[0];
             assert!((found_low - low).abs() < 1e-3 && (found_high - high).abs() < 1e-3);
         }
         for (later, points) in [(104.0, &[(102.0, 2.0)][..]), (150.0, &[])] {
             let apart = [vec![(100.0, 1.0)], vec![(later, 3.0)]];
-            assert_eq!(combine(&apart.each_ref(), Band::Sd).points, points);
+            assert_eq!(combine_seeds(&apart, Band::Sd).points, points);
         }
     }
 }
