@@ -2,6 +2,7 @@
 //! Each experiment decides what a piece is and what follows from all pieces. `sweep::runs` keeps whole runs.
 
 use std::{
+    collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
     time::{Instant, SystemTime},
@@ -63,8 +64,9 @@ pub(crate) struct Session {
     smoke: bool,
     pub(crate) report_only: bool,
     pub(crate) progress: Progress,
-    seconds: f64,
-    /// How many runs were made at once; `seconds` is the sum over all of them.
+    /// The time of each piece by its key, and of all runs together.
+    seconds: BTreeMap<String, f64>,
+    /// How many runs were made at once.
     jobs: u32,
     /// The names of the runs that are planned and not finished.
     missing: Vec<String>,
@@ -109,7 +111,7 @@ impl Session {
             smoke: flags.smoke,
             report_only,
             progress: Progress::new(units, shutdown),
-            seconds: 0.0,
+            seconds: BTreeMap::new(),
             jobs: 1,
             missing: Vec::new(),
         };
@@ -163,7 +165,7 @@ impl Session {
     /// Counts runs, which `sweep::runs` keeps: the time of all of them together, how many were made at once, and the names of the
     /// unfinished ones.
     pub(crate) fn count_runs(&mut self, seconds: f64, jobs: u32, missing: Vec<String>) {
-        self.seconds += seconds;
+        self.seconds.insert(RUNS.to_owned(), seconds);
         self.jobs = jobs;
         self.missing = missing;
     }
@@ -200,7 +202,7 @@ impl Session {
         // A piece that cannot be read is made again, like a missing one.
         if let Some(piece) = self.read::<T>(key).filter(|piece| piece.of == source) {
             self.progress.count_earlier(units);
-            self.seconds += piece.seconds;
+            self.seconds.insert(key.to_owned(), piece.seconds);
             return Ok(piece.result);
         }
         let report_stop = |e: &anyhow::Error| {
@@ -213,7 +215,7 @@ impl Session {
         let result = make(&mut self.progress).inspect_err(report_stop)?;
         let seconds = started.elapsed().as_secs_f64();
         self.write(key, source, seconds, &result)?;
-        self.seconds += seconds;
+        self.seconds.insert(key.to_owned(), seconds);
         // Counts the units that `make` did not count. This comes after the write, so that an interrupt here does not lose the piece.
         let rest = units.saturating_sub(self.progress.done() - before);
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
@@ -265,7 +267,8 @@ impl Session {
     /// failed and is therefore not on the page.
     pub(crate) fn write_page(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
-        let time = describe_time(self.seconds, self.jobs, self.read_piece(CORES));
+        let seconds = self.seconds.values().sum();
+        let time = describe_time(seconds, self.jobs, self.read_piece(CORES));
         let values = context! { missing => self.missing, ..values };
         let text = render_page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
@@ -360,6 +363,12 @@ mod tests {
         assert_eq!(cores, Some(Machine::detect().cores));
         let made = session.load_or_make("w, an old program", "errors", 1, |_| Ok(1));
         assert_eq!(made.unwrap(), 1);
+        // A piece that several runs use is made once, and its time counts once.
+        let seconds: f64 = session.seconds.values().sum();
+        session
+            .load_or_make("w, an old program", "errors", 1, |_| Ok(2))
+            .unwrap();
+        assert_eq!(session.seconds.values().sum::<f64>(), seconds);
         let computed = |session: &mut Session, of: &str, n: u32| {
             session.load_or_compute(of, "errors", 1, |_| Ok(n)).unwrap()
         };
