@@ -201,7 +201,6 @@ fn false_positives(results: &Results) -> (usize, f64) {
 const PANEL_COLUMNS: usize = 3;
 const PANEL_SIZE: (f64, f64) = (330.0, 250.0);
 
-#[derive(Clone, Copy, Debug, PartialEq)]
 struct Marker {
     speed: f64,
     value: f64,
@@ -214,9 +213,18 @@ fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
     let of_runs = results.points.values().flat_map(|it| it.values(returns));
     let all = Spread::of(of_runs);
     let (least, greatest) = all.map_or((0.0, 0.0), |it| (it.min, it.max));
-    let place = |point: &PointResult| place(point, returns, (least, greatest));
+    let place = |point: &PointResult| {
+        let value = point.mean(returns)?;
+        let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
+        Some(Marker {
+            speed: point.mean(FRAMES_PER_SECOND)?.mean,
+            value: value.mean,
+            // Few seeds may give an interval that is far wider than the range of all returns.
+            ends: [low.max(least), high.min(greatest)],
+        })
+    };
     let placed: Vec<Marker> = results.points.values().filter_map(place).collect();
-    let front: Vec<(f64, f64)> = front(&placed).map(|it| (it.speed, it.value)).collect();
+    let front = front(&placed);
     let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();
     let values: Vec<f64> = placed.iter().flat_map(|it| it.ends).collect();
     let label = format!("{name} return");
@@ -250,19 +258,8 @@ fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
     }
 }
 
-/// Returns the position of a point. Its interval is cut to the range of all returns, because few seeds may give a far wider one.
-fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -> Option<Marker> {
-    let value = point.mean(returns)?;
-    let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
-    Some(Marker {
-        speed: point.mean(FRAMES_PER_SECOND)?.mean,
-        value: value.mean,
-        ends: [low.max(least), high.min(greatest)],
-    })
-}
-
-/// Returns the Pareto front, the slowest point first: no other point is faster and no worse, or better and no slower.
-fn front(placed: &[Marker]) -> impl Iterator<Item = Marker> {
+/// Returns speed and value of the Pareto front, the slowest point first: no other point is faster and no worse, or better and no slower.
+fn front(placed: &[Marker]) -> Vec<(f64, f64)> {
     let beaten = |it: &Marker| {
         placed.iter().any(|other| {
             other.speed >= it.speed
@@ -270,9 +267,10 @@ fn front(placed: &[Marker]) -> impl Iterator<Item = Marker> {
                 && (other.speed > it.speed || other.value > it.value)
         })
     };
-    let mut front: Vec<_> = placed.iter().filter(|it| !beaten(it)).copied().collect();
-    front.sort_by(|a, b| a.speed.total_cmp(&b.speed));
-    front.into_iter()
+    let front = placed.iter().filter(|it| !beaten(it));
+    let mut front: Vec<_> = front.map(|it| (it.speed, it.value)).collect();
+    front.sort_by(|a, b| a.0.total_cmp(&b.0));
+    front
 }
 
 /// Draws the training return over seconds, with a panel for each dial and its base.
@@ -310,15 +308,14 @@ mod tests {
     }
     #[test]
     fn the_front_has_what_no_other_beats() {
-        let at = |speed: f64, value: f64| Marker {
+        let (slow_and_good, slow_and_bad) = ((1.0, 9.0), (1.0, 2.0));
+        let (between, beaten, fast_and_bad) = ((3.0, 5.0), (2.0, 4.9), (5.0, 3.0));
+        let all = [slow_and_good, slow_and_bad, fast_and_bad, between, beaten];
+        let all = all.map(|(speed, value)| Marker {
             speed,
             value,
             ends: [value; 2],
-        };
-        let (slow_and_good, slow_and_bad) = (at(1.0, 9.0), at(1.0, 2.0));
-        let (between, beaten, fast_and_bad) = (at(3.0, 5.0), at(2.0, 4.9), at(5.0, 3.0));
-        let all = [slow_and_good, slow_and_bad, fast_and_bad, between, beaten];
-        let front: Vec<_> = front(&all).collect();
-        assert_eq!(front, [slow_and_good, between, fast_and_bad]);
+        });
+        assert_eq!(front(&all), [slow_and_good, between, fast_and_bad]);
     }
 }
