@@ -191,7 +191,7 @@ impl Tradeoff<'_> {
         Ok(levels.iter().map(is_chosen).collect())
     }
 
-    /// Returns the cost of the unfinished runs of a point. `base` is the point itself or the base of its level.
+    /// Returns the cost of the unfinished runs of a requested point. `base` is the point itself or the base of its level.
     fn cost(&self, runs: &Runs, point: &Point, base: &Point) -> anyhow::Result<Cost> {
         let common = &self.settings.common;
         // The seconds of machine time for each finished run of a point.
@@ -201,10 +201,9 @@ impl Tradeoff<'_> {
             let finished = plans.filter_map(|plan| runs.get_finished(&plan));
             Spread::of(finished.map(|it| it.summary.wall_seconds / f64::from(common.jobs)))
         };
-        let estimated = |point: &Point| -> anyhow::Result<Option<f64>> {
-            let config = common.config(point)?;
-            let speed = self.speeds.get(&point.key);
-            Ok(speed.map(|speed| estimate_seconds(&config, speed)))
+        let estimated = |point: &Point| -> anyhow::Result<f64> {
+            let speed = &self.speeds[&point.key];
+            Ok(estimate_seconds(&common.config(point)?, speed))
         };
         let finished = taken(point);
         let seeds = self.settings.seed_count(point == base) as usize;
@@ -213,11 +212,10 @@ impl Tradeoff<'_> {
             _ if unfinished == 0 => 0.0,
             Some(finished) => finished.mean,
             // The time of finished base runs corrects the estimate from the benchmark.
-            None => {
-                let corrected = taken(base).zip(estimated(base)?);
-                let factor = corrected.map_or(1.0, |(taken, estimated)| taken.mean / estimated);
-                estimated(point)?.map_or(f64::INFINITY, |seconds| factor * seconds)
-            }
+            None => match taken(base) {
+                Some(taken) => estimated(point)? * taken.mean / estimated(base)?,
+                None => estimated(point)?,
+            },
         };
         Ok((point.key.clone(), each * unfinished as f64))
     }
