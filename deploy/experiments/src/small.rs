@@ -16,11 +16,7 @@ pub(crate) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
         v_min: support.0,
         v_max: support.1,
         torso: TorsoName::Nature,
-        conv: vec![ConvLayer {
-            out: 1,
-            kernel: 1,
-            stride: 1,
-        }],
+        conv: vec![ConvLayer::new(1, 1, 1)],
         channels: vec![],
         scale_blocks: false,
         hidden,

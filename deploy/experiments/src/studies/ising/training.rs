@@ -326,11 +326,7 @@ mod tests {
 
     #[test]
     fn views_of_the_dqn_network_tile_the_paper_s_frame() {
-        let layer = |out, kernel, stride| driml_model::ConvLayer {
-            out,
-            kernel,
-            stride,
-        };
+        let layer = driml_model::ConvLayer::new;
         let task = super::super::new_task(&super::super::tests::smoke()).unwrap();
         let model = ModelConfig {
             conv: vec![layer(32, 8, 4), layer(64, 4, 2), layer(64, 3, 1)],
