@@ -152,11 +152,7 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
         if is_return(column) {
             series.extend(random_lines(&random, &series, groups.len()));
         }
-        let (mut title, mut y) = title_and_label(column);
-        if is_loss {
-            title = format!("{} loss", loss_title(column));
-            y = "auxiliary loss [nats]".into();
-        }
+        let (title, y) = title_and_label(column, is_loss);
         let (x, y) = (Axis::linear(args.x.column()), Axis::linear(&y));
         panels.push(Panel::Chart(Chart::new(&title, x, y, series)));
     }
@@ -177,15 +173,18 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
     })
 }
 
-fn title_and_label(column: &str) -> (String, String) {
-    if column == EVALUATED {
-        return (
-            "Return of checkpoints, played greedily".into(),
-            "mean over episodes".into(),
-        );
-    }
+/// Returns the title of a column's chart and the label of its y axis.
+fn title_and_label(column: &str, is_auxiliary_loss: bool) -> (String, String) {
     let named = column.replace('_', " ");
     match metrics::find_column(column) {
+        _ if is_auxiliary_loss => {
+            let title = format!("{} loss", loss_title(column));
+            (title, "auxiliary loss [nats]".into())
+        }
+        _ if column == EVALUATED => {
+            let title = "Return of checkpoints, played greedily";
+            (title.into(), "mean over episodes".into())
+        }
         Some(it) if it.name == column => (it.plot_label.into(), it.unit.into()),
         // The column is one of several that share a description.
         Some(it) => (named, it.unit.into()),
