@@ -355,9 +355,6 @@ mod tests {
         // `read_piece` reads a piece whatever it was made from.
         assert_eq!(session.read_piece::<u32>("played"), Some(3));
         assert_eq!(session.read_piece::<u32>("never"), None);
-        session.store("calls", ["driml tradeoff"]).unwrap();
-        let calls: Option<Vec<String>> = session.read_piece("calls");
-        assert_eq!(calls.unwrap(), ["driml tradeoff"]);
         let mut reported = report("a").unwrap();
         let cores = reported.read_piece(CORES);
         assert_eq!(cores, Some(Machine::detect().cores));

@@ -47,9 +47,7 @@ fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> 
     let slopes = small::tensors(config, values)?;
     let mut sum = Tensor::new(0f32, &Device::Cpu)?;
     for (name, var) in parameters.iter() {
-        if let Some(slope) = slopes.get(name) {
-            sum = (sum + (var.as_tensor() * slope)?.sum_all()?)?;
-        }
+        sum = (sum + (var.as_tensor() * &slopes[name])?.sum_all()?)?;
     }
     Ok(Gradients::compute(&parameters, &sum)?)
 }
