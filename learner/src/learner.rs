@@ -80,8 +80,8 @@ impl Learner {
             affinity.map(AffinityEstimator::settings)
         });
         if configured != saved {
-            return Err(CheckpointError::Other(format!(
-                "in {} has another estimator of the action affinity: resume with the settings it was made with, or choose another folder",
+            return Err(CheckpointError::Mismatch(format!(
+                "the checkpoint in {} has another estimator of the action affinity: resume with the settings it was made with, or choose another folder",
                 folder.display()
             )));
         }

@@ -174,11 +174,10 @@ impl RunSpec {
         check_range("run.n_step", self.n_step, 1..=1000, why)?;
         let why = "a discount lies between 0 and 1";
         check_range("run.gamma", self.gamma, 0.0..=1.0, why)?;
-        if matches!(self.horizon, Horizon::None {}) {
-            return Ok(());
-        }
         let (key, k_max) = ("run.horizon", self.horizon.k_max());
-        check_range(key, k_max, 1..=1000, "k lies between 1 and 1000")?;
+        if self.horizon != (Horizon::None {}) {
+            check_range(key, k_max, 1..=1000, "k lies between 1 and 1000")?;
+        }
         let fits = self.horizon.positives() <= POSITIVES_MAX;
         check(fits, key, k_max, "a row carries at most 32 positives")
     }

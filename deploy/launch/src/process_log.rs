@@ -110,8 +110,12 @@ impl LogState {
         if is_error(&line) {
             self.tail.clear();
         } else if self.tail.len() == TAIL_LINES_MAX {
-            let has_error = self.tail.front().is_some_and(is_error);
-            self.tail.remove(has_error.into());
+            // The error line stays.
+            let oldest = match self.tail.front().is_some_and(is_error) {
+                true => 1,
+                false => 0,
+            };
+            self.tail.remove(oldest);
         }
         self.tail.push_back(line);
         warning
@@ -159,5 +163,13 @@ mod tests {
         }
         let said = ": it failed. Its last words:\n  no\n  more";
         assert_eq!(log.last_lines(), said);
+        for n in 0..10 {
+            lock(&log.state).add(format!("line {n}"));
+        }
+        let said = log.last_lines();
+        assert!(
+            said.starts_with(": it failed. Its last words:\n  line 3\n"),
+            "{said}"
+        );
     }
 }

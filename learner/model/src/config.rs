@@ -133,15 +133,15 @@ impl ModelConfig {
     /// `v_max`, either beyond +-1e30, no convolution or stage, a setting of another torso, or an invalid loss layer name.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
-        let check_within = |max: usize, name: &str, size: usize| match (1..=max).contains(&size) {
+        let check_up_to = |max: usize, name: &str, size: usize| match (1..=max).contains(&size) {
             true => Ok(()),
             false => fail(format!("{name} is {size}, must be 1 to {max}")),
         };
-        let check = |name: &str, size| check_within(DIMENSION_MAX, name, size);
+        let check = |name: &str, size| check_up_to(DIMENSION_MAX, name, size);
         check("height", self.height)?;
         check("width", self.width)?;
         check("input_channels", self.input_channels)?;
-        check_within(ACTIONS_MAX, "num_actions", self.num_actions)?;
+        check_up_to(ACTIONS_MAX, "num_actions", self.num_actions)?;
         check("atoms", self.atoms)?;
         check("hidden", self.hidden)?;
         check("embedding_dim", self.embedding_dim)?;

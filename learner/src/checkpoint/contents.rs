@@ -86,8 +86,8 @@ impl StateFile {
         if let Ok(Version { format }) = serde_json::from_slice(text)
             && format != FORMAT
         {
-            return Err(CheckpointError::Other(format!(
-                "{} was written by another version of this program (format {format}, this one reads {FORMAT}): use that version",
+            return Err(CheckpointError::Mismatch(format!(
+                "the checkpoint {} was written by another version of this program (format {format}, this one reads {FORMAT}): use that version",
                 folder.display()
             )));
         }

@@ -24,8 +24,8 @@ pub enum CheckpointError {
     )]
     Damaged { file: PathBuf, why: String },
     /// Another version of this program wrote the checkpoint, or its run had another network or another estimator of the affinity.
-    #[error("the checkpoint {0}")]
-    Other(String),
+    #[error("{0}")]
+    Mismatch(String),
     #[error(
         "{folder} belongs to a run with specification {found}, this run's is {expected}: \
          resume with the settings it was made with, or choose another folder"

@@ -109,8 +109,8 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
     let torso = description::first_difference("model.torso", &saved["torso"], &ours["torso"]);
     match torso.or_else(|| description::first_difference("model", saved, &ours)) {
         None => Ok(()),
-        Some((key, found, expected)) => Err(CheckpointError::Other(format!(
-            "{} was saved with {key} = {found}, this run has {key} = {expected}: resume with the settings it was made with, or choose \
+        Some((key, found, expected)) => Err(CheckpointError::Mismatch(format!(
+            "the checkpoint {} was saved with {key} = {found}, this run has {key} = {expected}: resume with the settings it was made with, or choose \
              another folder",
             path.display()
         ))),

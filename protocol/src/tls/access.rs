@@ -221,4 +221,11 @@ mod tests {
             assert_eq!(lists.concat().join(" "), expected);
         }
     }
+
+    #[test]
+    fn zenoh_takes_the_rules() {
+        let mut config = zenoh::Config::default();
+        let rules = access_rules(&Keys::new("a/b").unwrap());
+        config.insert_json5("access_control", &rules).unwrap();
+    }
 }

@@ -110,11 +110,13 @@ pub fn decode_from<M: Message>(
     pool: &BufferPool,
     spec_hash: Option<u64>,
 ) -> Result<(M, Buffer), CodecError> {
-    let need = PREFIX_BYTES;
     let mut prefix = [0; PREFIX_BYTES];
     bytes
         .read_exact(&mut prefix)
-        .map_err(|_| CodecError::Length { have: len, need })?;
+        .map_err(|_| CodecError::Length {
+            have: len,
+            need: PREFIX_BYTES,
+        })?;
     let prefix = Prefix::decode(&prefix, len)?;
     let mut sum = prefix.start_checksum();
     let mut header = vec![0; prefix.header_len()];

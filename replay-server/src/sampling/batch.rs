@@ -120,7 +120,7 @@ impl BatchSampler {
         let mut places = HashMap::new();
         for &NeededFrame { row, index } in states {
             let stack = self.rules.stack_indices(ring, index);
-            for index in stack.expect("an anchor whose stack is held") {
+            for index in stack.expect("the anchor's check found its stack held") {
                 let place = places.entry(index).or_insert_with(|| {
                     frames.push(NeededFrame { row, index });
                     frames.len() as u32 - 1

@@ -307,7 +307,10 @@ impl Launch<'_> {
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
         let view = &mut self.poller.view;
-        self.recorder.record(view, &[]);
+        // A run whose servers never answered has no row.
+        if !view.servers.is_empty() {
+            self.recorder.record(view, &[]);
+        }
         let logs = self.processes.iter().filter_map(|it| it.log.loss_message());
         let missing = console::join_losses(self.recorder.loss_messages().into_iter().chain(logs));
         missing.iter().for_each(|line| console::eprintln(line));

@@ -57,8 +57,9 @@ impl SavedState {
     fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;
-        // `resume::prepare` has checked that the checkpoint is of a run in lockstep.
-        let bytes = checkpoint::read_companion(path)?.unwrap_or_default();
+        // `resume::prepare` has checked that there is one.
+        let bytes = checkpoint::read_companion(path)?
+            .context("a checkpoint of a run in lockstep has a companion")?;
         let content = bytes.strip_prefix(&SAVED_STATE_FORMAT.to_le_bytes()).with_context(|| {
             let path = path.display();
             usage!("{path} is a lockstep checkpoint of another version of driml: resume with that version")
@@ -247,7 +248,10 @@ impl Lockstep {
                     break;
                 }
                 InsertReply::OutOfOrder { expected } => {
-                    bail!("actor {id} must continue at chunk {expected}")
+                    bail!(
+                        "actor {id} is at chunk {}, not {expected}",
+                        chunk.header.sequence
+                    )
                 }
                 InsertReply::Refused { why } => bail!("the replay rejected a chunk: {why}"),
             }

@@ -5,7 +5,7 @@ use std::{ffi::OsString, fs, path::Path};
 
 use anyhow::Context;
 use driml_learner::checkpoint;
-use driml_machine::units::count;
+use driml_machine::{error::usage, units::count};
 use serde::Deserialize;
 
 use super::{
@@ -42,7 +42,13 @@ impl EvaluationRow {
     /// The file is not a table of evaluations, or cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
-        Ok(Table::read(&path)?.parse_rows(&path)?)
+        let rows = Table::read(&path)?.parse_rows(&path);
+        rows.with_context(|| {
+            usage!(
+                "{} is not a table of evaluations: move it away",
+                path.display()
+            )
+        })
     }
 
     /// The kept best checkpoint, with the evaluation of it that has the most episodes; none if none is kept.
@@ -209,7 +215,7 @@ mod tests {
         assert!(at.eq(first.into_iter().chain(others)), "{all:?}");
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
         let said = EvaluationRow::all(&folder).unwrap_err().to_string();
-        assert!(said.contains("is not a row of evaluations"), "{said}");
+        assert!(said.contains("is not a table of evaluations"), "{said}");
     }
 
     #[test]

@@ -192,6 +192,8 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
             fs::write(run.metrics(), text).unwrap();
         }
         let recorder = open(&run, &["actor-0"], Some(point(31))).unwrap();
+        let aside = fs::read_to_string(run.path().join("episodes.aside-1.csv")).unwrap();
+        assert!(aside.ends_with("length\n3.0,2400,3,0,2,1,3\n"), "{aside}");
         let rows = |name: &str| Table::read(&run.path().join(name)).unwrap().rows.len();
         assert_eq!(rows("episodes.csv"), 2, "{what}");
         assert_eq!(rows("episodes.aside-1.csv"), 1, "{what}");

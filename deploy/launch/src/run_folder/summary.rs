@@ -162,9 +162,11 @@ impl Summary {
 
     pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.summary();
-        match path.exists() {
-            true => fs::remove_file(&path).with_context(|| format!("removing {}", path.display())),
-            false => Ok(()),
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                Err(e).with_context(|| format!("removing {}", path.display()))
+            }
+            _ => Ok(()),
         }
     }
 

@@ -68,7 +68,10 @@ impl Display {
 
     /// Shows the state of the run, and notes below it, such as which process does not answer.
     pub(crate) fn show(&mut self, view: &RunView) {
-        if view.learner.updates > view.after_updates.unwrap_or(0) {
+        if view
+            .after_updates
+            .is_some_and(|it| view.learner.updates > it)
+        {
             self.learning_since.get_or_insert_with(Instant::now);
         }
         let mut texts = self.lines(view).to_vec();

@@ -139,7 +139,9 @@ impl Poller {
 
     /// Asks only the learner.
     pub fn poll_learner(&mut self) -> anyhow::Result<()> {
-        let learner: LearnerStatus = self.servers[0].client.fetch(ANSWER_MAX)?;
+        let first = self.servers.first();
+        let first = first.context("no replay server is connected")?;
+        let learner: LearnerStatus = first.client.fetch(ANSWER_MAX)?;
         self.view.set_learner(Some(learner));
         Ok(())
     }

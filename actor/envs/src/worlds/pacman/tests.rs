@@ -167,6 +167,7 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
     game.ghosts[0].mode = Mode::Follow;
     // The boost counts in the step in which it is taken.
     assert_eq!(step(&mut world, 3), (5.0 + 20.0, StepEnd::Running));
+    assert_eq!(world.envs[0].game.pellets_left, MAZE.pellets);
     let pixel = MAZE.pixel(boost) * 3;
     for after in 1..=11 {
         let (colour, expected) = match after {

@@ -142,6 +142,11 @@ fn wrong_settings_are_refused_without_an_engine() {
         fails(config.validate(), &[text]);
         fails(ProcgenWorld::new(&config, 1, 1, 0), &[text]);
     };
+    let extreme = "maze has no distribution mode \"extreme\"";
+    refused(
+        |it| it.distribution_mode = DistributionMode::Extreme,
+        extreme,
+    );
     refused(|it| it.num_levels = u32::MAX, "num_levels = 4294967295");
     // The engine's own options are checked too; `procgen-sys` tests each of them.
     refused(|it| (it.num_levels, it.start_level) = (0, 3), "no effect");
