@@ -1,11 +1,9 @@
 //! Settings that float64 holds and float32 does not are rejected by name before anything is learned.
 //! The tests beside each routine check the computation within the ranges.
 
-use driml_learner::{AffinityConfig, UpdateSettings};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use driml_learner::UpdateSettings;
 
-use crate::synthetic::{ALL_DIM, check_says, settings};
+use crate::synthetic::{ALL_DIM, settings};
 
 /// A setting's name, values that are rejected, and values that are accepted.
 const RANGES: &str = "
@@ -45,28 +43,5 @@ fn what_float32_does_not_hold_is_refused_by_name() {
         for value in taken.split_whitespace() {
             with_value(name, value.parse().unwrap()).validate().unwrap();
         }
-    }
-}
-
-/// Invalid settings of either affinity estimator, and their errors.
-const AFFINITY: &str = "
-exact = { decay = 0.0, smoothing = 1.0 }    : decay = 0.0
-exact = { decay = 1.1, smoothing = 1.0 }    : decay = 1.1
-exact = { decay = nan, smoothing = 1.0 }    : decay = NaN
-exact = { decay = 0.9, smoothing = 0.0 }    : smoothing = 0.0
-exact = { decay = 0.9, smoothing = 1e-320 } : smoothing = 1e-320
-exact = { decay = 0.9, smoothing = 1e306 }  : smoothing = 1e306
-visible = [0, 2]                            : action 1 maps to 2
-learned = { hidden = 8, lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8, keep = 1.0 } : keep = 1.0
-";
-
-#[test]
-fn numbers_of_an_affinity_are_refused_by_name() {
-    for line in AFFINITY.trim().lines() {
-        let (numbers, said) = line.split_once(" : ").unwrap();
-        let table = format!("estimator = 'none'\n{numbers}");
-        let table: AffinityConfig = toml::from_str(&table).unwrap();
-        let estimator = table.make_estimator(2, &mut ChaCha8Rng::seed_from_u64(1));
-        check_says(estimator.unwrap_err(), &["learner.affinity", said]);
     }
 }

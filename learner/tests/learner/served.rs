@@ -208,14 +208,6 @@ fn a_refused_batch_draws_nothing() {
     assert_eq!(after, new_learner(&config).update(&good).unwrap());
 }
 
-/// The other refusals are among those of the settings.
-#[test]
-fn without_an_auxiliary_loss_nothing_is_augmented() {
-    let mut c51 = config(DIM, Some(PAPER)).learner;
-    c51.update.auxiliary_loss = AuxiliaryKind::NONE;
-    check_says(c51.validate().unwrap_err(), &["this agent has none"]);
-}
-
 /// The probability of each row weights its C51 loss alone, at the update's beta. The row's unweighted loss is reported.
 #[test]
 fn rows_drawn_by_priority_are_weighted_and_answered() {

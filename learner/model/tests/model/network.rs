@@ -165,32 +165,28 @@ fn inputs_that_do_not_fit_are_errors() {
     assert!(network.logits(&narrow, None).is_err());
 }
 
+/// The settings' snapshot of refusals has the answers to configurations that can be set.
 #[test]
 fn configurations_that_cannot_work_are_errors() {
-    let fails = |change: fn(&mut ModelConfig)| {
-        let mut config = small();
-        change(&mut config);
-        assert!(
-            matches!(config.validate(), Err(ModelError::Config(_))),
-            "{config:?}"
-        );
+    let fails = |config: ModelConfig| {
+        let checked = config.validate();
+        assert!(matches!(checked, Err(ModelError::Config(_))), "{config:?}");
         assert!(Parameters::init(&config, &mut rng(1), &Device::Cpu).is_err());
     };
+    let changes: [fn(&mut ModelConfig); 6] = [
+        |config| config.height = 11,
+        |config| config.input_channels = usize::MAX,
+        |config| config.num_actions = 256,
+        |config| config.v_min = -3e38,
+        |config| config.v_max = 1e38,
+        |config| *config = residual(TorsoName::Nature),
+    ];
     assert!(small().validate().is_ok());
-    fails(|config| config.height = 0);
-    fails(|config| config.height = 11);
-    fails(|config| config.input_channels = usize::MAX);
-    fails(|config| config.num_actions = 256);
-    fails(|config| config.atoms = 1);
-    fails(|config| config.v_max = config.v_min);
-    fails(|config| config.v_min = f32::NAN);
-    fails(|config| config.v_min = -3e38);
-    fails(|config| config.v_max = 1e38);
-    fails(|config| config.conv.clear());
-    fails(|config| config.channels = vec![4]);
-    fails(|config| config.scale_blocks = true);
-    fails(|config| config.torso = TorsoName::Impala);
-    fails(|config| *config = residual(TorsoName::Nature));
+    for change in changes {
+        let mut config = small();
+        change(&mut config);
+        fails(config);
+    }
     for torso in [TorsoName::Impala, TorsoName::Impoola] {
         let residual = residual(torso);
         assert!(residual.validate().is_ok());
@@ -198,8 +194,8 @@ fn configurations_that_cannot_work_are_errors() {
             channels: channels.to_vec(),
             ..residual.clone()
         };
-        for channels in [&[][..], &[0], &[8, 0], &[usize::MAX], &[65_536]] {
-            assert!(with(channels).validate().is_err(), "{channels:?}");
+        for channels in [&[usize::MAX][..], &[65_536]] {
+            fails(with(channels));
         }
         // The smallest possible frame.
         let one = ModelConfig {
@@ -209,10 +205,6 @@ fn configurations_that_cannot_work_are_errors() {
         };
         assert!(one.validate().is_ok() && one.f3_shape() == (1, 1, 3));
     }
-    fails(|config| config.conv[1].kernel = 9);
-    fails(|config| config.conv[0].stride = 0);
-    fails(|config| config.conv[2].out = 0);
-    fails(|config| (config.hidden, config.embedding_dim) = (65_536, 65_536));
 }
 
 #[test]
