@@ -1,7 +1,7 @@
 //! Augmentation: its distribution, its bounds, and that it changes no byte at strength 0.
 //! `driml experiment stability` checks what a crop, factors and a turn make of each byte.
 
-use driml_learner::{AugmentSettings, Augmenter, augment::View};
+use driml_learner::{AugmentSettings, Augmenter};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -73,29 +73,9 @@ fn crops_are_of_a_share_of_each_side() {
     }
 }
 
-/// Every position of the crop is equally frequent.
+/// The crop's position, the factors and the turn: within their bounds, equally frequent in 14 bins, and independent of one another.
 #[test]
-fn crops_are_anywhere_with_equal_chances() {
-    let augment = Augmenter::new(PAPER, (64, 64, 3), 3);
-    assert_eq!(augment.crop(), (51, 51));
-    let mut rng = rng(7);
-    let places = 14;
-    let mut counts = [[0u32; 14]; 2];
-    let mut both = vec![0u32; places * places];
-    for _ in 0..28_000 {
-        let View { top, left, .. } = augment.draw(&mut rng);
-        counts[0][top] += 1;
-        counts[1][left] += 1;
-        both[top * places + left] += 1;
-    }
-    // 99.9% quantiles for 13 and 195 degrees of freedom.
-    assert!(chi_square(&counts[0]) < 34.5 && chi_square(&counts[1]) < 34.5);
-    assert!(chi_square(&both) < 262.0, "{}", chi_square(&both));
-}
-
-/// Factors and turn: within their bounds, uniform over ten bins, and not the same for all.
-#[test]
-fn jitter_is_uniform_within_its_strength() {
+fn every_draw_is_uniform_within_its_strength() {
     let settings = AugmentSettings {
         brightness: 0.1,
         contrast: 0.2,
@@ -104,14 +84,18 @@ fn jitter_is_uniform_within_its_strength() {
         ..PAPER
     };
     let augment = Augmenter::new(settings, (64, 64, 3), 3);
-    let mut rng = rng(8);
-    let draws = 20_000;
-    let mut bins = [[0u32; 10]; 4];
-    let mut products = [0.0; 3];
+    assert_eq!(augment.crop(), (51, 51));
+    let (mut rng, draws) = (rng(7), 28_000);
+    let (mut bins, mut places) = ([[0u32; 14]; 6], vec![0u32; 14 * 14]);
+    let mut products = [0.0; 5];
     for _ in 0..draws {
         let view = augment.draw(&mut rng);
+        places[view.top * 14 + view.left] += 1;
+        let place = |at: usize| (2 * at + 1) as f64 / 14.0 - 1.0;
         // Each relative to its range, from -1 to 1.
         let shares = [
+            place(view.top),
+            place(view.left),
             (view.brightness - 1.0) / 0.1,
             (view.contrast - 1.0) / 0.2,
             (view.saturation - 1.0) / 0.3,
@@ -119,16 +103,15 @@ fn jitter_is_uniform_within_its_strength() {
         ];
         for (bins, share) in bins.iter_mut().zip(shares) {
             assert!((-1.0 - 1e-9..=1.0 + 1e-9).contains(&share), "{view:?}");
-            bins[(((share + 1.0) * 5.0) as usize).min(9)] += 1;
+            bins[(((share + 1.0) * 7.0) as usize).min(13)] += 1;
         }
         for (product, pair) in products.iter_mut().zip(shares.windows(2)) {
             *product += pair[0] * pair[1];
         }
     }
-    for bins in bins {
-        let far = chi_square(&bins);
-        assert!(far < 27.9, "9 degrees of freedom, 99.9%: {bins:?}");
-    }
+    // 99.9% quantiles for 13 and 195 degrees of freedom.
+    assert!(bins.iter().all(|it| chi_square(it) < 34.5), "{bins:?}");
+    assert!(chi_square(&places) < 262.0, "{}", chi_square(&places));
     for product in products {
         // Standard deviation of a product of two such shares: 1/3.
         assert!((product / f64::from(draws)).abs() < 4.0 / 3.0 / f64::from(draws).sqrt());

@@ -6,7 +6,7 @@ use driml_model::Kernels;
 
 use crate::agents::{GLOBAL, curl_table};
 use crate::synthetic::{
-    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, model, new_agent, pool, random_batch, settings,
+    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, NONE, model, new_agent, pool, random_batch, settings,
 };
 
 const ROWS: usize = 40;
@@ -81,7 +81,7 @@ fn rows_with(repeat: Repeat) -> OwnedBatch {
 fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alone() {
     for precision in [Precision::F32, Precision::Bf16] {
         for (auxiliary_loss, lambda) in [
-            (AuxiliaryKind::NONE, NO_DIM),
+            (NONE, NO_DIM),
             (DIM, ALL_DIM),
             (CPC, ALL_DIM),
             (CURL, GLOBAL),

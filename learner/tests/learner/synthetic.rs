@@ -15,6 +15,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 pub(crate) const ACTIONS: usize = 4;
+pub(crate) const NONE: AuxiliaryKind = AuxiliaryKind::NONE;
 pub(crate) const DIM: AuxiliaryKind = AuxiliaryKind::from_item(&dim::DIM);
 pub(crate) const CPC: AuxiliaryKind = AuxiliaryKind::from_item(&cpc::CPC);
 pub(crate) const CURL: AuxiliaryKind = AuxiliaryKind::from_item(&curl::CURL);
@@ -60,11 +61,7 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
 pub(crate) fn settings(lambda: Lambda) -> UpdateSettings {
     UpdateSettings {
         double_dqn: false,
-        auxiliary_loss: if lambda == NO_DIM {
-            AuxiliaryKind::NONE
-        } else {
-            DIM
-        },
+        auxiliary_loss: if lambda == NO_DIM { NONE } else { DIM },
         condition_on_action: lambda != NO_DIM,
         lambda,
         tanh_clip: 20.0,
@@ -100,7 +97,6 @@ pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
     new_agent(model(lambda), settings(lambda), compute, seed)
 }
 
-/// An agent with the given head.
 pub(crate) fn agent_with(head: HeadConfig, settings: UpdateSettings, seed: u64) -> Agent {
     let model = ModelConfig {
         head,
