@@ -12,6 +12,7 @@ mod cuda;
 mod deduplicate;
 mod errors;
 mod insight;
+mod parity;
 mod ranges;
 mod served;
 mod synthetic;
