@@ -8,6 +8,7 @@ use driml_learner::{
     checkpoint::{self, CheckpointError, LearnerState},
 };
 use driml_model::Compute;
+use serde_json::{Value, json};
 use tempfile::tempdir;
 
 use crate::{
@@ -21,7 +22,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
     let folder = tempdir().unwrap();
     let mut run = initial_state();
     learn(&mut run, 1);
-    let description = serde_json::json!({ "model": model(ALL_DIM) }).to_string();
+    let description = json!({ "model": model(ALL_DIM) }).to_string();
     let path = try_save(&run, folder.path(), 1, &description).unwrap();
     for name in [
         "online.safetensors",
@@ -72,7 +73,7 @@ fn a_checkpoint_of_another_format_is_rejected() {
     for unknown in [0, 3, 5] {
         // Another format may have any other fields.
         change_state(&path, |state| {
-            *state = serde_json::json!({ "format": unknown, "field": 1 });
+            *state = json!({ "format": unknown, "field": 1 });
         });
         let said = format!("another version of this program (format {unknown}, this one reads 4)");
         check_says(load(folder.path()).unwrap_err(), &[&said]);
@@ -101,6 +102,11 @@ fn a_state_that_is_not_finite_is_not_saved() {
     }
 }
 
+/// A change of one place in state.json.
+fn set(place: &'static str, value: Value) -> impl Fn(&mut Value) {
+    move |state| *state.pointer_mut(place).unwrap() = value.clone()
+}
+
 /// Files with a valid checksum, as an attacker may write them.
 #[test]
 fn arrays_and_counts_that_no_learner_wrote_are_damage() {
@@ -111,7 +117,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     let exact = ExactAffinity::new(Alphabet::raw(ACTIONS).unwrap(), exact).unwrap();
     let mut run = initial_state();
     let learned = run.affinity.clone().unwrap();
-    let refused = |run: &LearnerState, change: &dyn Fn(&mut serde_json::Value), said: &str| {
+    let refused = |run: &LearnerState, change: &dyn Fn(&mut Value), said: &str| {
         let folder = tempdir().unwrap();
         let path = save(run, folder.path(), 1);
         load(folder.path()).unwrap().unwrap();
@@ -131,8 +137,8 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
         run.affinity = Some(affinity);
         learn(&mut run, 1);
         for name in arrays {
-            let change = |change: fn(&mut Vec<serde_json::Value>)| {
-                move |state: &mut serde_json::Value| {
+            let change = |change: fn(&mut Vec<Value>)| {
+                move |state: &mut Value| {
                     change(state["affinity"][*name].as_array_mut().unwrap());
                 }
             };
@@ -142,37 +148,30 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
             // JSON's form of a number that is not finite.
             refused(&run, &change(|values| values[0] = ().into()), "state.json");
         }
-        for (raw, len) in [
+        for (index, len) in [
             (vec![], 0),
             (vec![9, 9], 1),
             (vec![0, 2], 3),
             (vec![0; 300], 1),
         ] {
-            let change = |state: &mut serde_json::Value| {
-                state["affinity"]["alphabet"]["index"] = raw.clone().into();
-                state["affinity"]["alphabet"]["len"] = len.into();
-            };
-            refused(&run, &change, "alphabet");
+            let alphabet = json!({ "index": index, "len": len });
+            refused(&run, &set("/affinity/alphabet", alphabet), "alphabet");
         }
     }
-    let huge = |state: &mut serde_json::Value| state["affinity"]["settings"]["decay"] = 2.into();
-    refused(&run, &huge, "decay = 2");
+    let decay = set("/affinity/settings/decay", 2.into());
+    refused(&run, &decay, "decay = 2");
     run.affinity = initial_state().affinity;
-    for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
-        let change =
-            |state: &mut serde_json::Value| state["affinity"]["settings"][key] = value.into();
-        refused(&run, &change, &format!("{key} = "));
-    }
-    for key in ["updates", "adam_step", "weights_version"] {
-        let change = |state: &mut serde_json::Value| state[key] = u64::MAX.into();
-        refused(&run, &change, key);
-    }
-    for (key, value) in [
-        ("seed", serde_json::json!([1, 2])),
-        ("word_pos", (-1).into()),
+    for (place, value, said) in [
+        ("/affinity/settings/hidden", json!(u64::MAX), "hidden = "),
+        ("/affinity/settings/lr", json!(0), "lr = "),
+        ("/affinity/settings/keep", json!(1), "keep = "),
+        ("/updates", json!(u64::MAX), "updates"),
+        ("/adam_step", json!(u64::MAX), "adam_step"),
+        ("/weights_version", json!(u64::MAX), "weights_version"),
+        ("/rng/seed", json!([1, 2]), "state.json"),
+        ("/rng/word_pos", json!(-1), "state.json"),
     ] {
-        let change = |state: &mut serde_json::Value| state["rng"][key] = value.clone();
-        refused(&run, &change, "state.json");
+        refused(&run, &set(place, value), said);
     }
 }
 
