@@ -98,7 +98,6 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
     }
 }
 
-/// An agent with the learning rate `lr`.
 fn agent_with_lr(compute: &Compute, lr: f64) -> Agent {
     let mut settings = settings(ALL_DIM);
     settings.adam.lr = lr;

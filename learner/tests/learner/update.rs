@@ -1,55 +1,13 @@
 //! Properties of every update, and state that no update may touch.
 //! `parity` compares with outside numbers; at extreme inputs, the property "whole update" of `driml experiment stability` does.
 
-use candle_core::Device;
 use driml_learner::{UpdateNoise, UpdateSettings};
-use driml_model::{HeadConfig, Parameters};
-use driml_protocol::NO_ACTION;
+use driml_model::HeadConfig;
 
 use crate::synthetic::{
     ALL_DIM, CANDLE, NO_DIM, agent, agent_on, agent_with, check_says, random_batch, settings,
     values,
 };
-
-#[test]
-fn rows_without_a_bootstrap_ignore_what_comes_after() {
-    for ended in [&[0, 1, 2, 3, 4, 5][..], &[1, 4]] {
-        let mut rows = random_batch(6, 9);
-        rows.bootstrap_discount.fill(0.93);
-        let (agent, len) = (agent(NO_DIM, 10), rows.states_n.len() / 6);
-        for &row in ended {
-            rows.bootstrap_discount[row] = 0.0;
-        }
-        let first = agent.evaluate(&rows.batch()).unwrap();
-        for &row in ended {
-            rows.states_n[row * len..][..len].fill(0);
-        }
-        let second = agent.evaluate(&rows.batch()).unwrap();
-        assert_eq!(first.target_projection, second.target_projection);
-        assert_eq!(first.total, second.total);
-        assert_eq!(first.next_greedy_action, second.next_greedy_action);
-        for (row, law) in first.target_projection.chunks_exact(21).enumerate() {
-            assert!((law.iter().sum::<f32>() - 1.0).abs() < 1e-6);
-            let action = first.next_greedy_action[row];
-            assert_eq!(ended.contains(&row), action == NO_ACTION);
-            if ended.contains(&row) {
-                // All of the row's probability is at its return, on the two atoms around it.
-                assert!(law.iter().filter(|&&p| p > 0.0).count() <= 2, "{law:?}");
-            }
-        }
-    }
-}
-
-#[test]
-fn actors_get_torso_and_head_and_nothing_else() {
-    let agent = agent(ALL_DIM, 24);
-    let bytes = agent.weights().unwrap();
-    let acting = agent.model().without_dim();
-    let loaded = Parameters::load_safetensors(&acting, &bytes, &Device::Cpu).unwrap();
-    let mut expected = values(agent.online());
-    expected.retain(|name, _| !name.starts_with("dim."));
-    assert_eq!(values(&loaded), expected);
-}
 
 #[test]
 fn gradients_hold_nothing_of_the_pass_that_they_come_from() {

@@ -8,7 +8,7 @@ use driml_model::{
 };
 
 use crate::support::{
-    assert_close, bits, configs, floats, frames, parameters, pool, residual, rng, small, variable,
+    assert_close, bits, configs, floats, frames, parameters, pool, residual, rng, small,
     with_biases,
 };
 
@@ -142,8 +142,8 @@ fn inputs_that_do_not_fit_are_errors() {
     let network = Network::new(&config, &parameters(&config, 1), Kernels::FUSED).unwrap();
     let batch = frames(&config, 2, &mut rng(6));
     let features = network.features(&batch).unwrap();
-    let floats = batch.to_dtype(DType::F32);
-    for bad in [floats, batch.narrow(1, 0, 35), batch.get(0)] {
+    let not_bytes = batch.to_dtype(DType::F32);
+    for bad in [not_bytes, batch.narrow(1, 0, 35), batch.get(0)] {
         assert!(network.features(&bad.unwrap()).is_err());
     }
     for wrong in [5i64, -1] {
@@ -163,6 +163,8 @@ fn inputs_that_do_not_fit_are_errors() {
     assert!(network.taken_logits(&none, &[], None).is_err());
     let narrow = features.f4.narrow(1, 0, 5).unwrap();
     assert!(network.logits(&narrow, None).is_err());
+    let [psi, phi] = [[5, 3, 7], [5, 2, 7]].map(|shape| floats(&shape, &mut rng(7)));
+    assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());
 }
 
 /// The settings' snapshot of refusals has the answers to configurations that can be set.
@@ -205,57 +207,4 @@ fn configurations_that_cannot_work_are_errors() {
         };
         assert!(one.validate().is_ok() && one.f3_shape() == (1, 1, 3));
     }
-}
-
-#[test]
-fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
-    let config = small();
-    let (parameters, batch) = (with_biases(&config), frames(&config, 9, &mut rng(4)));
-    let network = Network::new(&config, &parameters, Kernels::FUSED).unwrap();
-    // Every parameter is used twice, once for each half of the batch.
-    let features = network.features(&batch).unwrap();
-    let halves = [features.narrow(0, 4)?, features.narrow(4, 5)?];
-    let losses = halves.map(|half| network.logits(&half.f4, None).unwrap().sqr()?.sum_all());
-    let [first, second] = losses;
-    let loss = (first? + second?)?;
-    let (wanted, mut found) = (loss.backward()?, Backward::of(&loss)?);
-    let mut compared = 0;
-    for (name, var) in parameters.iter() {
-        let gradient = found.remove(var)?;
-        assert_eq!(gradient.is_some(), wanted.get(var).is_some(), "{name}");
-        if let (Some(found), Some(wanted)) = (gradient, wanted.get(var)) {
-            assert_close(name, &found, wanted, 1e-6);
-            compared += 1;
-        }
-    }
-    assert_eq!(compared, 8 + 2, "torso and head");
-    Ok(())
-}
-
-#[test]
-fn dot_products_and_their_gradients_are_candle_s() -> Result<()> {
-    let rng = &mut rng(6);
-    let (local, global) = ([5, 3, 7], [5, 7]);
-    for (psi, phi) in [
-        (&local[..], &local[..]),
-        (&local, &global),
-        (&global, &local),
-        (&global, &global),
-    ] {
-        let args = [variable(psi, rng), variable(phi, rng)];
-        let dots = |kernels: Kernels| kernels.dot_products(&args[0], &args[1]);
-        let [ours, theirs] = [dots(Kernels::FUSED)?, dots(Kernels::Candle)?];
-        let what = format!("dots of {psi:?} and {phi:?}");
-        assert_close(&what, &ours, &theirs, 1e-6);
-        let slope = floats(ours.dims(), rng);
-        let gradients = |dots: &Tensor| (dots * &slope)?.sum_all()?.backward();
-        let [ours, theirs] = [gradients(&ours)?, gradients(&theirs)?];
-        for arg in &args {
-            let [ours, theirs] = [&ours, &theirs].map(|it| it.get(arg).unwrap());
-            assert_close(&what, ours, theirs, 3e-6);
-        }
-    }
-    let (psi, phi) = (variable(&[5, 3, 7], rng), variable(&[5, 2, 7], rng));
-    assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());
-    Ok(())
 }

@@ -1,7 +1,7 @@
 //! Helpers of several tests: random tensors, comparisons, small networks.
 //! This file holds no tests.
 
-use candle_core::{DType, Device, Result, Tensor, Var};
+use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
     ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, PolicyNetwork, Precision, TorsoName,
 };
@@ -12,18 +12,11 @@ pub(crate) fn rng(seed: u64) -> ChaCha8Rng {
     ChaCha8Rng::seed_from_u64(seed)
 }
 
-/// Uniform on [-1, 1).
-pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f32 {
-    (rng.next_u32() >> 8) as f32 / (1 << 23) as f32 - 1.0
-}
-
+/// Values uniform on [-1, 1).
 pub(crate) fn floats(shape: &[usize], rng: &mut ChaCha8Rng) -> Tensor {
-    let values: Vec<f32> = (0..shape.iter().product()).map(|_| uniform(rng)).collect();
+    let uniform = |_| (rng.next_u32() >> 8) as f32 / (1 << 23) as f32 - 1.0;
+    let values: Vec<f32> = (0..shape.iter().product()).map(uniform).collect();
     Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
-}
-
-pub(crate) fn variable(shape: &[usize], rng: &mut ChaCha8Rng) -> Var {
-    Var::from_tensor(&floats(shape, rng)).unwrap()
 }
 
 pub(crate) fn bytes(len: usize, rng: &mut ChaCha8Rng) -> Vec<u8> {
