@@ -224,25 +224,6 @@ fn counts_that_do_not_fit_their_payload_are_refused() {
 }
 
 #[test]
-fn what_no_world_gives_is_refused() {
-    let decode = |change: &dyn Fn(&mut Vec<u8>)| {
-        let mut payload = chunk().payload().to_vec();
-        change(&mut payload);
-        read_chunk(&codec::encode(SPEC, &chunk().header, &payload).unwrap())
-    };
-    assert_eq!(decode(&|_| {}), Ok(()));
-    let refused = |change: &dyn Fn(&mut Vec<u8>), words: &str| {
-        let said = decode(change).unwrap_err().to_string();
-        assert!(said.contains(words), "{said}");
-    };
-    refused(&|it| it[36 + 5] = 4, "unknown end 4");
-    for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let reward = reward.to_le_bytes();
-        refused(&|it| it[42 + 4..42 + 8].copy_from_slice(&reward), "row 1");
-    }
-}
-
-#[test]
 fn what_no_process_says_is_refused() {
     let episodes = EpisodesReply {
         ended: 8,
@@ -280,6 +261,17 @@ fn what_no_process_says_is_refused() {
         (refusal(&recovering(1.0), &[1]), "1 bytes of payload follow"),
         (refusal(&fewer, &[]), "1 priorities of 2"),
     ];
+    let chunk_with = |at: usize, bytes: [u8; 4]| {
+        let mut payload = chunk().payload().to_vec();
+        payload[at..at + 4].copy_from_slice(&bytes);
+        let bytes = codec::encode(SPEC, &chunk().header, &payload).unwrap();
+        read_chunk(&bytes).unwrap_err().to_string()
+    };
+    // The ends of six rows begin at byte 36, their rewards at 42.
+    refused.push((chunk_with(36, [0, 0, 0, 4]), "unknown end 4"));
+    for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        refused.push((chunk_with(42 + 4, reward.to_le_bytes()), "row 1"));
+    }
     for report in [report(&long, 1.0, "", 0.0), report("", 1.0, &long, 0.0)] {
         refused.push((refusal(&report, &[]), "more than 80 bytes"));
     }
