@@ -2,7 +2,7 @@
 //! This module does not know the role of the process.
 
 use std::{
-    io::{BufRead, BufReader, Read},
+    io::Read,
     os::unix::process::ExitStatusExt,
     process::{Child, Command, Stdio},
     sync::{Arc, Mutex},
@@ -38,30 +38,28 @@ pub struct Exit {
     pub stderr: String,
 }
 
-/// The text read from one pipe so far, and the thread that keeps reading.
+/// The bytes read from one pipe so far, and the thread that keeps reading.
 #[derive(Debug)]
 struct PipeReader {
-    text: Arc<Mutex<String>>,
+    bytes: Arc<Mutex<Vec<u8>>>,
     reader: JoinHandle<()>,
 }
 
 impl PipeReader {
-    fn start(pipe: impl Read + Send + 'static) -> Self {
-        let text = Arc::<Mutex<String>>::default();
-        let sink = text.clone();
+    fn start(mut pipe: impl Read + Send + 'static) -> Self {
+        let bytes = Arc::<Mutex<Vec<u8>>>::default();
+        let sink = bytes.clone();
         let reader = thread::spawn(move || {
-            for line in BufReader::new(pipe).split(b'\n') {
-                let Ok(line) = line else { return };
-                let mut sink = sink.lock().unwrap();
-                sink.push_str(&String::from_utf8_lossy(&line));
-                sink.push('\n');
+            let mut buffer = [0; 4096];
+            while let Ok(count @ 1..) = pipe.read(&mut buffer) {
+                sink.lock().unwrap().extend_from_slice(&buffer[..count]);
             }
         });
-        Self { text, reader }
+        Self { bytes, reader }
     }
 
     fn text_so_far(&self) -> String {
-        self.text.lock().unwrap().clone()
+        String::from_utf8_lossy(&self.bytes.lock().unwrap()).into_owned()
     }
 }
 
@@ -84,10 +82,7 @@ pub(crate) fn run(command: &mut Command) -> String {
 impl Process {
     /// Starts a command that a test has built; `name` identifies the process in messages.
     pub fn start(name: String, mut command: Command) -> Self {
-        command
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command
             .spawn()
             .unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
@@ -109,6 +104,11 @@ impl Process {
     /// Returns the process ID.
     pub fn pid(&self) -> i32 {
         self.child.id() as i32
+    }
+
+    /// Standard output so far.
+    pub fn stdout(&self) -> String {
+        self.stdout.text_so_far()
     }
 
     /// Standard error so far.
@@ -163,7 +163,7 @@ impl Process {
     /// Waits until the process ends and checks that it failed with `words` on standard error.
     #[track_caller]
     pub fn fails(self, words: &str) -> Exit {
-        self.wait().expect_error(words)
+        self.wait().expect_code(1).expect_stderr(words)
     }
 
     /// Kills the process and waits until it ends.
@@ -215,12 +215,6 @@ impl Exit {
             self.stderr
         );
         self
-    }
-
-    /// Checks for exit code 1 and `words` on standard error.
-    #[track_caller]
-    pub fn expect_error(self, words: &str) -> Self {
-        self.expect_code(1).expect_stderr(words)
     }
 
     /// Parses standard output as JSON.

@@ -4,7 +4,7 @@
 use std::{
     fs,
     path::{Path, PathBuf},
-    process::Command,
+    process::{Command, Stdio},
     sync::atomic::{AtomicU32, AtomicU64, Ordering},
 };
 
@@ -187,6 +187,7 @@ impl TestSystem {
         command
             .args(&line[1..])
             .current_dir(self.folder.path())
+            .stdin(Stdio::null())
             .env(MARK, &self.mark)
             .env_remove("DRIML_LOG");
         let updates = self.pause_at_updates.load(Ordering::Relaxed);
@@ -224,7 +225,7 @@ impl TestSystem {
     /// Runs the program and checks that it fails with `words` on standard error.
     #[track_caller]
     pub fn fails(&self, args: &str, words: &str) -> Exit {
-        self.run(args).expect_error(words)
+        self.run(args).expect_code(1).expect_stderr(words)
     }
 
     /// Runs the program and checks that it rejects its configuration (exit code 64) with `words` on standard error.

@@ -3,83 +3,44 @@
 
 use std::{
     fs::{File, OpenOptions},
-    io::{BufRead, BufReader, Read, pipe},
+    io::{BufRead, BufReader, pipe},
     os::{fd::AsFd, unix::fs::OpenOptionsExt},
-    process::{Child, Stdio},
-    sync::{Arc, Mutex},
-    thread::{self, JoinHandle},
+    process::{Child, Command, Stdio},
+    thread,
     time::Duration,
 };
 
-use driml_protocol::Shutdown;
 use driml_tests::{Outcome, Process, TestSystem, wait_for, wait_until};
 use nix::{
     fcntl::OFlag,
-    poll::{PollFd, PollFlags, poll},
     pty::{grantpt, posix_openpt, ptsname_r, unlockpt},
     sys::signal::Signal,
 };
 
 use crate::{LONG, PROCESSES, start_run, system};
 
-/// A terminal whose window a test can close. Until then a thread reads the terminal's output, as a window does.
-struct Window {
-    closed: Shutdown,
-    shown: Arc<Mutex<Vec<u8>>>,
-    reader: JoinHandle<()>,
-}
-
-impl Window {
-    /// Opens a window. Returns the window, and the terminal that a process writes to.
-    fn open() -> (Self, File) {
-        // Not `openpty`: every process that any test starts meanwhile would inherit its files.
-        let flags = OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC;
-        let mut master = posix_openpt(flags).unwrap();
-        grantpt(&master).unwrap();
-        unlockpt(&master).unwrap();
-        let path = ptsname_r(&master).unwrap();
-        let terminal = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .custom_flags(OFlag::O_NOCTTY.bits())
-            .open(path)
-            .unwrap();
-        let (closed, shown) = <(Shutdown, Arc<Mutex<Vec<u8>>>)>::default();
-        let (is_closed, sink) = (closed.clone(), shown.clone());
-        let reader = thread::spawn(move || {
-            while !is_closed.is_set() {
-                let mut ready = [PollFd::new(master.as_fd(), PollFlags::POLLIN)];
-                if poll(&mut ready, 20_u8).unwrap() > 0 {
-                    let mut bytes = [0; 4096];
-                    let read = master.read(&mut bytes).unwrap();
-                    sink.lock().unwrap().extend_from_slice(&bytes[..read]);
-                }
-            }
-        });
-        let window = Self {
-            closed,
-            shown,
-            reader,
-        };
-        (window, terminal)
-    }
-
-    /// Returns the output so far.
-    fn shown(&self) -> String {
-        String::from_utf8_lossy(&self.shown.lock().unwrap()).into_owned()
-    }
-
-    fn close(self) {
-        self.closed.set();
-        self.reader.join().unwrap();
-    }
+/// Opens a terminal. Returns its window, which is a process that reads what the terminal shows, and the terminal for another process.
+fn open_window() -> (Process, File) {
+    // Not `openpty`: every process that any test starts meanwhile would inherit its files.
+    let flags = OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC;
+    let master = posix_openpt(flags).unwrap();
+    grantpt(&master).unwrap();
+    unlockpt(&master).unwrap();
+    let terminal = OpenOptions::new()
+        .read(true)
+        .write(true)
+        .custom_flags(OFlag::O_NOCTTY.bits())
+        .open(ptsname_r(&master).unwrap())
+        .unwrap();
+    let mut window = Command::new("cat");
+    window.stdin(master.as_fd().try_clone_to_owned().unwrap());
+    (Process::start("a window".into(), window), terminal)
 }
 
 /// Starts the program with the arguments `run`, with standard output and standard error redirected to `out` and `err`.
 fn spawn(system: &TestSystem, run: &str, out: impl Into<Stdio>, err: impl Into<Stdio>) -> Child {
     let mut command = system.command(run);
-    command.stdin(Stdio::null()).stdout(out).stderr(err);
-    command.spawn().unwrap()
+    command.stdout(out).stderr(err).spawn().unwrap()
 }
 
 /// Checks that the launcher exits as after an interrupt: everything is saved, and no process is left.
@@ -94,14 +55,14 @@ fn check_ended_saved(system: &TestSystem, mut launcher: Child) {
 #[test]
 fn a_closed_window_saves_the_run() {
     let system = system();
-    let (window, terminal) = Window::open();
+    let (window, terminal) = open_window();
     let run = system.local_args(&format!("--agent driml-ada {LONG}"));
     let launcher = spawn(&system, &run, terminal.try_clone().unwrap(), terminal);
     system.connect().wait_for_updates(100);
     wait_until("the progress bar", || {
-        window.shown().contains("replay ratio 7")
+        window.stdout().contains("replay ratio 7")
     });
-    window.close();
+    window.kill();
     check_ended_saved(&system, launcher);
 }
 

@@ -21,7 +21,8 @@ fn a_second_interrupt_ends_at_once() {
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again exits at once");
     interrupt_until_it_ends(process)
-        .expect_error("stopped at once by a second interrupt: what was not saved is lost");
+        .expect_code(1)
+        .expect_stderr("stopped at once by a second interrupt: what was not saved is lost");
     system.check_outcome(Outcome::Failed);
 }
 

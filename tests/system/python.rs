@@ -2,9 +2,8 @@
 //! Each test is skipped by name if no Python has the modules that it needs.
 
 use std::{
-    fs,
-    io::Write,
-    process::{Command, Stdio},
+    fs::{self, File},
+    process::Command,
 };
 
 use driml_learner::{
@@ -14,7 +13,7 @@ use driml_learner::{
 use driml_machine::resources::Machine;
 use driml_settings::{config::RunConfig, flags::resolve_names};
 use driml_tests::{
-    TestSystem, check_has, print_line,
+    Process, TestSystem, check_has, print_line,
     python::{find_python, run_script},
 };
 use rand::{RngCore, SeedableRng};
@@ -188,6 +187,9 @@ fn a_helper_without_its_package_says_which() {
     let Some(python) = find_python(&[]) else {
         return;
     };
+    let system = system();
+    let declaration = system.path("declaration");
+    fs::write(&declaration, "{\"driml_env\": 1, \"copies\": 1}\n").unwrap();
     for (script, args, package) in [
         ("optuna_search.py", &[][..], "optuna"),
         ("wandb_offline.py", &["run"], "wandb"),
@@ -200,19 +202,14 @@ fn a_helper_without_its_package_says_which() {
             .arg("-S")
             .arg(root().join("deploy/python").join(script));
         command.args(args).env_remove("PYTHONPATH");
-        command.stdin(Stdio::piped()).stderr(Stdio::piped());
-        let mut process = command.spawn().unwrap();
-        let asks = b"{\"driml_env\": 1, \"copies\": 1}\n";
-        // A script that fails earlier does not read this input.
-        let _ = process.stdin.take().unwrap().write_all(asks);
-        let ended = process.wait_with_output().unwrap();
-        let stderr = String::from_utf8_lossy(&ended.stderr);
+        command.stdin(File::open(&declaration).unwrap());
+        let process = Process::start(script.into(), command);
+        let stderr = process.wait().expect_code(1).stderr;
         let names = format!("{script} needs the package {package}: ");
         let install = format!("-m pip install {package}\n");
         assert!(
             stderr.starts_with(&names) && stderr.ends_with(&install),
             "{stderr}"
         );
-        assert_eq!(ended.status.code(), Some(1));
     }
 }

@@ -65,7 +65,7 @@ fn missing_processes_are_named_with_what_to_do() {
     server.signal(Signal::SIGSTOP);
     let ended = system.run(&system.connect_args("status"));
     server.signal(Signal::SIGCONT);
-    ended.expect_error("endpoint");
+    ended.expect_code(1).expect_stderr("endpoint");
 }
 
 #[test]
