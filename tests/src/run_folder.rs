@@ -4,31 +4,14 @@
 use std::{
     fs,
     path::{Path, PathBuf},
+    str::FromStr,
 };
 
 pub use driml_launch::run_folder::{Outcome, Summary, Table};
 use safetensors::SafeTensors;
-use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use crate::{client::check_nothing_lost, waiting::wait_until};
-
-/// A row of `episodes.csv`.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[allow(
-    missing_docs,
-    reason = "the names are those of the file, which the launcher documents"
-)]
-pub struct EpisodeRow {
-    pub seconds: Option<f64>,
-    pub frames: u64,
-    pub episode: u64,
-    pub actor: u64,
-    pub env: u64,
-    #[serde(rename = "return")]
-    pub episode_return: Option<f64>,
-    pub length: Option<u64>,
-}
 
 /// A run's folder.
 #[derive(Clone, Debug)]
@@ -105,33 +88,32 @@ impl RunFolder {
         cells.iter().map(|it| it.parse().unwrap()).collect()
     }
 
-    /// The rows of `episodes.csv` so far.
-    pub fn episodes(&self) -> Vec<EpisodeRow> {
+    /// Returns one column of `episodes.csv` so far; `None` where a cell is empty.
+    pub fn episode_column<T: FromStr>(&self, name: &str) -> Vec<Option<T>> {
         let table = self.table("episodes.csv");
-        let header = table.header.into();
         let rows = table.rows.iter();
-        rows.map(|row| row.deserialize(Some(&header)).unwrap())
-            .collect()
+        rows.map(|row| table.value(row, name)).collect()
     }
 
     /// Checks that every episode has a row, and that the mean return is of the last 100 episodes, or of all if there were fewer.
     #[track_caller]
     fn check_episodes(&self, summary: &Summary) {
-        let rows = self.episodes();
-        let is_sorted = rows.is_sorted_by(|a, b| a.frames <= b.frames && a.episode < b.episode);
-        let is_past = rows.iter().all(|it| it.frames <= summary.frames);
-        assert!(is_sorted && is_past, "{rows:?}");
+        let [frames, numbers] = ["frames", "episode"].map(|name| self.episode_column::<u64>(name));
+        let is_sorted = frames.is_sorted() && numbers.is_sorted_by(|a, b| a < b);
+        let is_past = frames.iter().all(|it| *it <= Some(summary.frames));
+        assert!(is_sorted && is_past, "{frames:?} {numbers:?}");
         assert_eq!(summary.mean_return_of, summary.episodes.min(100));
-        let newest = &rows[rows.len() - summary.mean_return_of as usize..];
-        let returns = newest.iter().filter_map(|it| it.episode_return);
-        let sum: f64 = returns.sum();
+        let returns = self.episode_column("return");
+        let newest = &returns[returns.len() - summary.mean_return_of as usize..];
+        let sum: f64 = newest.iter().flatten().sum();
         let mean = (!newest.is_empty()).then(|| sum / newest.len() as f64);
         assert_eq!(mean.is_some(), summary.mean_return.is_some());
         let off = mean.unwrap_or_default() - summary.mean_return.unwrap_or_default();
         assert!(off.abs() < 1e-9, "{mean:?} {:?}", summary.mean_return);
-        let last = rows.last().map_or(0, |row| row.episode);
+        let last = numbers.last().map_or(0, |number| number.unwrap());
         assert_eq!(last, summary.episodes, "episodes have their numbers");
-        assert_eq!(rows.len() as u64, summary.episodes, "each has a row");
+        let rows = numbers.len() as u64;
+        assert_eq!(rows, summary.episodes, "each has a row");
     }
 
     /// Returns the log of a process.
@@ -139,17 +121,15 @@ impl RunFolder {
         self.text(&format!("logs/{process}.log"))
     }
 
-    /// The checkpoints, oldest first.
+    /// The complete checkpoints, oldest first.
     pub fn checkpoints(&self) -> Vec<PathBuf> {
-        let entries = fs::read_dir(self.path.join("checkpoints")).unwrap();
-        let mut paths: Vec<_> = entries
-            .map(|entry| entry.unwrap().path())
-            .filter(|path| !path.ends_with(".lock"))
-            .collect();
-        paths.sort();
-        let is_whole = paths.iter().all(|path| path.extension().is_none());
-        assert!(is_whole, "left from an unfinished save: {paths:?}");
-        paths
+        let entries = fs::read_dir(self.path.join("checkpoints"));
+        let paths = entries.into_iter().flatten().map(|it| it.unwrap().path());
+        // Beside them are a lock file, and perhaps the remains of an unfinished save, whose names have an extension.
+        let is_complete = |path: &PathBuf| !path.ends_with(".lock") && path.extension().is_none();
+        let mut complete: Vec<_> = paths.filter(is_complete).collect();
+        complete.sort();
+        complete
     }
 
     /// The newest checkpoint.
@@ -210,6 +190,9 @@ impl RunFolder {
         let kept = self.checkpoints().len();
         let allowed = 1..=self.setting("learner.checkpoints_kept") as usize;
         assert!(allowed.contains(&kept), "{kept} checkpoints");
+        let mut entries = fs::read_dir(self.path.join("checkpoints")).unwrap();
+        let unfinished = entries.find(|it| it.as_ref().unwrap().path().extension().is_some());
+        assert!(unfinished.is_none(), "{unfinished:?}");
         summary
     }
 

@@ -8,7 +8,9 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Outcome, Process, TestSystem, check_has, succeeds, wait_for, wait_until};
+use driml_tests::{
+    Outcome, Process, TestSystem, check_has, checkpoint_updates, succeeds, wait_for, wait_until,
+};
 
 use crate::{LONG, SHORT, status::status_text, system};
 
@@ -77,11 +79,6 @@ fn with_full_disk(
 
 const NOT_WRITTEN: &str = "cannot be written: No space left";
 
-/// Returns how often `words` occur in `said`.
-fn occurrences(text: &str, words: &str) -> usize {
-    text.matches(words).count()
-}
-
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
     with_full_disk(PERIOD_NEVER, NOT_WRITTEN, |system, process, filler| {
@@ -93,8 +90,12 @@ fn a_run_continues_while_the_disk_is_full() {
         let now = client.learner_status().unwrap().updates;
         run.wait_for_updates(now);
         let ended = process.interrupt().expect_code(130);
-        assert_eq!(occurrences(&ended.stderr, "No space left"), 1, "{ended:#?}");
-        assert_eq!(occurrences(&ended.stderr, "\nlost "), 0, "{ended:#?}");
+        assert_eq!(
+            ended.stderr.matches("No space left").count(),
+            1,
+            "{ended:#?}"
+        );
+        assert_eq!(ended.stderr.matches("\nlost ").count(), 0, "{ended:#?}");
         run.check(Outcome::Interrupted);
         // Times increase strictly, and frames never decrease.
         let [seconds, frames] = ["seconds", "frames"].map(|name| run.numeric_column(name));
@@ -116,10 +117,8 @@ fn the_first_error_is_the_one_shown() {
         let lost: Vec<_> = lost.collect();
         assert!(lost.len() == 1 && lost[0].contains(" of "), "{ended:#?}");
         for line in ended.stderr.lines() {
-            assert!(
-                occurrences(line, "No space left") <= 1,
-                "a cause is logged once: {line}"
-            );
+            let causes = line.matches("No space left").count();
+            assert!(causes <= 1, "a cause is logged once: {line}");
         }
         fs::remove_file(filler).unwrap();
     });
@@ -133,13 +132,13 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
         client.wait_for_updates(then + 600);
         fs::remove_file(filler).unwrap();
         let now = client.learner_status().unwrap().updates;
+        let run = system.run_folder("disk/run");
         wait_until("a checkpoint after that", || {
-            let names = system.file_names("disk/run/checkpoints");
-            let updates = |name: &String| name.strip_prefix("checkpoint-")?.parse::<u64>().ok();
-            names.iter().any(|name| updates(name) > Some(now))
+            let newest = run.checkpoints().pop();
+            newest.is_some_and(|it| checkpoint_updates(&it) > now)
         });
         process.interrupt().expect_code(130);
-        system.run_folder("disk/run").check(Outcome::Interrupted);
+        run.check(Outcome::Interrupted);
     });
 }
 

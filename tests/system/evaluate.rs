@@ -196,11 +196,8 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     let system = system();
     let flags = "--agent c51 --eval-interval 100 --eval-episodes 1000000";
     let process = system.start(&format!("local --lockstep {SHORT} {flags} --run-dir run"));
-    wait_until("a checkpoint", || {
-        let saved = fs::read_dir(system.path("run/checkpoints")).into_iter();
-        let mut saved = saved.flatten().flatten();
-        saved.any(|it| !it.path().ends_with(".lock"))
-    });
+    let run = system.run_folder("run");
+    wait_until("a checkpoint", || !run.checkpoints().is_empty());
     process
         .interrupt()
         .expect_code(130)
@@ -209,7 +206,7 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     system
         .run_ok("local --resume run --set local.evaluation.episodes=2")
         .expect_stderr("the run continues without an evaluation: ");
-    system.run_folder("run").check_finished();
+    run.check_finished();
     // A file in place of the last checkpoint ends the run, which leaves its summary.
     let last = system.path("run/checkpoints/checkpoint-000000000860.tmp");
     fs::write(last, "").unwrap();
@@ -274,19 +271,11 @@ fn a_film_changes_nothing_that_is_played() {
 /// By default an evaluation plays the weights that the run's actors receive, rounded to the actors' precision.
 #[test]
 fn it_plays_in_the_precision_of_the_run() {
-    let system = system();
-    system
-        .run_ok(&format!(
-            "local --lockstep --agent c51 {SHORT} --set learner.publish_dtype=bf16 --set actor.precision=bf16 --run-dir run"
-        ));
+    let system = with_run("--set learner.publish_dtype=bf16 --set actor.precision=bf16");
     for (flags, precision) in [("", "bf16"), ("--exact", "f32")] {
-        let call = format!("evaluate run --episodes 2 {flags}");
-        let words = format!("{precision} weights after 540 updates played in {precision}");
-        system.run_ok(&call).expect_stdout(&words);
+        let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
+        assert_eq!([&json["weights"], &json["arithmetic"]], [precision; 2]);
     }
-    let json = system.run_json("evaluate run --episodes 2 --json");
-    assert_eq!(json["weights"], "bf16");
-    assert_eq!(json["arithmetic"], "bf16");
 }
 
 /// The learner's own tests check that damage to any file is found. Without a checkpoint no film is begun.

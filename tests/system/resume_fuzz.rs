@@ -50,13 +50,7 @@ struct SavedCounts {
 
 /// Reads the newest checkpoint; `None` before the first.
 fn saved_counts(run: &RunFolder) -> Option<SavedCounts> {
-    let entries = fs::read_dir(run.path().join("checkpoints")).ok()?;
-    // A checkpoint that a kill has cut off does not count.
-    let whole = entries.map(|it| it.unwrap().path()).filter(|path| {
-        let name = path.file_name().unwrap().to_str().unwrap();
-        name.starts_with("checkpoint-") && !name.ends_with(".tmp")
-    });
-    let newest = whole.max()?;
+    let newest = run.checkpoints().pop()?;
     let state: Value =
         serde_json::from_slice(&fs::read(newest.join("state.json")).unwrap()).unwrap();
     let shards = state["progress"]["shards"].as_array().unwrap().clone();
@@ -183,17 +177,14 @@ fn resume_once(seed: u64) {
         let is_refilled = replay.transitions_refilled > 0;
         assert!(store.is_empty() || !is_refilled, "{details}");
     }
-    let episodes = run.episodes();
-    let pairs = episodes.windows(2);
-    let is_sorted = pairs
-        .map(|it| (&it[0], &it[1]))
-        .all(|(row, next)| row.episode < next.episode && row.frames <= next.frames);
+    let [numbers, frames] = ["episode", "frames"].map(|name| run.episode_column::<u64>(name));
+    let is_sorted = numbers.is_sorted_by(|a, b| a < b) && frames.is_sorted();
+    let is_past = frames.iter().all(|it| *it <= Some(after.frames));
+    assert!(is_sorted && is_past, "{details}");
     for count in ["frames", "updates"] {
         let column = run.numeric_column(count);
         assert!(column.is_sorted(), "{count}: {column:?}, {details}");
     }
-    let is_past = episodes.iter().all(|row| row.frames <= after.frames);
-    assert!(is_sorted && is_past, "{details}");
 }
 
 fn run_and_stop(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, delay: Duration) {

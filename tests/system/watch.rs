@@ -1,10 +1,11 @@
 //! `driml watch`: shows and records runs that others have started, without disturbing them.
 //! `driml status` is tested in `status`.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use driml_launch::metrics::COLUMNS;
 use driml_tests::{
+    check_has,
     python::{find_python, run_script},
     wait_for, wait_until,
 };
@@ -37,13 +38,14 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let summary = watched.check_finished();
     assert_eq!((summary.frames, summary.updates), (1280, 540));
     // Check who played each episode, and that each was seen completely: frames outside these episodes are of episodes still being played.
-    let episodes = watched.episodes();
-    let who: BTreeSet<_> = episodes.iter().map(|it| (it.actor, it.env)).collect();
-    let expected = (0..2).flat_map(|actor| (0..4).map(move |env| (actor, env)));
+    let column = |name| watched.episode_column::<u64>(name);
+    let who: BTreeSet<_> = column("actor").into_iter().zip(column("env")).collect();
+    let expected = (0..2).flat_map(|actor| (0..4).map(move |env| (Some(actor), Some(env))));
     assert_eq!(who, expected.collect());
-    let played: u64 = episodes.iter().map(|it| it.length.unwrap()).sum();
+    let played: u64 = column("length").into_iter().map(Option::unwrap).sum();
     assert!(played <= 1280, "{played}");
-    assert!(episodes.iter().all(|it| it.seconds.is_some()));
+    let seconds = watched.episode_column::<f64>("seconds");
+    assert!(seconds.iter().all(Option::is_some));
 
     // The columns are those of a launched run with these settings.
     system.run_ok(&format!("local {flags} {SHORT} --run-dir launched"));
@@ -151,28 +153,31 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();
     let (_, labels, frames) = of("driml_frames_total");
     assert_eq!(*frames, 1280.0);
-    assert_eq!(
-        (&*labels["world"], &*labels["agent"], &*labels["seed"]),
-        ("chain", "driml-ada", "1")
-    );
-    assert_eq!(labels["endpoint"], system.endpoint());
+    let endpoint = format!("endpoint={:?}", system.endpoint());
+    let run = [
+        "world=\"chain\"",
+        "agent=\"driml-ada\"",
+        "seed=\"1\"",
+        &endpoint,
+    ];
+    check_has(labels, &run);
     assert_eq!(of("driml_updates_total").2, 540.0);
     // The JSON parser may be off by the last digit.
     let (found, mean) = (of("driml_mean_return").2, &json["mean_return"]);
     assert!((found - mean.as_f64().unwrap()).abs() < 1e-12, "{found}");
     assert_eq!(of("driml_finished").2, 1.0);
     assert!(of("driml_c51_kl").2 > 0.0 && of("driml_total_loss").2 > 0.0);
-    assert_eq!(of("driml_losses").1["loss"], "dim_4t4");
-    let actor = samples
-        .iter()
-        .find(|it| it.0 == "driml_process_connected" && it.1["process"] == "actor-0");
+    check_has(&of("driml_losses").1, &["loss=\"dim_4t4\""]);
+    let actor = samples.iter().find(|(name, labels, _)| {
+        name == "driml_process_connected" && labels.contains("process=\"actor-0\"")
+    });
     assert_eq!(actor.unwrap().2, 0.0, "it has left");
     drop(client);
     drop(server);
 }
 
 /// Returns name, labels and value of each sample. Panics if the text is not in Prometheus' text format.
-fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> {
+fn parse_prometheus(text: &str) -> Vec<(String, String, f64)> {
     assert!(text.ends_with('\n'));
     let (mut families, mut samples) = (BTreeSet::new(), Vec::new());
     let (mut helped, mut family) = ("", "");
@@ -192,16 +197,11 @@ fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> 
             let (name, rest) = line.split_once('{').unwrap();
             assert_eq!(name, family, "samples follow their family");
             let (labels, value) = rest.rsplit_once("} ").unwrap();
-            let labels = labels.split("\",").map(|label| {
-                let (name, value) = label.split_once("=\"").unwrap();
-                (name.to_owned(), value.trim_end_matches('"').to_owned())
-            });
-            let labels: BTreeMap<_, _> = labels.collect();
             let twice = samples
                 .iter()
-                .any(|(other, their, _)| other == name && *their == labels);
+                .any(|(other, their, _)| other == name && their == labels);
             assert!(!twice, "{line} comes twice");
-            samples.push((name.to_owned(), labels, value.parse().unwrap()));
+            samples.push((name.to_owned(), labels.to_owned(), value.parse().unwrap()));
         }
     }
     samples
