@@ -16,36 +16,14 @@ fn tls_copy(system: &TestSystem, name: &str) -> Certificates {
     system.certificates().copy_to(system.path(name))
 }
 
-/// Opens the session of a stranger that listens in place of a replay server.
-fn listen_raw(endpoint: &str, certificates: &Certificates, role: &str) -> Session {
-    let own = raw_tls("listen", certificates, Some(role));
-    open_raw(&[
-        ("mode", "\"router\"".into()),
-        ("listen/endpoints", format!("[{endpoint:?}]")),
-        ("transport/link/tls", own),
-    ])
-    .unwrap()
-}
-
-/// Opens a session with zenoh alone, without driml's checks. As a client, the session gives up soon.
-fn open_raw(settings: &[(&str, String)]) -> zenoh::Result<Session> {
-    let mut config = zenoh::Config::default();
-    for (key, value) in [
-        ("mode", "\"client\"".to_owned()),
-        ("scouting/multicast/enabled", "false".into()),
-        ("connect/timeout_ms", "1500".into()),
-        ("connect/exit_on_failure", "true".into()),
-    ]
-    .iter()
-    .chain(settings)
-    {
-        config.insert_json5(key, value).unwrap();
-    }
-    zenoh::open(config).wait()
-}
-
-/// zenoh's settings for one side of a connection, `connect` or `listen`.
-fn raw_tls(side: &str, certificates: &Certificates, role: Option<&str>) -> String {
+/// Opens a session with zenoh alone, without driml's checks, that uses the certificate of a role on one side, `connect` or `listen`. A
+/// session that connects gives up soon.
+fn open_raw(
+    side: &str,
+    endpoint: &str,
+    certificates: &Certificates,
+    role: Option<&str>,
+) -> zenoh::Result<Session> {
     let file = |name: &str| format!("{:?}", certificates.path(name).display().to_string());
     let own = role.map_or(String::new(), |role| {
         format!(
@@ -54,7 +32,22 @@ fn raw_tls(side: &str, certificates: &Certificates, role: Option<&str>) -> Strin
             file(&format!("{role}.key"))
         )
     });
-    format!("{{ root_ca_certificate: {}{own} }}", file("ca.pem"))
+    let mode = if side == "listen" { "router" } else { "client" };
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", format!("{mode:?}")),
+        ("scouting/multicast/enabled", "false".into()),
+        ("connect/timeout_ms", "1500".into()),
+        ("connect/exit_on_failure", "true".into()),
+        (&format!("{side}/endpoints"), format!("[{endpoint:?}]")),
+        (
+            "transport/link/tls",
+            format!("{{ root_ca_certificate: {}{own} }}", file("ca.pem")),
+        ),
+    ] {
+        config.insert_json5(key, &value).unwrap();
+    }
+    zenoh::open(config).wait()
 }
 
 /// Files that are wrong are named before anything is sent.
@@ -126,18 +119,11 @@ fn strangers_at_a_replay_server() {
         ("not valid yet", &new, Some("learner")),
         ("a replay server's", &good, Some("replay-server")),
     ];
-    let learner = raw_tls("connect", &good, Some("learner"));
-    let accepted = open_raw(&[
-        ("connect/endpoints", format!("[{endpoint:?}]")),
-        ("transport/link/tls", learner),
-    ]);
+    let accepted = open_raw("connect", endpoint, &good, Some("learner"));
     assert!(accepted.is_ok(), "else what is below says nothing");
     // Each attempt lasts until its time-out.
     in_parallel(attempts, |(name, certificates, role)| {
-        let opened = open_raw(&[
-            ("connect/endpoints", format!("[{endpoint:?}]")),
-            ("transport/link/tls", raw_tls("connect", certificates, role)),
-        ]);
+        let opened = open_raw("connect", endpoint, certificates, role);
         assert!(opened.is_err(), "a certificate that is {name}");
     });
     server.wait_for_stderr("QUIC acceptor failed: ");
@@ -185,7 +171,8 @@ fn strangers_in_the_place_of_a_replay_server() {
     ]
     .map(|(name, stranger)| {
         let endpoint = quic_endpoint();
-        let listening = stranger.map(|(files, role)| listen_raw(&endpoint, files, role));
+        let listening =
+            stranger.map(|(files, role)| open_raw("listen", &endpoint, files, Some(role)).unwrap());
         let actor = format!("actor --id 0 --connect {endpoint} --tls-dir tls");
         let actor = system.start_process(&actor);
         (name, endpoint, listening, actor)
