@@ -32,9 +32,11 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
         None => row.starts_with('#').then(|| format!("{row}\n")),
     });
     expect_file!["snapshots/refusals.txt"].assert_eq(&answered.collect::<String>());
-    // A folder in use is not touched.
+    // A folder in use is not touched, and nothing was begun.
     assert_eq!(fs::read(used.join("metrics.csv")).unwrap(), b"old");
     assert_eq!(fs::read_dir(used).unwrap().count(), 1);
+    assert_eq!(system.file_names(".").len(), 3);
+    assert_eq!(system.running_processes(), []);
 }
 
 #[test]
