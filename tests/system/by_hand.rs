@@ -121,34 +121,6 @@ fn processes_that_are_told_to_stop_lose_nothing() {
     }
 }
 
-#[test]
-fn an_actor_killed_and_started_again_continues() {
-    let system = system();
-    // Pause the learner, so that the first actor cannot finish the run before it is killed.
-    system.pause_learners_at(100);
-    let flags = "--env chain --preset smoke --frames 4008 --set replay.warmup_transitions=2000";
-    let _server = system.start_replay_server(&format!(
-        "--agent driml-ada {flags} --set replay.replay_ratio=2"
-    ));
-    let learner = system.start_learner("run");
-    let actor = system.start_actor(3);
-    let client = system.connect();
-    client.wait_for_transitions(500);
-    actor.kill();
-    let before = client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
-    assert!(!before.finished);
-
-    system.release_learners();
-    let again = system.start_actor(3);
-    again.wait_ok();
-    client.wait_for_the_last_update();
-    // A killed actor sends no `Leave`: its undelivered transitions were never announced and appear in no count.
-    let replay = client.check_nothing_lost();
-    assert!(replay.transitions_inserted >= 4_008 && replay.finished);
-    assert_eq!(replay.messages_refused, 0);
-    learner.stop(0);
-}
-
 /// A process started by hand also sets the environment variables that candle and the C library read. Variables set by the user stay.
 #[test]
 fn a_process_by_hand_settles_its_environment() {

@@ -51,32 +51,6 @@ fn a_call_that_asks_for_help_or_leaves_the_command_out_prints_it() {
     }
 }
 
-/// The program finds these errors only at run time, and exits with code 1.
-#[test]
-fn files_and_runs_that_are_not_there() {
-    let system = system();
-    // A safetensors file that announces a header of 100 bytes and is cut off after 10.
-    let mut cut = 100u64.to_le_bytes().to_vec();
-    cut.extend(b"{\"input.fr");
-    fs::write(system.path("cut.safetensors"), cut).unwrap();
-    for (call, why) in [
-        (
-            "parity cut.safetensors",
-            "error: cut.safetensors: not a whole safetensors file: invalid header length\n",
-        ),
-        (
-            "parity none.safetensors",
-            "error: cannot read none.safetensors: No such file or directory (os error 2)\n",
-        ),
-        (
-            "actor --connect unixsock-stream/absent.sock",
-            "there is no such socket",
-        ),
-    ] {
-        system.fails(call, why);
-    }
-}
-
 #[test]
 fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let system = system();

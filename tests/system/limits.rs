@@ -60,7 +60,4 @@ fn a_temporary_folder_may_have_a_name_too_long_for_a_socket() {
     system.run_ok(&format!(
         "env TMPDIR={folder} DRIML local --agent c51 {SHORT} --run-dir run"
     ));
-    let endpoint = format!("unixsock-stream/{folder}/{}", "s".repeat(20));
-    system
-        .rejects(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"), "the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");
 }

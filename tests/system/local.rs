@@ -123,14 +123,6 @@ fn an_actor_from_elsewhere_plays_over_tls() {
     }
 }
 
-#[test]
-fn mspacman_with_stacked_and_enlarged_frames() {
-    let flags = "--env mspacman --agent driml-fix --preset smoke --frames 320";
-    let summary = system().train(flags, "run");
-    assert_eq!(summary.updates, 7);
-    assert_eq!(summary.mean_k, Some(1.0), "driml-fix serves k = 1 here");
-}
-
 /// Serves five positives a row over zenoh for `cpc` and none for `curl`. The checkpoints of both can be evaluated.
 #[test]
 fn cpc_and_curl_get_what_they_need_and_no_more() {
