@@ -3,7 +3,7 @@
 
 use std::{collections::BTreeMap, fs, os::unix::fs::MetadataExt, path::Path};
 
-use driml_tests::{Outcome, check_has};
+use driml_tests::check_has;
 
 use crate::{SMALL_NETWORK, system};
 
@@ -21,8 +21,7 @@ fn data_files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
 }
 
 fn joined_names(files: &BTreeMap<String, Vec<u8>>) -> String {
-    let names: Vec<_> = files.keys().map(String::as_str).collect();
-    names.join(" ")
+    files.keys().cloned().collect::<Vec<_>>().join(" ")
 }
 
 /// Returns the number of lines of a CSV file without its header.
@@ -296,8 +295,7 @@ fn killed_and_resumed() {
     system
         .run_ok(call)
         .expect_stderr("mspacman-c51-seed1 resumes from its checkpoint");
-    let summary = run.summary();
-    assert_eq!(summary.outcome, Outcome::Finished, "{summary:#?}");
+    let summary = run.check_finished();
     assert!(summary.resumed_after_updates > 0, "{summary:#?}");
     let page = system.read("x/README.md");
     assert!(page.contains("* Finished: 1 of 1 run, each"), "{page}");

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_tests::{Outcome, Process, TestSystem, in_parallel, wait_until};
+use driml_tests::{Exit, Outcome, Process, in_parallel, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, failures::interrupt_until_it_ends, start_run, system};
@@ -12,8 +12,12 @@ use crate::{LONG, SHORT, failures::interrupt_until_it_ends, start_run, system};
 #[test]
 fn a_frozen_process_does_not_hold_the_others_up() {
     let checks: [fn(); 5] = [
-        a_complete_run_is_finished,
-        an_interrupt_of_a_complete_run_leaves_it_finished,
+        || {
+            let killed = "did not exit within 1 min 0 s and was killed";
+            a_complete_run_is_finished(|run| run.wait().expect_stderr(killed));
+        },
+        // After the first interrupt the launcher waits for the actor, after the second it does not.
+        || a_complete_run_is_finished(interrupt_until_it_ends),
         a_replay_server_ends_without_its_actor,
         a_replay_server_ends_whose_launcher_died,
         a_frozen_actor_does_not_stop_the_others,
@@ -21,8 +25,9 @@ fn a_frozen_process_does_not_hold_the_others_up() {
     in_parallel(checks, |check| check());
 }
 
-/// Starts a run of two actors, suspends one of them, and waits until the learner has made its last update.
-fn complete_but_for_an_actor(system: &TestSystem) -> Process {
+/// Suspends one of two actors, and ends the run once the learner has made its last update.
+fn a_complete_run_is_finished(end: impl FnOnce(Process) -> Exit) {
+    let system = system();
     // Pause the learner, so that the run does not end before its second actor starts.
     system.pause_learners_at(100);
     let flags = format!("--agent c51 {SHORT} --actors 2");
@@ -32,24 +37,7 @@ fn complete_but_for_an_actor(system: &TestSystem) -> Process {
     system.find_process("actor").signal(Signal::SIGSTOP);
     system.release_learners();
     client.wait_for_the_last_update();
-    process
-}
-
-fn a_complete_run_is_finished() {
-    let system = system();
-    complete_but_for_an_actor(&system)
-        .wait_ok()
-        .expect_stderr("did not exit within 1 min 0 s and was killed")
-        .expect_stdout("finished: ");
-    system.check_outcome(Outcome::Finished);
-}
-
-/// After the first interrupt the launcher waits for the actor, after the second it does not. Neither changes the run's outcome.
-fn an_interrupt_of_a_complete_run_leaves_it_finished() {
-    let system = system();
-    interrupt_until_it_ends(complete_but_for_an_actor(&system))
-        .expect_code(0)
-        .expect_stdout("finished: ");
+    end(process).expect_code(0).expect_stdout("finished: ");
     system.check_outcome(Outcome::Finished);
 }
 

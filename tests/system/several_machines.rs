@@ -1,10 +1,7 @@
 //! A run whose processes are on separate machines, joined by a router: machines that are disconnected, links that are slow.
 //! The machines are network namespaces; without the privileges to make them, the tests are skipped by name.
 
-use std::{
-    thread::sleep,
-    time::{Duration, Instant},
-};
+use std::{thread::sleep, time::Duration};
 
 use driml_tests::{Network, Process, TestSystem, print_line, skip, wait_for, wait_until};
 use nix::sys::signal::Signal;
@@ -89,22 +86,11 @@ impl Run {
     }
 
     /// Waits for the end of the run, and checks that the counts are as if nothing had happened.
-    fn check_end(mut self, timeout: Duration) {
-        let deadline = Instant::now() + timeout;
-        let status = loop {
-            let is_over = |status: &Value| {
-                status["replay"]["finished"] == true && status["learner"]["finished"] == true
-            };
-            match self.status().filter(is_over) {
-                Some(status) => break status,
-                None => assert!(
-                    Instant::now() < deadline,
-                    "no end within {timeout:?}: {:#?}",
-                    self.status()
-                ),
-            }
-            sleep(Duration::from_millis(500));
+    fn check_end(mut self) {
+        let is_over = |status: &Value| {
+            status["replay"]["finished"] == true && status["learner"]["finished"] == true
         };
+        let status = wait_for("the run's end", || self.status().filter(is_over));
         let count = |of: &str, what: &str| status[of][what].as_u64().unwrap();
         let inserted = count("replay", "transitions_inserted");
         let planned = (inserted - WARMUP) * self.ratio / ROWS;
@@ -150,7 +136,7 @@ fn cut_cables_heal_by_themselves() {
     sleep(Duration::from_secs(12));
     run.network.reconnect("server");
     run.system.release_learners();
-    run.check_end(Duration::from_secs(300));
+    run.check_end();
 }
 
 /// One actor sends 64 kbit/s, so that a chunk takes half a second. No process restarts or loses its connection, and nothing is lost.
@@ -184,7 +170,7 @@ fn a_narrow_link_stops_no_process() {
         assert!(is_there && last_seen_s < 10.0, "{process}");
     }
     assert!(run.processes.iter_mut().all(Process::is_running));
-    run.check_end(Duration::from_secs(300));
+    run.check_end();
 }
 
 /// Disconnects each process for 30 s, then for 90 s. Run by hand: it takes seven minutes.
@@ -204,7 +190,7 @@ fn each_process_is_cut_off_for_long() {
             run.wait_for_frames(before + 1_000);
         }
     }
-    run.check_end(Duration::from_secs(600));
+    run.check_end();
 }
 
 /// Kills, suspends, disconnects and restarts at random: DRIML_FAULTS faults (default 200) with the seed DRIML_FAULTS_SEED (default 1).
@@ -267,5 +253,5 @@ fn random_faults_lose_nothing() {
         status["replay"]["finished"], false,
         "faults after the end prove nothing"
     );
-    run.check_end(Duration::from_secs(900));
+    run.check_end();
 }
