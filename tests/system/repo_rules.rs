@@ -177,7 +177,6 @@ fn repo_files() -> Vec<String> {
     files
 }
 
-/// A file of text.
 pub(crate) struct Source {
     /// The path from the root.
     pub(crate) name: String,

@@ -30,7 +30,6 @@ pub(crate) fn config(transitions: u64) -> Config {
 /// The incarnation of every actor.
 const INCARNATION: u64 = 1;
 
-/// Lets an actor join.
 pub(crate) fn join_actor(replay: &mut Replay, actor: u32) {
     let join = ActorJoin {
         actor,

@@ -179,12 +179,10 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     batch
 }
 
-/// An encoded chunk.
 pub(crate) fn encoded_chunk() -> Vec<u8> {
     codec::encode(SPEC, &chunk().header, chunk().payload()).unwrap()
 }
 
-/// An encoded batch.
 pub(crate) fn encoded(batch: Batch) -> Vec<u8> {
     let (header, payload) = batch.into_payload();
     codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()

@@ -21,7 +21,6 @@ use crate::{
     history::{History, spec},
 };
 
-/// Rows of a batch.
 pub(crate) const ROWS: u32 = 4;
 /// Bytes of a record before its body, and the offset of the body's length.
 const HEAD_BYTES: u64 = 32;

@@ -15,7 +15,6 @@ use crate::segments::repair_message;
 /// The hash of the run spec in these messages.
 const SPEC_HASH: u64 = 0x0123_4567_89ab_cdef;
 
-/// Reads bytes as one type of message.
 type ReadFn = fn(&[u8]);
 
 /// Reads a message in one piece and in several. Both ways must agree, and the message must be written back unchanged.

@@ -7,7 +7,6 @@ use driml_protocol::{
 };
 use driml_replay_server::{Config, Replay};
 
-/// Draws rows by priority.
 const PRIORITISED: Sampling = Sampling::Prioritised {
     alpha: 0.5,
     beta_start: 0.4,
@@ -15,7 +14,6 @@ const PRIORITISED: Sampling = Sampling::Prioritised {
     beta_updates: 1,
 };
 
-/// The number of actions in [`spec`].
 pub(crate) const ACTIONS: u32 = 3;
 /// The most messages in one execution.
 const MESSAGES_MAX: usize = 64;

@@ -18,7 +18,6 @@ use crate::replay::{self, ACTIONS};
 
 /// The size of a frame in bytes. A frame is its number, which is never 0.
 const FRAME_BYTES: usize = 4;
-/// The number of rows in a batch.
 const ROWS: u32 = 4;
 /// The number of batches drawn from a recovered replay.
 const BATCHES: u64 = 8;
@@ -139,7 +138,6 @@ fn check_draws(replay: &mut Replay, stored: &HashSet<Step>) {
     }
 }
 
-/// Splits the bytes into segments.
 fn split_segments(mut bytes: &[u8]) -> Vec<Vec<u8>> {
     let mut all = Vec::new();
     while let Some((length, rest)) = bytes.split_first_chunk()

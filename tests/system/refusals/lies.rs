@@ -22,7 +22,6 @@ use crate::{PRIORITISED, start_run_with, system};
 
 const INCARNATION: u64 = 77;
 const LEARNER: u64 = 78;
-/// An unused actor number.
 const UNUSED_ACTOR: u32 = 500;
 
 /// A launched run, and a second client of it.
