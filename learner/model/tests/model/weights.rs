@@ -102,16 +102,6 @@ fn residual_blocks_start_smaller_where_that_is_asked_for() {
 }
 
 #[test]
-fn copies_share_nothing_and_clones_share_all() {
-    let original = parameters(&small(), 1);
-    let (copy, clone) = (original.copy_part(|_| true).unwrap(), original.clone());
-    let var = original.get("head.bias").unwrap();
-    var.set(&var.ones_like().unwrap()).unwrap();
-    assert_ne!(bits(copy.get("head.bias").unwrap()), bits(var));
-    assert_eq!(bits(clone.get("head.bias").unwrap()), bits(var));
-}
-
-#[test]
 fn tensors_that_do_not_fit_are_named() {
     let config = small();
     let drawn = parameters(&config, 1);
@@ -206,10 +196,6 @@ fn a_weight_that_is_too_large_for_its_type_is_named() {
     weight.set(&large).unwrap();
     let error = parameters.to_safetensors_as(WeightDtype::F16, |_| true);
     let said = error.unwrap_err().to_string();
-    for words in [
-        "head.weight",
-        "too large for f16: set learner.publish_dtype",
-    ] {
-        assert!(said.contains(words), "{said}");
-    }
+    let words = "head.weight: is 100000 at index 0, too large for f16: set learner.publish_dtype";
+    assert!(said.contains(words), "{said}");
 }
