@@ -1,5 +1,5 @@
-//! Wrong calls of the program: each exits with the right code and a sentence that says what to do.
-//! These tests start no run.
+//! Calls that start no run. A wrong one exits with the right code and a sentence that says what to do.
+//! The judgement of each fact of `driml doctor` is tested beside its code.
 
 use std::{fs, os::unix::process::CommandExt};
 
@@ -91,4 +91,25 @@ fn completions_and_pages() {
     system.run_ok("man man1");
     let page = system.read("man1/driml-train.1");
     assert!(page.contains("\\-\\-frames"), "{page}");
+}
+
+/// The doctor looks at whatever machine runs these tests.
+#[test]
+fn the_doctor_names_what_the_machine_has_and_ends_as_it_says() {
+    let system = system();
+    let ended = system.run("doctor");
+    let facts = "cores, vectors, memory, shared memory, locked memory, disk, Procgen, cuda";
+    for what in facts.split(", ") {
+        let states = ["ok", "note", "missing"].map(|state| format!("{state:<8} {what}"));
+        let is_line = |line: &str| states.iter().any(|state| line.starts_with(state));
+        assert!(ended.stdout.lines().any(is_line), "{what}: {ended:#?}");
+    }
+    // Without a network Procgen's engine may be missing.
+    let trains = ended.stdout.contains("This machine can train on the CPU");
+    ended.expect_code(i32::from(!trains));
+    let facts = system.run("doctor --json").json();
+    let facts = facts.as_array().unwrap();
+    assert!(facts.len() >= 8, "{facts:?}");
+    assert_eq!(facts[0]["what"], "cores");
+    assert!(facts.iter().all(|fact| fact["state"].is_string()));
 }

@@ -9,7 +9,6 @@ mod cli;
 mod closed_terminal;
 mod disk_full;
 mod diverging;
-mod doctor;
 mod durable;
 mod evaluate;
 mod experiments;
