@@ -12,8 +12,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    PRIORITISED, chain,
-    numbered::{KILLS, ROWS, ROWS_SAMPLED, WARMUP, kill_after_rows},
+    PRIORITISED, ROWS, WARMUP, chain,
+    numbered::{KILLS, ROWS_SAMPLED, kill_after_rows},
     prioritised::{ROWS_WERE_SET, logged_counts},
     start_run_with, system,
 };

@@ -61,6 +61,10 @@ fn listen_on_free_port() -> (String, TcpListener) {
     (format!("tcp/{}", listener.local_addr().unwrap()), listener)
 }
 
+/// The warm-up in transitions and the batch size of the preset `smoke`.
+const WARMUP: u64 = 200;
+const ROWS: u32 = 16;
+
 /// A run on the chain that takes about a second: 540 updates of 16 rows, replay ratio 8.
 ///
 /// 1280 frames are whole chunks of one or two actors (4 environments x 8 steps), and (1280 - 200) * 8 / 16 is whole.

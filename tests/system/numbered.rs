@@ -9,6 +9,7 @@ use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, TestSystem, check_nothing_lost};
 
 use crate::{
+    ROWS, WARMUP,
     synthetic::{SyntheticActor, SyntheticLearner},
     system, tiny_replay,
 };
@@ -20,9 +21,6 @@ const STREAMS: u32 = 4;
 const STEPS: u32 = 8;
 const TRANSITIONS_PER_ACTOR: u64 = CHUNKS * (STREAMS * STEPS) as u64;
 const TRANSITIONS: u64 = ACTORS as u64 * TRANSITIONS_PER_ACTOR;
-/// The values of the preset `smoke`.
-pub(crate) const WARMUP: u64 = 200;
-pub(crate) const ROWS: u32 = 16;
 /// The replay ratio: rows per transition.
 const RATIO: u64 = 16;
 /// How often each transition is drawn at the end, on average. The probability that a given one is never drawn is exp(-64).

@@ -3,7 +3,7 @@
 
 use driml_tests::Outcome;
 
-use crate::{PRIORITISED, SHORT, system};
+use crate::{PRIORITISED, ROWS, SHORT, system};
 
 /// Returns the numbers of the last line with `words`. A replay server logs rows whose priority was set, came too late and came twice; the
 /// learner logs updates whose priorities arrived.
@@ -16,8 +16,6 @@ pub(crate) fn logged_counts<const N: usize>(log: &str, words: &str) -> [u64; N] 
     numbers.try_into().unwrap()
 }
 
-/// The batch size of the preset `smoke`.
-const BATCH_ROWS: u64 = 16;
 pub(crate) const ROWS_WERE_SET: &str = "rows were set";
 
 /// The servers got the priorities of all updates that the learner counts as arrived. On a busy machine it exits before some arrive.
@@ -45,7 +43,7 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
         assert!(set + gone <= rows, "{sums:?} of {rows}");
         assert!(arrived * 4 > summary.updates, "{arrived}");
         assert!(
-            set + gone >= arrived * BATCH_ROWS,
+            set + gone >= arrived * u64::from(ROWS),
             "{sums:?} of {rows}, {arrived} updates"
         );
         assert_eq!(repeated, 0);

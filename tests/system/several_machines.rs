@@ -8,11 +8,7 @@ use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use serde_json::Value;
 
-use crate::system;
-
-/// The values of the preset `smoke`.
-const WARMUP: u64 = 200;
-const ROWS: u64 = 16;
+use crate::{ROWS, WARMUP, system};
 
 /// A run of processes that were started by hand, each on its own machine. Its replay is kept on disk.
 struct Run {
@@ -93,9 +89,9 @@ impl Run {
         let status = wait_for("the run's end", || self.status().filter(is_over));
         let count = |of: &str, what: &str| status[of][what].as_u64().unwrap();
         let inserted = count("replay", "transitions_inserted");
-        let planned = (inserted - WARMUP) * self.ratio / ROWS;
+        let planned = (inserted - WARMUP) * self.ratio / u64::from(ROWS);
         assert_eq!(count("learner", "updates"), planned);
-        assert_eq!(count("replay", "rows_sampled"), planned * ROWS);
+        assert_eq!(count("replay", "rows_sampled"), planned * u64::from(ROWS));
         for what in "transitions_lost transitions_duplicated messages_refused".split(' ') {
             assert_eq!(count("replay", what), 0, "{what}");
         }
