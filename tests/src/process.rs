@@ -2,7 +2,7 @@
 //! This module does not know the role of the process.
 
 use std::{
-    io::Read,
+    io::{ErrorKind, Read},
     os::unix::process::ExitStatusExt,
     process::{Child, Command, Stdio},
     sync::{Arc, Mutex},
@@ -51,8 +51,12 @@ impl PipeReader {
         let sink = bytes.clone();
         let reader = thread::spawn(move || {
             let mut buffer = [0; 4096];
-            while let Ok(count @ 1..) = pipe.read(&mut buffer) {
-                sink.lock().unwrap().extend_from_slice(&buffer[..count]);
+            loop {
+                match pipe.read(&mut buffer) {
+                    Ok(count @ 1..) => sink.lock().unwrap().extend_from_slice(&buffer[..count]),
+                    Err(e) if e.kind() == ErrorKind::Interrupted => {}
+                    _ => return,
+                }
             }
         });
         Self { bytes, reader }
@@ -80,7 +84,7 @@ pub(crate) fn run(command: &mut Command) -> String {
 }
 
 impl Process {
-    /// Starts a command that a test has built; `name` identifies the process in messages.
+    /// Starts a command that a test has built, with the standard input that it has; `name` identifies the process in messages.
     pub fn start(name: String, mut command: Command) -> Self {
         command.stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command

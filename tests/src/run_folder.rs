@@ -3,6 +3,7 @@
 
 use std::{
     fs,
+    io::ErrorKind,
     path::{Path, PathBuf},
     str::FromStr,
 };
@@ -89,10 +90,18 @@ impl RunFolder {
     }
 
     /// Returns one column of `episodes.csv` so far; `None` where a cell is empty.
+    #[track_caller]
     pub fn episode_column<T: FromStr>(&self, name: &str) -> Vec<Option<T>> {
         let table = self.table("episodes.csv");
-        let rows = table.rows.iter();
-        rows.map(|row| table.value(row, name)).collect()
+        let at = table.column_index(name);
+        let at = at.unwrap_or_else(|| panic!("{name} is not in {:?}", table.header));
+        let parse = |cell: &str| {
+            let value = cell.parse();
+            value.unwrap_or_else(|_| panic!("{name} = {cell:?}"))
+        };
+        let cells = table.rows.iter().map(|row| &row[at]);
+        let values = cells.map(|cell| (!cell.is_empty()).then(|| parse(cell)));
+        values.collect()
     }
 
     /// Checks that every episode has a row, and that the mean return is of the last 100 episodes, or of all if there were fewer.
@@ -100,7 +109,7 @@ impl RunFolder {
     fn check_episodes(&self, summary: &Summary) {
         let [frames, numbers] = ["frames", "episode"].map(|name| self.episode_column::<u64>(name));
         let is_sorted = frames.is_sorted() && numbers.is_sorted_by(|a, b| a < b);
-        let is_past = frames.iter().all(|it| *it <= Some(summary.frames));
+        let is_past = frames.iter().all(|it| it.unwrap() <= summary.frames);
         assert!(is_sorted && is_past, "{frames:?} {numbers:?}");
         assert_eq!(summary.mean_return_of, summary.episodes.min(100));
         let returns = self.episode_column("return");
@@ -121,10 +130,13 @@ impl RunFolder {
         self.text(&format!("logs/{process}.log"))
     }
 
-    /// The complete checkpoints, oldest first.
+    /// The complete checkpoints, oldest first; none if the folder does not exist.
     pub fn checkpoints(&self) -> Vec<PathBuf> {
-        let entries = fs::read_dir(self.path.join("checkpoints"));
-        let paths = entries.into_iter().flatten().map(|it| it.unwrap().path());
+        let entries = match fs::read_dir(self.path.join("checkpoints")) {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Vec::new(),
+            entries => entries.unwrap(),
+        };
+        let paths = entries.map(|it| it.unwrap().path());
         // Beside them are a lock file, and perhaps the remains of an unfinished save, whose names have an extension.
         let is_complete = |path: &PathBuf| !path.ends_with(".lock") && path.extension().is_none();
         let mut complete: Vec<_> = paths.filter(is_complete).collect();

@@ -276,6 +276,9 @@ fn it_plays_in_the_precision_of_the_run() {
         let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
         assert_eq!([&json["weights"], &json["arithmetic"]], [precision; 2]);
     }
+    let words = "bf16 weights after 540 updates played in bf16";
+    let played = system.run_ok("evaluate run --episodes 2");
+    played.expect_stdout(words);
 }
 
 /// The learner's own tests check that damage to any file is found. Without a checkpoint no film is begun.

@@ -29,7 +29,8 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let system = system();
     let env = numbered_world("");
     let flags = format!("{SMALL_WORLD} --agent driml-ada --frames 1280 --env '{env}'");
-    let summary = system.train(&format!("{flags} --actors 2"), "run");
+    let limit = "--set world.step_timeout_ms=50000";
+    let summary = system.train(&format!("{flags} {limit} --actors 2"), "run");
     assert_eq!(summary.frames, 1280);
     // Each episode of a copy lasts three to six steps.
     assert!(summary.episodes > 200, "{summary:#?}");
@@ -37,6 +38,8 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let config = run.config();
     assert_eq!(config["run"]["world"].as_str(), Some(env.as_str()));
     assert_eq!(config["world"]["actions"].as_array().unwrap().len(), 3);
+    let limit = &config["world"]["step_timeout_ms"];
+    assert_eq!(limit.as_integer(), Some(50_000));
     assert!(run.log("actor-0").contains("a line on stdout does no harm"));
 
     let lockstep = |args: &str, name: &str| {

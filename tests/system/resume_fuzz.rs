@@ -179,7 +179,7 @@ fn resume_once(seed: u64) {
     }
     let [numbers, frames] = ["episode", "frames"].map(|name| run.episode_column::<u64>(name));
     let is_sorted = numbers.is_sorted_by(|a, b| a < b) && frames.is_sorted();
-    let is_past = frames.iter().all(|it| *it <= Some(after.frames));
+    let is_past = frames.iter().all(|it| it.unwrap() <= after.frames);
     assert!(is_sorted && is_past, "{details}");
     for count in ["frames", "updates"] {
         let column = run.numeric_column(count);

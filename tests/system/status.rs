@@ -25,7 +25,7 @@ fn missing_processes_are_named_with_what_to_do() {
     let system = system();
     let endpoint = system.endpoint();
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let _client = system.connect();
+    let client = system.connect();
     let learn =
         format!("no learner has joined: start `driml learner --connect {endpoint} --run-dir DIR`");
     let act = format!("no actor has joined: start `driml actor --connect {endpoint} --id N`");
@@ -45,6 +45,7 @@ fn missing_processes_are_named_with_what_to_do() {
     assert!(!text.contains("DOWN"), "{text}");
 
     actors[1].signal(Signal::SIGKILL);
+    client.wait_for_replay("one actor", |it| it.actors == 1);
     let again = format!("`driml actor --connect {endpoint} --id 5`");
     wait_for_status(
         &system,

@@ -197,6 +197,9 @@ fn parse_prometheus(text: &str) -> Vec<(String, String, f64)> {
             let (name, rest) = line.split_once('{').unwrap();
             assert_eq!(name, family, "samples follow their family");
             let (labels, value) = rest.rsplit_once("} ").unwrap();
+            let mut pairs = labels.split("\",");
+            let is_quoted = labels.ends_with('"') && pairs.all(|it| it.contains("=\""));
+            assert!(is_quoted, "{line}");
             let twice = samples
                 .iter()
                 .any(|(other, their, _)| other == name && their == labels);

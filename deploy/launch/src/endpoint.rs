@@ -180,7 +180,11 @@ mod tests {
             ("tcp/[::1]:7447", false, ""),
             ("unixsock-stream//tmp/driml.sock", false, ""),
             (&*short, false, ""),
-            (&*long, false, "at most 107 bytes, and this one has 108"),
+            (
+                &*long,
+                false,
+                "107 bytes, and this one has 108: choose a shorter one",
+            ),
             ("quic/host:1", true, ""),
             ("unixsock-stream//tmp/s", true, ""),
             ("", false, none),

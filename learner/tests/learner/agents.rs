@@ -121,6 +121,14 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         let is_ended = parts.bootstrap_discount.iter().map(|it| *it == 0.0);
         let is_none = found.next_greedy_action.iter().map(|it| *it == NO_ACTION);
         assert!(is_none.eq(is_ended), "{kind:?}");
+        // All rows have ended.
+        let ended = Batch {
+            bootstrap_discount: &[0.0; 6],
+            states_n: &[],
+            ..parts
+        };
+        let found = agent(kind, lambda).evaluate(&ended).unwrap();
+        assert_eq!(found.next_greedy_action, [NO_ACTION; 6], "{kind:?}");
 
         for (states_k, states_n, what) in [
             (&states_k[1..], &states_n[..], "states_k"),
@@ -231,8 +239,8 @@ fn each_slow_network_is_a_moving_average_with_a_period_of_its_own() {
         assert_eq!(agent.key_encoder().is_some(), kind == CURL);
         let start = values(agent.online());
         let mut target = select(&start, |name| !name.starts_with("dim."));
-        let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
-        let mut key = select(&start, encoder);
+        let is_in_key = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
+        let mut key = select(&start, is_in_key);
         for update in 0..=4 {
             if update > 0 {
                 agent.update(&batch).unwrap();

@@ -268,7 +268,7 @@ fn what_no_process_says_is_refused() {
         read_chunk(&bytes).unwrap_err().to_string()
     };
     // The ends of six rows begin at byte 36, their rewards at 42.
-    refused.push((chunk_with(36, [0, 0, 0, 4]), "unknown end 4"));
+    refused.push((chunk_with(38, [0, 0, 0, 4]), "unknown end 4"));
     for reward in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         refused.push((chunk_with(42 + 4, reward.to_le_bytes()), "row 1"));
     }

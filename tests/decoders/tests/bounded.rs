@@ -107,11 +107,15 @@ struct ReportOnPanic<'a> {
 
 impl Drop for ReportOnPanic<'_> {
     fn drop(&mut self) {
-        let execution = format!("{}-{}", self.name, self.number);
-        let file = std::env::temp_dir().join(format!("driml-decoder-{execution}"));
+        let Self {
+            name,
+            number,
+            bytes,
+        } = self;
+        let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
         // The panic fails the test; the file with its bytes is only a help.
-        let _ = fs::write(&file, self.bytes);
-        let message = format!("execution {execution}: {}\n", file.display());
+        let _ = fs::write(&file, bytes);
+        let message = format!("{name}, execution {number}: {}\n", file.display());
         let _ = std::io::stderr().write_all(message.as_bytes());
     }
 }

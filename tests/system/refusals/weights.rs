@@ -72,8 +72,14 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         ("damaged", damaged),
         ("not a message", b"not weights".to_vec()),
         ("of a stranger", pack(2, &good, LEARNER ^ 1)),
-        ("other, of the same version", pack(1, &good[..40], LEARNER)),
-        ("beyond all versions", pack(1 << 60, &good, LEARNER)),
+        (
+            "other weights of the same version",
+            pack(1, &good[..40], LEARNER),
+        ),
+        (
+            "a count that no learner reaches",
+            pack(1 << 60, &good, LEARNER),
+        ),
         ("older", pack(0, &good, LEARNER)),
     ];
     check_rejected(&client, rows);

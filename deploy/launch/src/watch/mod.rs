@@ -5,7 +5,7 @@ mod watched;
 
 use std::{path::PathBuf, time::Duration};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use driml_machine::{error::Interrupted, units::count};
 use driml_protocol::{LogLimiter, Shutdown, reach};

@@ -37,20 +37,23 @@ const UNIFORM: [&str; 5] = [
     "dim.phi4.out",
 ];
 
-/// The laws of weights and biases that start uniform are tested in `init`.
 #[test]
 fn every_layer_starts_as_its_law_says() {
     let config = small();
     let parameters = parameters(&config, 5);
+    let mut uniform = 0;
     for (name, shape) in config.parameter_shapes() {
         let (layer, part) = name.rsplit_once('.').unwrap();
         let (tensor, is_uniform) = (parameters.get(&name).unwrap(), UNIFORM.contains(&layer));
         let (rows, fan_in) = (shape[0], shape.iter().skip(1).product::<usize>());
         let is_within = |bound: f64| values(tensor).iter().all(|value| value.abs() <= bound);
-        if part == "bias" {
-            assert_eq!(is_within(0.0), !is_uniform, "{name}");
-        } else if is_uniform {
-            assert!(is_within(1.0 / (fan_in as f64).sqrt() + 1e-7), "{name}");
+        if is_uniform {
+            let weight = parameters.get(&format!("{layer}.weight")).unwrap();
+            let bound = 1.0 / (weight.dims()[1] as f64).sqrt();
+            assert!(is_within(bound + 1e-7) && !is_within(0.7 * bound), "{name}");
+            uniform += 1;
+        } else if part == "bias" {
+            assert!(is_within(0.0), "{name}");
         } else {
             let matrix = tensor.reshape((rows, fan_in)).unwrap();
             let other = matrix.t().unwrap();
@@ -69,6 +72,7 @@ fn every_layer_starts_as_its_law_says() {
             }
         }
     }
+    assert_eq!(uniform, 2 * UNIFORM.len());
 }
 
 #[test]

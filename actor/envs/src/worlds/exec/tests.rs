@@ -155,7 +155,7 @@ kill 3        => ended in the middle of a step (signal: 9
 small 3       => (exit status: 1) | Error:
 nan 3         => gave copy 1 the reward NaN
 end 3         => ended the step of copy 1 with 7; 0 runs on
-hang 3        => --set world.step_timeout_ms=N | sleeping
+hang 3        => has not answered for 0.7 s in the middle of a step | --set world.step_timeout_ms=N | sleeping
 saves never   => cannot save its state: the dragon sits on it
 saves nothing => wrote no state
 saves large   => wrote a state of 67108865 bytes; 67108864 are possible
