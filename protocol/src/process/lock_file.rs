@@ -1,11 +1,16 @@
 //! Files whose lock shows that something is in use. The lock ends with the last process that has the file open, however it ends.
-//! These functions do not wait; the caller does.
+//! These functions wait only for processes that are being started; for others the caller waits.
 
 use std::{
     fs::{File, TryLockError},
     io,
     path::Path,
+    thread,
+    time::{Duration, Instant},
 };
+
+/// How long a process that another thread starts may keep the locks of this process: until its `exec` it has all files open.
+const FORK_MAX: Duration = Duration::from_millis(200);
 
 /// Creates `path` and locks it; returns `None` if another process holds the lock.
 ///
@@ -14,13 +19,16 @@ use std::{
 /// # Errors
 /// The file cannot be created; the error names no path.
 pub fn acquire(path: &Path, advice: &str) -> io::Result<Option<File>> {
-    let file = File::create(path)?;
-    match try_lock(&file) {
-        Ok(true) => Ok(Some(file)),
-        Ok(false) => Ok(None),
-        Err(e) => {
-            tracing::warn!("{} cannot be locked: {e}; {advice}", path.display());
-            Ok(Some(file))
+    let (file, started) = (File::create(path)?, Instant::now());
+    loop {
+        match try_lock(&file) {
+            Ok(true) => return Ok(Some(file)),
+            Ok(false) if started.elapsed() >= FORK_MAX => return Ok(None),
+            Ok(false) => thread::sleep(FORK_MAX / 20),
+            Err(e) => {
+                tracing::warn!("{} cannot be locked: {e}; {advice}", path.display());
+                return Ok(Some(file));
+            }
         }
     }
 }
@@ -48,8 +56,12 @@ mod tests {
         let copy = lock.try_clone().unwrap();
         drop(lock);
         assert!(acquire(&path, "").unwrap().is_none());
-        drop(copy);
+        let released = thread::spawn(|| {
+            thread::sleep(FORK_MAX / 4);
+            drop(copy);
+        });
         assert!(acquire(&path, "").unwrap().is_some());
+        released.join().unwrap();
         assert!(acquire(&folder.path().join("nowhere/.lock"), "").is_err());
     }
 }

@@ -197,7 +197,8 @@ mod tests {
         let mut shown = |frames, updates| {
             let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = frames);
             let learner = make(|it: &mut LearnerStatus| it.updates = updates);
-            let view = view(plan(8_000, 218), replay, Some(learner));
+            let mut view = view(plan(8_000, 218), replay, Some(learner));
+            view.after_updates = Some(0);
             display.show(&view);
             display.lines(&view).join("\n")
         };
