@@ -6,11 +6,10 @@ use crate::{
     canvas::{Anchor, Canvas, Letters, Rect, TextStyle},
     chart::{Chart, Series, draw_legend, legend_height},
     colours::{CARD, CARD_BORDER, INK, INK_SOFT},
-    error::FigureError,
     font,
     heat::Heat,
     lattice::Lattice,
-    render,
+    render::{self, FigureError},
 };
 
 /// PNG pixels for each unit of the figure: enough for a sharp picture on a dense screen and in print.
@@ -66,7 +65,10 @@ impl Format {
             Some("svg") => Ok(Self::Svg),
             Some("pdf") => Ok(Self::Pdf),
             Some("png") => Ok(Self::Png),
-            _ => Err(FigureError::Extension(path.to_owned())),
+            _ => Err(FigureError(format!(
+                "{} is not the name of a picture: use one that ends in .svg, .pdf or .png",
+                path.display()
+            ))),
         }
     }
 }
@@ -227,44 +229,34 @@ mod tests {
         }
     }
 
+    /// Returns a chart with a line of each name.
+    fn chart(title: &str, names: &[String]) -> Panel {
+        let points = || vec![(0.0, 1.0), (1.0, 3.0)];
+        let lines = names.iter().map(|name| Series::line(name, 0, points()));
+        let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
+        Panel::Chart(Chart::new(title, x, y, lines.collect()))
+    }
+
+    fn svg(panels: Vec<Panel>, look: Look) -> String {
+        let bytes = Figure { panels, ..figure() }.encode(Format::Svg, look);
+        String::from_utf8(bytes.unwrap()).unwrap()
+    }
+
     #[test]
     fn a_legend_that_would_fill_a_panel_is_above_all_panels() {
-        let svg = |runs: usize| {
-            let line = |at| {
-                Series::line(
-                    &format!("a run with a long name {at:02}"),
-                    at,
-                    vec![(0.0, 1.0)],
-                )
-            };
-            let chart = |_| {
-                let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
-                Panel::Chart(Chart::new("", x, y, (0..runs).map(line).collect()))
-            };
-            let panels = (0..2).map(chart).collect();
-            let bytes = Figure { panels, ..figure() }.encode(Format::Svg, Look::Card);
-            String::from_utf8(bytes.unwrap()).unwrap()
-        };
         for (runs, entries) in [(3, 6), (20, 20)] {
-            assert_eq!(svg(runs).matches("a run with").count(), entries);
+            let name = |at| format!("a run with a long name {at:02}");
+            let names: Vec<_> = (0..runs).map(name).collect();
+            let svg = svg(vec![chart("", &names), chart("", &names)], Look::Card);
+            assert_eq!(svg.matches("a run with").count(), entries);
         }
     }
 
     #[test]
     fn a_plain_figure_is_its_panels_and_one_legend() {
-        let svg = |look| {
-            let chart = |title: &str, names: &[&str]| {
-                let line = |name: &&str| Series::line(name, 0, vec![(0.0, 1.0), (1.0, 3.0)]);
-                let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
-                Panel::Chart(Chart::new(title, x, y, names.iter().map(line).collect()))
-            };
-            let second = chart("second", &["driml-ada", "c51"]);
-            let panels = vec![chart("first", &["driml-ada"]), second];
-            let bytes = Figure { panels, ..figure() }.encode(Format::Svg, look);
-            String::from_utf8(bytes.unwrap()).unwrap()
-        };
-        let (card, plain) = (svg(Look::Card), svg(Look::Plain));
-        let count = |svg: &str, word: &str| svg.matches(word).count();
+        let names = ["driml-ada", "c51"].map(String::from);
+        let panels = || vec![chart("first", &names[..1]), chart("second", &names)];
+        let (card, plain) = (svg(panels(), Look::Card), svg(panels(), Look::Plain));
         for (word, in_card, in_plain) in [
             ("A figure", 1, 0),
             ("made up", 1, 0),
@@ -273,8 +265,8 @@ mod tests {
             ("c51", 1, 1),
             ("second", 1, 1),
         ] {
-            let found = (count(&card, word), count(&plain, word));
-            assert_eq!(found, (in_card, in_plain), "{word}");
+            let found = [&card, &plain].map(|svg| svg.matches(word).count());
+            assert_eq!(found, [in_card, in_plain], "{word}");
         }
     }
 }

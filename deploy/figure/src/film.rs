@@ -1,77 +1,40 @@
 //! A sequence of pictures as an animated GIF that repeats forever. Pixels that did not change are stored as transparent.
 //! Only the last picture is kept in memory.
 
-use std::{
-    fs::File,
-    io::{self, BufWriter, Write},
-    path::{Path, PathBuf},
-};
+use std::io::{self, Write};
 
 use gif::{Encoder, Frame, Repeat};
-use tempfile::TempPath;
 
-use crate::{error::FigureError, picture::Picture};
+use crate::picture::Picture;
 
 /// The shortest delay that viewers respect, in hundredths of a second. Some viewers ignore a shorter delay.
 const DELAY_MIN: u16 = 2;
 
 /// A film (animated GIF) that is being written.
-///
-/// The film is written to `PATH.tmp`; [`Film::finish`] renames it to its path. If a film is dropped before that, its file is removed
-/// and an older file at the path stays.
-pub struct Film {
-    path: PathBuf,
-    tmp_path: TempPath,
-    encoder: Encoder<BufWriter<File>>,
-    width: u16,
-    height: u16,
+pub struct Film<W: Write> {
+    encoder: Encoder<W>,
+    size: (u16, u16),
     /// The delay of each picture in hundredths of a second. `owed` carries the rounding error, because GIF delays are whole numbers.
     delay: f64,
     owed: f64,
     previous: Option<Vec<[u8; 3]>>,
 }
 
-impl Film {
-    /// Returns an error unless the name ends in `.gif`.
-    pub fn check_name(path: &Path) -> Result<(), FigureError> {
-        match path.extension() {
-            Some(extension) if extension == "gif" => Ok(()),
-            _ => Err(FigureError::FilmExtension(path.to_owned())),
-        }
-    }
-
-    /// Creates a film of pictures of `size` (width, height), shown at `pictures_per_second`.
+impl<W: Write> Film<W> {
+    /// Begins a film of pictures of `size` (width, height), shown at `pictures_per_second`, and writes it `to` a file.
     ///
-    /// # Errors
-    /// The name does not end in `.gif`, a side is 0 or above 65,535 pixels, or the file cannot be written.
-    pub fn create(
-        path: &Path,
-        size: (usize, usize),
-        pictures_per_second: f64,
-    ) -> Result<Self, FigureError> {
-        Self::check_name(path)?;
-        let side = |length: usize| u16::try_from(length).ok().filter(|&it| it > 0);
-        let (Some(width), Some(height)) = (side(size.0), side(size.1)) else {
-            let (width, height) = size;
-            return Err(FigureError::Size { width, height });
-        };
-        let mut tmp_path = path.as_os_str().to_owned();
-        tmp_path.push(".tmp");
-        let begin = || -> io::Result<_> {
-            let file = BufWriter::new(File::create(&tmp_path)?);
-            let tmp_path = TempPath::try_from_path(tmp_path)?;
-            let mut encoder = Encoder::new(file, width, height, &[]).map_err(io::Error::other)?;
-            let repeated = encoder.set_repeat(Repeat::Infinite);
-            repeated.map_err(io::Error::other)?;
-            Ok((tmp_path, encoder))
-        };
-        let (tmp_path, encoder) = begin().map_err(|e| FigureError::write(path, e))?;
+    /// # Panics
+    /// A side is above 65,535 pixels, the most that a GIF can have.
+    pub fn begin(to: W, size: (usize, usize), pictures_per_second: f64) -> io::Result<Self> {
+        let side = |length: usize| u16::try_from(length).expect("a GIF's side fits 16 bits");
+        let size = (side(size.0), side(size.1));
+        let encoder = Encoder::new(to, size.0, size.1, &[]);
+        let mut encoder = encoder.map_err(io::Error::other)?;
+        let repeated = encoder.set_repeat(Repeat::Infinite);
+        repeated.map_err(io::Error::other)?;
         Ok(Self {
-            path: path.to_owned(),
-            tmp_path,
             encoder,
-            width,
-            height,
+            size,
             delay: (100.0 / pictures_per_second).max(DELAY_MIN.into()),
             owed: 0.0,
             previous: None,
@@ -82,8 +45,9 @@ impl Film {
     ///
     /// # Panics
     /// The size of the picture differs from that of the film.
-    pub fn add(&mut self, picture: &Picture, times: f64) -> Result<(), FigureError> {
-        let size = (usize::from(self.width), usize::from(self.height));
+    pub fn add(&mut self, picture: &Picture, times: f64) -> io::Result<()> {
+        let (width, height) = self.size;
+        let size = (usize::from(width), usize::from(height));
         assert_eq!(picture.size(), size, "a film has pictures of one size");
         let pixels = picture.rgb();
         let changed = |(at, &[r, g, b]): (usize, &[u8; 3])| match &self.previous {
@@ -91,22 +55,21 @@ impl Film {
             _ => [r, g, b, u8::MAX],
         };
         let mut rgba: Vec<u8> = pixels.iter().enumerate().flat_map(changed).collect();
-        let mut frame = Frame::from_rgba(self.width, self.height, &mut rgba);
+        let mut frame = Frame::from_rgba(width, height, &mut rgba);
         self.owed += self.delay * times;
         let delay = self.owed.round().clamp(DELAY_MIN.into(), u16::MAX.into());
         self.owed -= delay;
         frame.delay = delay as u16;
         self.previous = Some(pixels);
         let written = self.encoder.write_frame(&frame);
-        written.map_err(|e| FigureError::write(&self.path, io::Error::other(e)))
+        written.map_err(io::Error::other)
     }
 
-    /// Completes the film and renames its file to the final path.
-    pub fn finish(self) -> Result<(), FigureError> {
-        let ended = self.encoder.into_inner().map_err(io::Error::other);
-        let ended = ended.and_then(|mut file| file.flush());
-        let ended = ended.and_then(|()| self.tmp_path.persist(&self.path).map_err(io::Error::from));
-        ended.map_err(|e| FigureError::write(&self.path, e))
+    /// Completes the film, and returns the file.
+    pub fn finish(self) -> io::Result<W> {
+        let mut file = self.encoder.into_inner().map_err(io::Error::other)?;
+        file.flush()?;
+        Ok(file)
     }
 }
 
@@ -128,19 +91,14 @@ mod tests {
         picture
     }
 
-    /// Writes a film of these pictures; returns the delays, and the whole pictures as a viewer composes them.
+    /// Makes a film of these pictures; returns the delays, and the whole pictures as a viewer composes them.
     fn played(pictures: &[Picture], rate: f64) -> (Vec<u16>, Vec<Vec<[u8; 3]>>) {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("x.gif");
-        let mut film = Film::create(&path, pictures[0].size(), rate).unwrap();
+        let mut film = Film::begin(Vec::new(), pictures[0].size(), rate).unwrap();
         for picture in pictures {
             film.add(picture, 1.0).unwrap();
         }
-        film.finish().unwrap();
-        let files = std::fs::read_dir(folder.path()).unwrap();
-        assert_eq!(files.count(), 1, "nothing else is left");
-
-        let mut decoder = gif::Decoder::new(File::open(path).unwrap()).unwrap();
+        let bytes = film.finish().unwrap();
+        let mut decoder = gif::Decoder::new(&*bytes).unwrap();
         let mut shown = vec![[9; 3]; pictures[0].rgb().len()];
         let (mut delays, mut seen) = (Vec::new(), Vec::new());
         while let Some(frame) = decoder.read_next_frame().unwrap() {
@@ -186,31 +144,5 @@ mod tests {
             let far = off.iter().filter(|&&off| off > 40).count();
             assert!(mean < 5.0 && far < off.len() / 100, "{mean} {far}");
         }
-    }
-
-    #[test]
-    fn names_and_places_that_no_film_can_have() {
-        let folder = tempfile::tempdir().unwrap();
-        let create = |name: &str, width| {
-            let path = folder.path().join(name);
-            let film = Film::create(&path, (width, 4), 10.0);
-            film.map(drop).map_err(|e| e.to_string())
-        };
-        for (name, width, why) in [
-            ("x", 4, "ends in .gif"),
-            ("x.png", 4, "ends in .gif"),
-            ("gif", 4, "ends in .gif"),
-            ("none/x.gif", 4, "writing "),
-            ("x.gif", 70_000, "70000 x 4 pixels"),
-        ] {
-            let said = create(name, width).unwrap_err();
-            assert!(said.contains(why), "{said}");
-        }
-        // A film that is dropped unfinished leaves the older file and no other.
-        let path = folder.path().join("x.gif");
-        std::fs::write(&path, "older").unwrap();
-        create("x.gif", 4).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), "older");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 }

@@ -31,7 +31,6 @@
 mod canvas;
 mod chart;
 mod colours;
-mod error;
 mod figure;
 mod film;
 mod font;
@@ -45,10 +44,10 @@ pub use crate::{
     canvas::Rect,
     chart::{Axis, Chart, Mark, Series},
     colours::{Colour, GREY},
-    error::FigureError,
     figure::{Figure, Format, Look, Panel},
     film::Film,
     heat::{Field, Heat, Outline},
     lattice::Lattice,
     picture::{Image, Ink, Picture},
+    render::FigureError,
 };

@@ -6,8 +6,7 @@ use resvg::tiny_skia::{Color, Pixmap, PremultipliedColorU8, Transform};
 use crate::{
     canvas::{Anchor, Canvas, Letters, Point, Rect, TextStyle},
     colours::{CARD, GREY, INK, INK_SOFT, heat_colour, series_colour},
-    error::FigureError,
-    render,
+    render::{self, FigureError},
 };
 
 /// An image [H, W, C] of bytes, channels last. Three channels are red, green and blue; otherwise the first channel is drawn as grey.

@@ -7,7 +7,16 @@ use resvg::{
 };
 use svg2pdf::{ConversionOptions, PageOptions};
 
-use super::error::FigureError;
+/// Why a figure or a picture could not be made.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct FigureError(pub(super) String);
+
+impl FigureError {
+    fn encoding(e: impl std::fmt::Display) -> Self {
+        Self(format!("encoding a picture: {e}"))
+    }
+}
 
 /// Renders the SVG as a PNG with `zoom` pixels for each unit. Pixels that no shape covers are transparent.
 pub(super) fn png(svg: &str, zoom: f32) -> Result<Vec<u8>, FigureError> {
@@ -24,18 +33,18 @@ pub(super) fn png(svg: &str, zoom: f32) -> Result<Vec<u8>, FigureError> {
 pub(super) fn pdf(svg: &str) -> Result<Vec<u8>, FigureError> {
     let page = PageOptions { dpi: 96.0 };
     let bytes = svg2pdf::to_pdf(&parse_svg(svg)?, ConversionOptions::default(), page);
-    bytes.map_err(|e| FigureError::Encode(e.to_string()))
+    bytes.map_err(FigureError::encoding)
 }
 
 pub(super) fn parse_svg(svg: &str) -> Result<Tree, FigureError> {
-    let tree = Tree::from_str(svg, &Options::default());
-    tree.map_err(|e| FigureError::Encode(e.to_string()))
+    Tree::from_str(svg, &Options::default()).map_err(FigureError::encoding)
 }
 
 pub(super) fn new_pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
     let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
     let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
-    pixmap.ok_or(FigureError::Size { width, height })
+    let why = || format!("a picture of {width} x {height} pixels cannot be made");
+    pixmap.ok_or_else(|| FigureError(why()))
 }
 
 /// Encodes the pixels as a PNG file. tiny-skia's encoder compresses fast and gives a file three times as large.
@@ -52,6 +61,6 @@ pub(super) fn encode_png(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
     let pixels: Vec<u8> = pixels.collect();
     let header = encoder.write_header();
     let written = header.and_then(|mut image| image.write_image_data(&pixels));
-    written.map_err(|e| FigureError::Encode(e.to_string()))?;
+    written.map_err(FigureError::encoding)?;
     Ok(file)
 }

@@ -12,7 +12,6 @@ use std::{
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use driml_actor::Step;
-use driml_figure::Film;
 use driml_launch::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice},
     console::{self, Screen, print},
@@ -87,8 +86,13 @@ fn probability(text: &str) -> Result<f64, String> {
 }
 
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
-    if let Some(path) = &args.film.record {
-        Film::check_name(path).map_err(|e| usage!("--record: {e}"))?;
+    if let Some(path) = &args.film.record
+        && path.extension().is_none_or(|it| it != "gif")
+    {
+        bail!(usage!(
+            "--record: {} is not the name of a film: use one that ends in .gif",
+            path.display()
+        ));
     }
     let folder = args.folder.as_ref().or(args.run.as_ref());
     let folder = folder.expect("clap asks for one of the two");
@@ -157,16 +161,18 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         (PolicyKind::Random, "random"),
     ] {
         let mut screen = Screen::new(episodes as u64, PROGRESS_TEMPLATE);
+        let mut filmed = Ok(());
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
-            film.iter_mut().for_each(|film| film.add_step(step));
-            match shutdown.is_set() {
+            filmed = film.iter_mut().try_for_each(|film| film.add_step(step));
+            match shutdown.is_set() || filmed.is_err() {
                 true => ControlFlow::Break(()),
                 false => ControlFlow::Continue(()),
             }
         };
         let returns = player.play(policy, &world, episodes, args.seed, watch);
         screen.clear();
+        filmed.context("making the film")?;
         let returns = returns?;
         if shutdown.is_set() {
             return Err(Interrupted.into());

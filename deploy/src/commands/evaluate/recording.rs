@@ -1,19 +1,22 @@
 //! A film of what the agent plays: which environments, for how long, and what stands beside each frame.
 //! Filming does not change what is played.
 
-use std::{collections::VecDeque, path::PathBuf};
+use std::{
+    collections::VecDeque,
+    fs::File,
+    io::{self, BufWriter},
+    path::PathBuf,
+};
 
 use clap::Args;
 use driml_actor::Step;
 use driml_envs::StepEnd;
-use driml_figure::{FigureError, Film, Picture};
-use driml_launch::evaluate::Player;
+use driml_figure::{Film, Picture};
+use driml_launch::{evaluate::Player, output::unwritable};
 use driml_learner::insight::{Insight, NetworkOutputs};
-use driml_machine::{
-    error::{Usage, usage},
-    whole_number,
-};
+use driml_machine::whole_number;
 use driml_protocol::Horizon;
+use tempfile::TempPath;
 
 use super::tile::{Layout, Local, Shot};
 
@@ -41,7 +44,9 @@ pub(crate) struct RecordArgs {
 
 pub(crate) struct Recording {
     path: PathBuf,
-    film: Film,
+    /// The file of an unfinished film, which is removed when this is dropped. An older file at `path` stays until then.
+    tmp_path: TempPath,
+    film: Film<BufWriter<File>>,
     layout: Layout,
     /// Computes the network's outputs for the states, if they are shown.
     insight: Option<Insight>,
@@ -52,7 +57,6 @@ pub(crate) struct Recording {
     steps: u32,
     /// Steps that are not drawn yet, because local DIM compares them with later states.
     waiting: VecDeque<FilmedStep>,
-    error: Option<anyhow::Error>,
 }
 
 struct FilmedStep {
@@ -88,7 +92,14 @@ impl Recording {
         });
         let layout = Layout::new(&player.config, envs, insight.is_some(), local);
         let rate = player.config.world.steps_per_second();
-        let film = Film::create(path, layout.size, rate).map_err(film_error)?;
+        let begin = || -> io::Result<_> {
+            let mut tmp_path = path.as_os_str().to_owned();
+            tmp_path.push(".tmp");
+            let file = BufWriter::new(File::create(&tmp_path)?);
+            let tmp_path = TempPath::try_from_path(tmp_path)?;
+            Ok((tmp_path, Film::begin(file, layout.size, rate)?))
+        };
+        let (tmp_path, film) = begin().map_err(|e| unwritable("--record", path, e))?;
         // Start as if an episode had ended before the first.
         let before = Shot {
             is_last: true,
@@ -96,6 +107,7 @@ impl Recording {
         };
         Ok(Some(Self {
             path: path.clone(),
+            tmp_path,
             film,
             layout,
             insight,
@@ -104,23 +116,15 @@ impl Recording {
             steps_max: args.record_steps,
             steps: 0,
             waiting: VecDeque::new(),
-            error: None,
         }))
     }
 
-    /// Films a step. [`finish`](Self::finish) returns the errors.
-    pub(crate) fn add_step(&mut self, step: &Step<'_>) {
+    /// Films a step, unless everything is filmed.
+    pub(crate) fn add_step(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
         let is_over = |shot: &Shot| shot.is_over(self.episodes_max);
-        if self.error.is_none()
-            && self.steps < self.steps_max
-            && !self.shots.iter().all(is_over)
-            && let Err(e) = self.try_add_step(step)
-        {
-            self.error = Some(e);
+        if self.steps == self.steps_max || self.shots.iter().all(is_over) {
+            return Ok(());
         }
-    }
-
-    fn try_add_step(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
         let played = step.actions.len();
         let frames = step.frames.chunks_exact(step.frames.len() / played);
         let mut seen = None;
@@ -182,21 +186,19 @@ impl Recording {
         }
         let ended = matches!(filmed.shots[..], [Shot { is_last: true, .. }]);
         let added = self.film.add(&picture, if ended { PAUSE } else { 1.0 });
-        Ok(added.map_err(film_error)?)
+        Ok(added.map_err(|e| unwritable("--record", &self.path, e))?)
     }
 
     /// Ends the film, and returns a sentence about its content.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
-        while self.error.is_none() && !self.waiting.is_empty() {
-            self.error = self.draw_next().err();
+        while !self.waiting.is_empty() {
+            self.draw_next()?;
         }
-        let path = self.path.display();
-        if let Some(e) = self.error {
-            return Err(e.context("making the film"));
-        }
-        self.film.finish().map_err(film_error)?;
+        let file = self.film.finish();
+        let written = file.and_then(|_| Ok(self.tmp_path.persist(&self.path)?));
+        written.map_err(|e| unwritable("--record", &self.path, e))?;
         let steps = driml_machine::units::count(self.steps, "step");
-        Ok(format!("filmed {steps}: {path}\n"))
+        Ok(format!("filmed {steps}: {}\n", self.path.display()))
     }
 }
 
@@ -217,15 +219,5 @@ impl Shot {
         self.reward = f64::from(step.rewards[i]);
         self.total += self.reward;
         self.is_last = matches!(step.ends[i], StepEnd::Terminal | StepEnd::TimedOut);
-    }
-}
-
-/// Reports a film that cannot be made or written as a wrong flag.
-fn film_error(error: FigureError) -> Usage {
-    match error {
-        FigureError::Write { path, source } => {
-            driml_launch::output::unwritable("--record", &path, source)
-        }
-        _ => usage!("--record: {error}"),
     }
 }
