@@ -1,11 +1,12 @@
-//! What every run needs of the machine: cores, vector instructions and the kernels that use them, memory, shared memory, disk.
-//! The numbers are what is free now; `plan` says how large a run becomes.
+//! What every run needs of the machine: cores, vector instructions and the kernels that use them, memory, shared memory, disk, and
+//! Procgen's engine. The numbers are what is free now; `plan` says how large a run becomes. Nothing is fetched.
 
 use std::path::Path;
 
 use driml_model::{Precision, describe_kernels};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
+use procgen_sys::{Engine, ProcgenError};
 
 use super::fact::{Fact, Finding, State};
 use crate::{
@@ -38,6 +39,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
         ("shared memory", shared_memory(shared_memory::free_bytes())),
         ("locked memory", locked_memory(lockable_bytes())),
         ("disk", disk(runs)),
+        ("Procgen", engine()),
     ];
     all.map(|(what, found)| Fact::new(what, found)).into()
 }
@@ -169,6 +171,34 @@ fn free_disk_bytes(folder: &Path) -> Result<u64, String> {
     Ok(disk.blocks_available().saturating_mul(disk.fragment_size()))
 }
 
+/// Whether Procgen's engine is in the cache folder and loads.
+fn engine() -> Finding {
+    let checked = Engine::locate().and_then(|engine| engine.check_loads().map(|()| engine));
+    match checked {
+        Ok(engine) => {
+            let library = engine.library().display();
+            (State::Ok, format!("the engine is {library} and loads"))
+        }
+        Err(ProcgenError::Missing { reason, .. }) => {
+            not_installed(&reason, Engine::describe_source())
+        }
+        Err(why) => (State::Missing, why.to_string()),
+    }
+}
+
+/// The fact for an engine that is not installed; `source` is where it would be downloaded from.
+fn not_installed(reason: &str, source: Result<String, ProcgenError>) -> Finding {
+    match source {
+        Ok(source) => {
+            let text = format!(
+                "the engine: {reason}; `driml procgen install` gets it from {source}, and so does the first run that needs it"
+            );
+            (State::Note, text)
+        }
+        Err(why) => (State::Missing, why.to_string()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -180,6 +210,7 @@ mod tests {
             memory_bytes,
             fast_bf16: false,
         };
+        let no_pip = ProcgenError::Fetch("install python3-pip".into());
         for (found, state) in [
             (vectors(Some(16)), State::Ok),
             (vectors(Some(8)), State::Ok),
@@ -198,6 +229,8 @@ mod tests {
             (locked_memory(None), State::Ok),
             (cores(&machine(1, 0)), State::Note),
             (cores(&machine(2, 0)), State::Ok),
+            (not_installed("", Ok("`pip`".into())), State::Note),
+            (not_installed("", Err(no_pip)), State::Missing),
         ] {
             assert_eq!(found.0, state, "{found:?}");
         }

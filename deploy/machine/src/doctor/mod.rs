@@ -2,7 +2,6 @@
 //! The doctor changes nothing, fetches nothing and measures no speed.
 
 mod certificates;
-mod engine;
 mod fact;
 mod host;
 
@@ -23,8 +22,6 @@ pub struct Report {
 
 /// Examines this machine. `run_dir` is where runs would be written; `tls_dir` holds the certificates, if any.
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
-    let mut cpu = host::facts(run_dir);
-    cpu.push(Fact::new("Procgen", engine::check_engine()));
     // Training on the CPU needs no GPU.
     let gpu_fact = |(name, found): GpuCheck| match found {
         Ok(text) => Fact::new(name, (State::Ok, text)),
@@ -35,7 +32,7 @@ pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
         Err(why) => vec![Fact::new("cuda", (State::Note, why))],
     };
     Report {
-        cpu,
+        cpu: host::facts(run_dir),
         cuda,
         certificates: tls_dir.map_or_else(Vec::new, certificates::facts),
     }
