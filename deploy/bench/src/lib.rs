@@ -1,6 +1,6 @@
 //! `driml bench`: measures the speed of the components, alone and compared with other software for the same work.
 //!
-//! Each file is one bench and returns `Measurement`s, each with its name and unit; [`flags::BenchCommand`] lists the benches.
+//! Each file is one bench and records figures, each with its name and unit; `flags.rs` lists the benches.
 //! `deploy/bench/peers/` has the same work in Python. No bench passes or fails by its speed.
 //!
 //! Start with [`run`]; its arguments come from a command line:
@@ -55,7 +55,7 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
         BenchCommand::Learner(args) => args.on.device,
         _ => DeviceName::Cpu,
     };
-    device::check_device(device_name)?;
+    let gpu = device::check_device(device_name)?;
     let json = flags.json.as_deref().filter(|it| *it != Path::new("-"));
     json.map_or(Ok(()), |it| output::check_file("--json", it))?;
     let starts_processes = matches!(
@@ -65,7 +65,7 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
     if !starts_processes {
         subprocess::ensure_threads(flags.threads)?;
     }
-    let machine = MachineInfo::detect(device::describe_gpu(device_name));
+    let machine = MachineInfo::detect(gpu);
     let mut bench = Bench {
         flags,
         meter: SpeedMeter::new(flags.quick),

@@ -21,10 +21,11 @@ pub struct DeviceFlag {
     pub device: DeviceName,
 }
 
-/// Checks that the device exists and that this program was built for it. Otherwise the error says what to do.
-pub fn check_device(device: DeviceName) -> Result<(), Usage> {
+/// Checks that the device exists and that this program was built for it. Otherwise the error says what to do. Returns a GPU's name, compute
+/// capability and memory.
+pub fn check_device(device: DeviceName) -> Result<Option<String>, Usage> {
     let DeviceName::Cuda(ordinal) = device else {
-        return Ok(());
+        return Ok(None);
     };
     let described = device_count().and_then(|count| match ordinal < count {
         true => describe_cuda(ordinal),
@@ -33,16 +34,8 @@ pub fn check_device(device: DeviceName) -> Result<(), Usage> {
             units::count(count, "device")
         )),
     });
-    let checked = described.map(drop);
-    checked.map_err(|why| usage!("cuda:{ordinal} cannot be used: {why}"))
-}
-
-/// Describes a GPU: its name, compute capability and memory. None for the CPU, or if the GPU cannot be used.
-pub fn describe_gpu(device: DeviceName) -> Option<String> {
-    match device {
-        DeviceName::Cpu => None,
-        DeviceName::Cuda(ordinal) => describe_cuda(ordinal).ok(),
-    }
+    let described = described.map_err(|why| usage!("cuda:{ordinal} cannot be used: {why}"))?;
+    Ok(Some(described))
 }
 
 /// A GPU's device name, such as `cuda:0`, and its description, or why this program cannot compute there.
