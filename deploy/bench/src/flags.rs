@@ -10,16 +10,14 @@ use driml_machine::{device::DeviceFlag, whole_number};
 /// The arguments of `driml bench`.
 #[derive(Debug, Args)]
 pub struct BenchArgs {
-    /// What to measure.
     #[command(subcommand)]
     pub(crate) command: BenchCommand,
     #[command(flatten)]
     pub(crate) flags: BenchFlags,
 }
 
-/// What to measure.
 #[derive(Debug, Subcommand)]
-pub enum BenchCommand {
+pub(crate) enum BenchCommand {
     /// Updates of the learner, also with candle's operations
     Learner(BenchLearnerArgs),
     /// Decisions of an actor's policy
@@ -53,7 +51,7 @@ pub enum BenchCommand {
 
 /// The flags of all benches.
 #[derive(Clone, Debug, Args)]
-pub struct BenchFlags {
+pub(crate) struct BenchFlags {
     /// Few iterations: shows only that the bench works
     #[arg(long, global = true)]
     pub(crate) quick: bool,
@@ -79,9 +77,8 @@ impl BenchFlags {
     }
 }
 
-/// The flags of `driml bench learner`.
 #[derive(Clone, Debug, Args)]
-pub struct BenchLearnerArgs {
+pub(crate) struct BenchLearnerArgs {
     /// Measure C51 + global DIM with growing batch, observation, atoms and vectors instead
     #[arg(long)]
     pub(crate) growth: bool,
@@ -92,9 +89,8 @@ pub struct BenchLearnerArgs {
     pub(crate) on: DeviceFlag,
 }
 
-/// The flags of `driml bench replay`.
 #[derive(Clone, Debug, Args)]
-pub struct BenchReplayArgs {
+pub(crate) struct BenchReplayArgs {
     /// Compare a replay on disk, in DIR/driml-bench, with one in memory instead; also measures reading it back
     #[arg(long, value_name = "DIR")]
     pub(crate) replay_dir: Option<PathBuf>,
@@ -112,9 +108,8 @@ pub struct BenchReplayArgs {
     pub(crate) tls_dir: Option<PathBuf>,
 }
 
-/// The flags of `driml bench peers`.
 #[derive(Debug, Args)]
-pub struct BenchPeersArgs {
+pub(crate) struct BenchPeersArgs {
     /// Only these components
     #[arg(long, value_enum, value_delimiter = ',', value_name = "COMPONENTS")]
     pub(crate) only: Vec<Component>,
@@ -137,7 +132,7 @@ pub struct BenchPeersArgs {
 
 /// A component that is measured by itself, and beside a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub enum Component {
+pub(crate) enum Component {
     /// Updates, beside PyTorch's
     Learner,
     /// Frames through the policy, beside PyTorch's

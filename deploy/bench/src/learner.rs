@@ -34,7 +34,6 @@ const REPEATED: [(f64, &str); 3] = [
     (0.04, "4% of states repeat"),
     (0.38, "38% of states repeat"),
 ];
-/// The two ways to compute equal states.
 const DEDUPLICATION: [(&str, &str); 2] = [
     ("learner.deduplicate_states=false", "each computed"),
     ("learner.deduplicate_states=true", "equal ones once"),

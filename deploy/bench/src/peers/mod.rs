@@ -7,6 +7,7 @@ mod script;
 use std::{
     collections::{BTreeMap, BTreeSet},
     fs,
+    path::Path,
 };
 
 use anyhow::Context;
@@ -82,8 +83,9 @@ pub(super) fn run(
         only => only.iter().copied().collect(),
     };
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
-    for (name, text) in script::SCRIPTS {
-        fs::write(folder.path().join(name), text).with_context(|| format!("writing {name}"))?;
+    for (path, text) in script::SCRIPTS {
+        let name = Path::new(path).file_name().context("a script has a name")?;
+        fs::write(folder.path().join(name), text).with_context(|| format!("writing {path}"))?;
     }
     let frames = folder.path().join("frames");
     if components.contains(&Component::Replay) {

@@ -16,24 +16,17 @@ use crate::{
     report::{Measurement, Report},
 };
 
-/// The scripts, which are embedded in the program so that it can be started anywhere.
-pub(super) const SCRIPTS: [(&str, &str); 6] = [
-    ("measure.py", include_str!("../../peers/measure.py")),
-    ("driml_net.py", include_str!("../../../python/driml_net.py")),
-    (
-        "torch_update.py",
-        include_str!("../../peers/torch_update.py"),
-    ),
-    (
-        "torch_policy.py",
-        include_str!("../../peers/torch_policy.py"),
-    ),
-    (
-        "reverb_replay.py",
-        include_str!("../../peers/reverb_replay.py"),
-    ),
-    ("gym3_steps.py", include_str!("../../peers/gym3_steps.py")),
-];
+macro_rules! embed {
+    ($($path:literal)+) => {
+        [$(($path, include_str!($path))),+]
+    };
+}
+
+/// The scripts by their paths, which are embedded in the program so that it can be started anywhere.
+pub(super) const SCRIPTS: [(&str, &str); 6] = embed!(
+    "../../peers/measure.py" "../../../python/driml_net.py" "../../peers/torch_update.py"
+    "../../peers/torch_policy.py" "../../peers/reverb_replay.py" "../../peers/gym3_steps.py"
+);
 
 /// The script of a component's peer, and its arguments.
 pub(super) struct Script {
