@@ -5,9 +5,6 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
-/// The side of a field, in pixels.
-const FIELD: usize = 2;
-
 /// What each action adds to row and column.
 const MOVES: [(isize, isize); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 
@@ -34,7 +31,7 @@ impl WorldSettings for IslandConfig {
     }
 
     fn frame_shape(&self) -> FrameShape {
-        FrameShape::new(self.side * FIELD, self.side * FIELD, 1)
+        FrameShape::new(self.side, self.side, 1)
     }
 
     fn action_names(&self) -> Vec<&str> {
@@ -107,13 +104,10 @@ impl Environment for Islands {
 
     fn observe(&mut self, frames: &mut [u8]) {
         frames.fill(0);
-        let shape = self.config.frame_shape();
-        let (width, frames) = (shape.width, frames.chunks_exact_mut(shape.bytes()));
-        for (frame, island) in frames.zip(&self.islands) {
+        let side = self.config.side;
+        for (frame, island) in frames.chunks_exact_mut(side * side).zip(&self.islands) {
             for ((row, column), shade) in [(island.treasure, 128), (island.agent, 255)] {
-                for row in frame.chunks_exact_mut(width).skip(row * FIELD).take(FIELD) {
-                    row[column * FIELD..][..FIELD].fill(shade);
-                }
+                frame[row * side + column] = shade;
             }
         }
     }
