@@ -9,6 +9,7 @@ use std::{
 };
 
 use clap::{Arg, Command, CommandFactory, Parser};
+use driml_settings::presets::{Layer, PRESETS};
 use expect_test::expect_file;
 use walkdir::WalkDir;
 
@@ -108,13 +109,14 @@ pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-fn preset_files(folder: &str) -> Vec<(String, PathBuf)> {
+/// Returns the names of the files in a folder of presets, sorted.
+fn preset_names(folder: &str) -> Vec<String> {
     let folder = root().join("deploy/settings/presets").join(folder);
     let files = fs::read_dir(folder).unwrap().map(|it| it.unwrap().path());
-    let name = |file: &Path| file.file_stem().unwrap().to_str().unwrap().to_owned();
-    let mut presets: Vec<_> = files.map(|file| (name(&file), file)).collect();
-    presets.sort();
-    presets
+    let names = files.map(|file| file.file_stem().unwrap().to_str().unwrap().to_owned());
+    let mut names: Vec<_> = names.collect();
+    names.sort();
+    names
 }
 
 /// Returns the page of settings: the base preset in full, and links to the others.
@@ -125,19 +127,16 @@ fn settings() -> String {
         `driml presets --env bigfish --agent driml-fix` prints it with the source of every value.\n\n\
         ## Base\n\n```toml\n";
     page += &fs::read_to_string(base).unwrap();
-    page += "```\n\n## Presets\n\n* `paper`: base, world and agent alone.\n";
+    page += "```\n\n## Presets\n\n";
     let link = |folder: &str, name: &str| {
         format!("[`{name}`](../../../settings/presets/{folder}/{name}.toml)")
     };
-    for (name, file) in preset_files("variant") {
-        let text = fs::read_to_string(&file).unwrap();
-        let first = text.lines().next().unwrap().trim_start_matches("# ");
-        let first = first.split_inclusive(". ").next().unwrap().trim();
-        writeln!(page, "* {}: {first}", link("variant", &name)).unwrap();
+    for Layer { name, about, .. } in PRESETS {
+        writeln!(page, "* {}: {about}.", link("variant", name)).unwrap();
     }
     for (folder, title) in [("agent", "Agents"), ("world", "Worlds")] {
-        let presets = preset_files(folder);
-        let links: Vec<_> = presets.iter().map(|it| link(folder, &it.0)).collect();
+        let names = preset_names(folder).into_iter();
+        let links: Vec<_> = names.map(|name| link(folder, &name)).collect();
         write!(page, "\n## {title}\n\n{}\n", links.join(", ")).unwrap();
     }
     page

@@ -2,7 +2,7 @@
 
 use driml_envs::{CustomKind, WorldSettings};
 use driml_learner::auxiliary::{self, loss::MenuItem};
-use driml_settings::presets::{self, Agent};
+use driml_settings::presets::{self, Layer};
 use serde::de::DeserializeOwned;
 
 /// Worlds, losses and agents in addition to driml's own, for [`main_with`](crate::main_with). If a world or an agent has the name of one of
@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 pub struct Registry {
     worlds: Vec<CustomKind>,
     losses: Vec<&'static MenuItem>,
-    agents: Vec<Agent>,
+    agents: Vec<Layer>,
 }
 
 impl Registry {
@@ -35,7 +35,7 @@ impl Registry {
     /// Adds an agent, for `--agent NAME`, with a sentence that describes it and its layer of settings in TOML.
     #[must_use]
     pub fn agent(mut self, name: &'static str, about: &'static str, layer: &'static str) -> Self {
-        self.agents.push(Agent::new(name, about, layer));
+        self.agents.push(Layer::custom(name, about, layer));
         self
     }
 

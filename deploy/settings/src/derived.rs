@@ -9,7 +9,7 @@ use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use crate::overrides::inline_text;
+use crate::overrides::{find, inline_text, insert, insert_missing};
 
 /// The derived settings: their paths, and from what they follow.
 const DERIVED: &str = "\
@@ -36,9 +36,9 @@ pub(crate) const FRAME_PATH: &str = "input.frame";
 /// Asks a world that runs in its own process for its declaration, and fills in its shapes, actions and input size.
 pub(crate) fn fill_in_declaration(table: &mut Table, command: &str) -> Result<(), Usage> {
     let limits = ["world.start_timeout_ms", "world.step_timeout_ms"];
-    let [start, step] = limits.map(|limit| read_size(table, limit));
-    let declared = driml_envs::probe_exec_command(command, start? as u64, step? as u64)
-        .map_err(|e| usage!("--env: {e}"))?;
+    let [start_ms, step_ms] = limits.map(|limit| read(table, limit));
+    let declared = driml_envs::probe_exec_command(command, start_ms?, step_ms?);
+    let declared = declared.map_err(|e| usage!("--env: {e}"))?;
     for (path, side) in [
         ("input.height", declared.height),
         ("input.width", declared.width),
@@ -64,12 +64,15 @@ pub(crate) fn resolve_precision(table: &mut Table, fast_bf16: bool) {
     }
 }
 
-/// Removes the presets' settings of torsos other than this network's. Settings in `by_hand` stay, so that their check rejects them.
-pub(crate) fn drop_other_torsos(table: &mut Table, by_hand: &[String]) -> Result<(), Usage> {
+/// Removes the presets' settings of torsos other than this network's. Settings that `is_set` by hand stay, so that their check rejects them.
+pub(crate) fn drop_other_torsos(
+    table: &mut Table,
+    is_set: impl Fn(&str) -> bool,
+) -> Result<(), Usage> {
     let others = read_torso(table)?.settings_of_others();
     if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
         for key in others {
-            if !by_hand.contains(&format!("model.{key}")) {
+            if !is_set(&format!("model.{key}")) {
                 model.remove(*key);
             }
         }
@@ -92,43 +95,40 @@ pub(crate) fn find_derived(path: &str) -> Option<(&'static str, &'static str)> {
 
 pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
     let world = find(table, "run.world").and_then(Value::as_str);
-    let world = world.ok_or_else(|| missing("run.world", "a word"))?.parse();
+    let world = world.ok_or_else(|| missing("run.world, a word"))?.parse();
     let world: WorldName = world.map_err(|e| usage!("run.world: {e}"))?;
     insert(table, "world.kind", Value::String(world.kind().into()));
     for (key, value) in world.settings() {
         insert(table, &format!("world.{key}"), Value::String(value.into()));
     }
-    let config: WorldConfig = read_table(table, "world")?;
-    let update: UpdateSettings = read_table(table, "learner.update")?;
+    let config: WorldConfig = read(table, "world")?;
+    let update: UpdateSettings = read(table, "learner.update")?;
     let shape = config.frame_shape();
     let frame = (shape.height, shape.width);
-    let input = (
-        read_size(table, "input.height")?,
-        read_size(table, "input.width")?,
-    );
-    let mut read = ReadArea { input, frame };
+    let input = (read(table, "input.height")?, read(table, "input.width")?);
+    let mut area = ReadArea { input, frame };
     if find(table, FRAME_PATH).is_some() {
         let (height, width) = (shape.height as u32, shape.width as u32);
         insert(table, FRAME_PATH, as_toml(FrameSize { height, width })?);
         // Augmentation crops the frame and reads the borders too.
         if find(table, "learner.augment").is_none() {
-            let input: InputSize = read_table(table, "input")?;
+            let input: InputSize = read(table, "input")?;
             let conv: Option<Vec<ConvLayer>> = read_optional(table, "model.conv")?;
-            read = input.read_area(read_torso(table)?, &conv.unwrap_or_default(), frame);
+            area = input.read_area(read_torso(table)?, &conv.unwrap_or_default(), frame);
         }
     }
     let set = read_optional(table, "actor.actions")?.unwrap_or(ActionSet::All);
     let num_actions = config.actions(set).len();
-    let stack = read_whole(table, "run.frame_stack")?;
+    let stack: i64 = read(table, "run.frame_stack")?;
     let size = |value: usize| Value::Integer(value as i64);
     let channels = stack.saturating_mul(shape.channels as i64);
     for (path, value) in [
-        ("run.frame_height", size(read.frame.0)),
-        ("run.frame_width", size(read.frame.1)),
+        ("run.frame_height", size(area.frame.0)),
+        ("run.frame_width", size(area.frame.1)),
         ("run.frame_channels", size(shape.channels)),
         ("run.num_actions", size(num_actions)),
-        ("model.height", size(read.input.0)),
-        ("model.width", size(read.input.1)),
+        ("model.height", size(area.input.0)),
+        ("model.width", size(area.input.1)),
         ("model.input_channels", Value::Integer(channels)),
         ("model.num_actions", size(num_actions)),
         ("model.dim", as_toml(update.dim_heads(num_actions))?),
@@ -144,7 +144,7 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
 
 /// Fills in the layers of the auxiliary loss, if it has any. If the model or the loss is invalid, later checks report why.
 fn fill_in_loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
-    if let Ok(model) = read_table::<ModelConfig>(table, "model")
+    if let Ok(model) = read::<ModelConfig>(table, "model")
         && let Ok(loss) = update.make_auxiliary_loss()
     {
         let layers = loss.layers(&model).into_iter().map(as_toml);
@@ -224,63 +224,21 @@ pub(crate) fn parse_file(name: &str, text: &str) -> Result<Table, Usage> {
     Ok(read)
 }
 
-pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
-    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
-    let value = table.get(first)?;
-    match rest {
-        "" => Some(value),
-        rest => find(value.as_table()?, rest),
-    }
-}
-
-/// Writes a value and creates the tables on its path. Another value in place of such a table stays, for its reader to reject.
-pub(crate) fn insert(table: &mut Table, path: &str, value: Value) {
-    match path.split_once('.') {
-        None => {
-            table.insert(path.into(), value);
-        }
-        Some((first, rest)) => {
-            let new = || Value::Table(Table::new());
-            let inner = table.entry(first).or_insert_with(new);
-            if let Some(inner) = inner.as_table_mut() {
-                insert(inner, rest, value);
-            }
-        }
-    }
-}
-
-pub(crate) fn insert_missing(table: &mut Table, path: &str, value: Value) {
-    if find(table, path).is_none() {
-        insert(table, path, value);
-    }
-}
-
 fn as_toml(value: impl serde::Serialize) -> Result<Value, Usage> {
     Value::try_from(value).map_err(|e| usage!("a setting as TOML: {e}"))
 }
 
-fn missing(path: &str, what: &str) -> Usage {
-    usage!("the settings lack {path}, {what}: use a config.toml that driml wrote")
+fn missing(what: &str) -> Usage {
+    usage!("the settings lack {what}: use a config.toml that driml wrote")
 }
 
-fn read_whole(table: &Table, path: &str) -> Result<i64, Usage> {
-    let value = find(table, path).and_then(Value::as_integer);
-    value.ok_or_else(|| missing(path, "a whole number"))
-}
-
-/// Reads a whole number as a size, which is not negative. Later checks limit its range.
-fn read_size(table: &Table, path: &str) -> Result<usize, Usage> {
-    let size = read_whole(table, path)?;
-    usize::try_from(size).map_err(|_| usage!("{path} = {size}: a size is not below 0"))
-}
-
-fn read_table<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
-    read_optional(table, path)?.ok_or_else(|| {
-        usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
-    })
+/// Reads a setting that every run has.
+fn read<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+    read_optional(table, path)?.ok_or_else(|| missing(path))
 }
 
 fn read_optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
-    let read = find(table, path).cloned().map(Value::try_into).transpose();
+    let value = find(table, path).cloned().map(Value::try_into);
+    let read = value.transpose();
     read.map_err(|e| usage!("in the settings' [{path}] table: {}", describe(&e)))
 }

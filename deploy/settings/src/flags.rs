@@ -4,7 +4,6 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
     resources::{self, Machine},
@@ -15,14 +14,9 @@ use toml::{Table, Value};
 use crate::{
     config::RunConfig,
     derived, memory,
-    overrides::Override,
-    presets::{self, Agent, Preset},
+    overrides::{Override, insert, insert_missing},
+    presets::Choice,
 };
-
-/// The default world.
-pub const DEFAULT_ENV: &str = "procgen:coinrun";
-/// The default agent.
-pub const DEFAULT_AGENT: &str = "driml-ada";
 
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
@@ -81,12 +75,11 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             (Source::File(name.clone(), text), name)
         }
         None => {
-            let world = presets::world(args.env.as_deref().unwrap_or(DEFAULT_ENV));
-            let world = world.map_err(|e| usage!("--env: {e}"))?;
-            let agent = presets::agent(args.agent.as_deref().unwrap_or(DEFAULT_AGENT))?;
-            let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
-            let source = Source::Layers(preset, world, agent);
-            (source, format!("preset {}", preset.name))
+            let names = [&args.preset, &args.env, &args.agent];
+            let [preset, env, agent] = names.map(Option::as_deref);
+            let choice = Choice::new(preset, env, agent)?;
+            let from = format!("preset {}", choice.preset.name);
+            (Source::Presets(choice), from)
         }
     };
     Ok((source.resolve(&args.flags, machine)?, from))
@@ -100,24 +93,19 @@ pub fn resolve_names(
     sets: &[&str],
     machine: &Machine,
 ) -> Result<RunConfig, Usage> {
-    let flags = RunFlags {
-        env: Some(world.into()),
-        agent: Some(agent.into()),
-        preset: Some(preset.into()),
-        config: None,
-        flags: Flags {
-            sets: sets.iter().map(|&set| set.into()).collect(),
-            ..Flags::default()
-        },
+    let choice = Choice::new(Some(preset), Some(world), Some(agent))?;
+    let flags = Flags {
+        sets: sets.iter().map(|&set| set.into()).collect(),
+        ..Flags::default()
     };
-    Ok(resolve(&flags, machine)?.0)
+    Source::Presets(choice).resolve(&flags, machine)
 }
 
 /// The source of the settings before flags are applied.
 #[derive(Clone, Debug)]
 pub enum Source {
-    /// Layers: preset, world, agent.
-    Layers(&'static Preset, WorldName, &'static Agent),
+    /// Preset, world and agent.
+    Presets(Choice),
     /// A file that driml wrote: its name and text.
     File(String, String),
 }
@@ -129,12 +117,12 @@ impl Source {
     /// A setting is unknown, of the wrong type, out of range, or at odds with another. The error names the first such setting.
     pub fn resolve(&self, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
         let mut table = match self {
-            Self::Layers(preset, world, agent) => {
-                let mut table = presets::merged(preset, *world, agent)?;
+            Self::Presets(choice) => {
+                let (mut table, world) = (choice.merged()?, choice.world);
                 // Everything else follows from these names.
-                derived::insert(&mut table, "run.world", world.to_string().into());
-                derived::insert(&mut table, "run.agent", agent.name.into());
-                derived::insert(&mut table, derived::FRAME_PATH, Table::new().into());
+                insert(&mut table, "run.world", world.to_string().into());
+                insert(&mut table, "run.agent", choice.agent.name.into());
+                insert(&mut table, derived::FRAME_PATH, Table::new().into());
                 if let Some(command) = world.command() {
                     // The start of the world needs its time-outs now.
                     for text in &flags.sets {
@@ -152,30 +140,27 @@ impl Source {
                     ("actor.envs", resources::ENVS_PER_ACTOR.into()),
                     ("actor.world_threads", 0.into()),
                 ] {
-                    derived::insert_missing(&mut table, path, value);
+                    insert_missing(&mut table, path, value);
                 }
                 table
             }
             Self::File(name, text) => derived::parse_file(name, text)?,
         };
-        for (path, value) in [
+        let sized_by_machine = matches!(self, Self::Presets(_));
+        let numbers = [
             ("local.actors", flags.actors.map(u64::from)),
             ("actor.envs", flags.envs.map(u64::from)),
             ("replay.transitions_max", flags.frames),
             ("replay.shards", flags.replay_shards.map(u64::from)),
             ("run.seed", flags.seed),
-        ] {
-            if let Some(number) = value {
-                let whole = i64::try_from(number)
-                    .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
-                derived::insert(&mut table, path, whole.into());
-            }
-        }
-        let sized_by_machine = matches!(self, Self::Layers(..));
-        let by_hand = apply_sets(&mut table, &flags.sets)?;
-        let is_set = |path: &str| by_hand.iter().any(|set| set == path);
+        ];
+        let numbers = numbers.into_iter();
+        let sets = numbers.filter_map(|(path, number)| Some(format!("{path}={}", number?)));
+        let sets: Vec<String> = sets.chain(flags.sets.iter().cloned()).collect();
+        let by_hand = apply_sets(&mut table, &sets)?;
+        let is_set = |path: &str| by_hand.iter().any(|(set, _)| set == path);
         if sized_by_machine || is_set("model.torso") {
-            derived::drop_other_torsos(&mut table, &by_hand)?;
+            derived::drop_other_torsos(&mut table, is_set)?;
         }
         let is_capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
         derived::resolve_precision(&mut table, machine.fast_bf16);
@@ -183,42 +168,35 @@ impl Source {
             Self::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
             _ => e,
         };
-        let mut config = RunConfig::derive(table).map_err(in_file)?;
+        let mut config = RunConfig::derive(table).map_err(|e| {
+            let unknown = by_hand.iter().find_map(|(path, unknown)| {
+                let key = path.rsplit('.').next()?;
+                let is_it = e.0.contains(&format!("unknown field `{key}`"));
+                unknown.clone().filter(|_| is_it)
+            });
+            unknown.unwrap_or_else(|| in_file(e))
+        })?;
         memory::fit(&mut config, is_capacity_set, flags.server_alone, machine).map_err(in_file)?;
         config = config.checked().map_err(in_file)?;
-        if let Self::Layers(preset, ..) = self {
-            let notes = preset.accuracy_notes.iter().copied();
-            config.notes.extend(notes.map(str::to_owned));
+        if let Self::Presets(choice) = self {
+            config.notes.extend(choice.preset.accuracy_note());
         }
         Ok(config)
     }
 }
 
-/// Applies every `--set`; returns the paths that were set.
-fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
-    let mut paths = Vec::with_capacity(sets.len());
-    for text in sets {
+/// Applies every `--set`. Returns the paths that were set, each with the error to report if its key is new and turns out to be no setting:
+/// an optional setting is known only to the type of its table.
+fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<(String, Option<Usage>)>, Usage> {
+    let apply = |text: &String| {
         let parsed = Override::parse(text)?;
         if let Some((known, how)) = derived::find_derived(&parsed.path) {
             return Err(usage!("{known} cannot be set: it {how}"));
         }
-        let mut tried = table.clone();
-        let is_new = parsed.apply(&mut tried)?;
-        // A new key may be an optional setting, which the type of its table knows.
-        if is_new {
-            let mut read = tried.clone();
-            derived::resolve_precision(&mut read, false);
-            let read = RunConfig::derive(read);
-            let key = parsed.path.rsplit('.').next().unwrap_or_default();
-            let unknown = format!("unknown field `{key}`");
-            if read.is_err_and(|e| e.0.contains(&unknown)) {
-                return Err(parsed.unknown_key(table));
-            }
-        }
-        *table = tried;
-        paths.push(parsed.path);
-    }
-    Ok(paths)
+        let unknown = parsed.apply(table)?;
+        Ok((parsed.path, unknown))
+    };
+    sets.iter().map(apply).collect()
 }
 
 #[cfg(test)]

@@ -8,9 +8,10 @@ use driml_machine::{error::Usage, resources::Machine};
 use toml::{Table, Value};
 
 use crate::{
-    derived::{self, find},
+    derived,
     flags::{Flags, Source},
-    presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, merged, preset_or_default},
+    overrides::find,
+    presets::{Choice, Layer, PRESETS, agents},
 };
 
 /// The column at which a setting's source begins, if the setting leaves room.
@@ -22,16 +23,27 @@ const SET_BY_MACHINE: &str =
 const SET_BY_WORLD: &str =
     "world.height world.width world.channels world.actions input.height input.width";
 
+const FURTHER_SETTINGS: &str = "
+off in every preset
+--actors 4 --set 'actor.epsilon_ladder={base=0.4,alpha=7}'  a fixed epsilon per actor, each smaller than the one before, as in Ape-X
+
+tuned uses it on bigfish, fruitbot and starpilot; works on any game
+--set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4
+
+rainbow uses it; works with any agent
+--set 'model.head={dueling=true,noisy_sigma=0.5}'  two streams of the C51 head; noisy layers (then --set actor.epsilon_start=0 too)
+
+Every setting of one of them with its source: driml presets --env bigfish --agent driml-fix
+";
+
 /// Returns the list of presets, agents and differences by game.
 pub fn menu() -> Result<String, Usage> {
-    let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
     let agents = agents();
-    let agents = agents.iter().map(|agent| (agent.name, agent.about));
-    let names = presets.clone().chain(agents.clone());
-    let width = names.map(|(name, _)| name.len()).max().unwrap_or(0);
-    let line = |(name, about)| format!("{name:width$}  {about}\n");
-    let presets: String = presets.map(line).collect();
-    let agents: String = agents.map(line).collect();
+    let names = PRESETS.iter().chain(agents.iter().copied());
+    let width = names.map(|it| it.name.len()).max().unwrap_or(0);
+    let line = |it: &Layer| format!("{:width$}  {}\n", it.name, it.about);
+    let presets: String = PRESETS.iter().map(line).collect();
+    let agents: String = agents.into_iter().map(line).collect();
     let mut text = format!("--preset\n{presets}\n--agent\n{agents}\n");
     text += "what differs by world, with its default preset\n";
     text += &format!(
@@ -39,22 +51,14 @@ pub fn menu() -> Result<String, Usage> {
         "--env", "driml-fix", "augments", "driml-noact"
     );
     for world in WorldName::all() {
-        let preset = preset_or_default(None, world)?;
-        let settings = |name: &str| merged(preset, world, agent(name)?);
+        let world = world.to_string();
+        let settings = |agent| Choice::new(None, Some(&world), Some(agent))?.merged();
         let (fix, noact) = (settings("driml-fix")?, settings("driml-noact")?);
         let augments = find(&fix, "learner.augment").map_or("-", |_| "yes");
-        let (world, fix_k, noact_k, lambdas) =
-            (world.to_string(), k(&fix), k(&noact), lambdas(&fix));
+        let (fix_k, noact_k, lambdas) = (k(&fix), k(&noact), lambdas(&fix));
         text += &format!("{world:18}  k = {fix_k:<5}  {augments:9}  k = {noact_k:<7}  {lambdas}\n");
     }
-    text += "\noff in every preset\n";
-    text += "--actors 4 --set 'actor.epsilon_ladder={base=0.4,alpha=7}'  a fixed epsilon per actor, each smaller than the one before, as in Ape-X\n";
-    text += "\ntuned uses it on bigfish, fruitbot and starpilot; works on any game\n";
-    text += "--set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4\n";
-    text += "\nrainbow uses it; works with any agent\n";
-    text += "--set 'model.head={dueling=true,noisy_sigma=0.5}'  two streams of the C51 head; noisy layers (then --set actor.epsilon_start=0 too)\n";
-    text += "\nEvery setting of one of them with its source: driml presets --env bigfish --agent driml-fix\n";
-    Ok(text)
+    Ok(text + FURTHER_SETTINGS)
 }
 
 fn k(table: &Table) -> String {
@@ -70,27 +74,23 @@ fn lambdas(table: &Table) -> String {
 }
 
 /// Returns the resolved settings, each with its source.
-pub fn settings_with_sources(
-    preset: &'static Preset,
-    world: WorldName,
-    agent: &'static Agent,
-) -> Result<String, Usage> {
-    let source = Source::Layers(preset, world, agent);
+pub fn settings_with_sources(choice: Choice) -> Result<String, Usage> {
     // Shows what the preset asks for on any machine, whatever memory is free at this moment.
     let machine = Machine {
         memory_bytes: u64::MAX,
         ..Machine::detect()
     };
-    let table = source.resolve(&Flags::default(), &machine)?.to_table();
+    let config = Source::Presets(choice).resolve(&Flags::default(), &machine)?;
+    let world = choice.world;
     let mut sources = BTreeMap::new();
-    for layer in layers(preset, world, agent) {
+    for layer in choice.layers() {
         record_sources(&layer, &world.without_library().to_string(), &mut sources);
     }
     let mut text = format!(
         "# {} in {world}, preset {}: every setting and its source. `driml train --config` takes this file.\n",
-        agent.name, preset.name
+        choice.agent.name, choice.preset.name
     );
-    write_table(&table, "", &sources, &mut text);
+    write_table(&config.to_table(), "", &sources, &mut text);
     Ok(text)
 }
 
@@ -144,9 +144,9 @@ fn find_source<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process
 /// Adds the comment on each setting of a layer, in place of the comment of an earlier layer.
 fn record_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
     for part in layer.parts().iter().filter(|it| it.applies_to(world)) {
-        let how = if part.is_general { "" } else { ", by world" };
+        let how = if part.is_general() { "" } else { ", by world" };
         for (path, comment) in comments(&part.text) {
-            let source = format!("{comment} [{}{how}]", layer.name);
+            let source = format!("{comment} [{}{how}]", layer.path);
             sources.insert(path, source.trim_start().to_owned());
         }
     }
@@ -194,7 +194,8 @@ mod tests {
     fn every_setting_of_every_game_and_agent_has_a_source_and_reads_back() {
         for world in WorldName::all() {
             for agent in AGENTS {
-                let text = settings_with_sources(&PRESETS[0], world, agent).unwrap();
+                let choice = Choice::new(Some("paper"), Some(&world.to_string()), Some(agent.name));
+                let text = settings_with_sources(choice.unwrap()).unwrap();
                 assert!(!text.contains("not said"), "{text}");
                 RunConfig::parse("printed", &text).unwrap();
             }
@@ -203,8 +204,8 @@ mod tests {
 
     #[test]
     fn a_game_s_own_choice_is_named_as_such() {
-        let world = "procgen:bigfish".parse().unwrap();
-        let text = settings_with_sources(&PRESETS[0], world, agent("driml-fix").unwrap()).unwrap();
+        let choice = Choice::new(Some("paper"), Some("bigfish"), Some("driml-fix"));
+        let text = settings_with_sources(choice.unwrap()).unwrap();
         let mut lines = text.lines();
         let horizon = lines.find(|line| line.starts_with("horizon")).unwrap();
         assert!(

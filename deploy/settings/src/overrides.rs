@@ -1,4 +1,4 @@
-//! `--set key=value`: one value of the settings, by its dotted path.
+//! `--set key=value`: one value of the settings, by its dotted path, and the values of a table by such paths.
 //! Keys and types are checked against the existing settings; each component checks its own ranges.
 
 use driml_machine::error::{Usage, did_you_mean, usage};
@@ -34,22 +34,19 @@ impl Override {
         })
     }
 
-    /// Puts the value into `table`; returns whether the key is new.
-    ///
-    /// A new key is accepted in an existing table; the reader of that table decides whether the key is a setting.
-    pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
+    /// Puts the value into `table`. A new key is accepted in an existing table; then this returns the error to report if the reader of that
+    /// table does not know the key.
+    pub(crate) fn apply(&self, table: &mut Table) -> Result<Option<Usage>, Usage> {
+        let parent = self.path.rsplit_once('.').map(|(tables, _)| tables);
+        let parent = parent.and_then(|tables| find(table, tables));
         let unknown = self.unknown_key(table);
-        let (tables, key) = self.path.rsplit_once('.').ok_or_else(|| unknown.clone())?;
-        let mut inner = table;
-        for name in tables.split('.') {
-            let found = inner.get_mut(name).and_then(Value::as_table_mut);
-            inner = found.ok_or_else(|| unknown.clone())?;
-        }
-        let value = match inner.get(key) {
-            Some(old) => self.convert_to_type_of(old)?,
-            None => self.value.clone(),
+        let (value, unknown) = match find(table, &self.path) {
+            Some(old) => (self.convert_to_type_of(old)?, None),
+            None if parent.is_some_and(Value::is_table) => (self.value.clone(), Some(unknown)),
+            None => return Err(unknown),
         };
-        Ok(inner.insert(key.to_owned(), value).is_none())
+        insert(table, &self.path, value);
+        Ok(unknown)
     }
 
     fn convert_to_type_of(&self, old: &Value) -> Result<Value, Usage> {
@@ -74,7 +71,7 @@ impl Override {
     }
 
     /// The error for an unknown key: the keys that exist, and the nearest one.
-    pub(crate) fn unknown_key(&self, table: &Table) -> Usage {
+    fn unknown_key(&self, table: &Table) -> Usage {
         let mut known = table;
         let mut at = Vec::new();
         for name in self.path.split('.') {
@@ -102,6 +99,37 @@ impl Override {
             self.path,
             keys.join(", ")
         )
+    }
+}
+
+pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
+    let value = table.get(first)?;
+    match rest {
+        "" => Some(value),
+        rest => find(value.as_table()?, rest),
+    }
+}
+
+/// Writes a value and creates the tables on its path. Another value in place of such a table stays, for its reader to reject.
+pub(crate) fn insert(table: &mut Table, path: &str, value: Value) {
+    match path.split_once('.') {
+        None => {
+            table.insert(path.into(), value);
+        }
+        Some((first, rest)) => {
+            let new = || Value::Table(Table::new());
+            let inner = table.entry(first).or_insert_with(new);
+            if let Some(inner) = inner.as_table_mut() {
+                insert(inner, rest, value);
+            }
+        }
+    }
+}
+
+pub(crate) fn insert_missing(table: &mut Table, path: &str, value: Value) {
+    if find(table, path).is_none() {
+        insert(table, path, value);
     }
 }
 
@@ -149,7 +177,7 @@ mod tests {
         let mut settings: Table = "[run]\nseed = 1\ntimeout = \"terminal\"".parse().unwrap();
         let mut set = |text| Override::parse(text).unwrap().apply(&mut settings);
         assert!(set("run.seed=1\nother = 2").is_err());
-        assert_eq!(set("run.timeout = \"bootstrap\"").ok(), Some(false));
+        assert!(set("run.timeout = \"bootstrap\"").unwrap().is_none());
         assert_eq!(settings["run"]["timeout"], Value::from("bootstrap"));
         assert_eq!(settings["run"]["seed"], Value::Integer(1));
     }

@@ -8,160 +8,64 @@ use driml_machine::error::{Usage, did_you_mean, usage};
 use serde::Deserialize;
 use toml::{Table, Value};
 
+/// A file in `presets/`: settings of all runs, of a kind of world, of a preset or of an agent.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Layer {
-    pub(crate) name: &'static str,
-    pub(crate) text: &'static str,
-}
-
-macro_rules! layer {
-    ($($path:literal)+) => {
-        Layer {
-            name: concat!($($path),+),
-            text: include_str!(concat!("../presets/", $($path,)+ ".toml")),
-        }
-    };
-}
-
-const BASE: Layer = layer!("base");
-
-/// A way to run any agent in a world.
-#[derive(Clone, Debug)]
-pub struct Preset {
-    /// The name, as given to `--preset`.
+pub struct Layer {
+    /// The name, as given to `--preset` or `--agent`.
     pub name: &'static str,
     /// The description in `driml presets`, one line.
     pub about: &'static str,
-    /// Settings over base and world, under the agent: a preset does not change what defines an agent, such as Rainbow's epsilon of 0.
-    layer: Option<Layer>,
-    /// The kinds of world for which the preset is made; empty means all.
-    world_kinds: &'static [&'static str],
-    /// The accuracy that the preset gives up for speed, with the largest measured errors: lines that a run prints.
-    pub(crate) accuracy_notes: &'static [&'static str],
+    /// The path in `presets/` without its extension; of a layer that a program adds, its name.
+    pub(crate) path: &'static str,
+    pub(crate) text: &'static str,
 }
 
-const TUNED: &str = "tuned";
-
-/// Returns the preset of this name for a run in `world`. The default is `tuned` on Procgen and `paper` elsewhere.
-pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'static Preset, Usage> {
-    let is_game = world.kind() == "procgen";
-    preset(name.unwrap_or(if is_game { TUNED } else { PRESETS[0].name }))
-}
-
-/// Makes [`PRESETS`]. A line has the preset's name, which is that of its file in `presets/variant/`, the kind of world if the preset is not
-/// for all, the description, and what the preset gives up.
-macro_rules! presets {
-    ($($name:literal $(for $kind:literal)?: $about:literal $(, $note:literal)?;)+) => {
-        /// Every preset, `paper` first.
-        pub const PRESETS: &[Preset] = &[
-            Preset {
-                name: "paper",
-                about: "as the paper's authors ran it, at the world's own frame size (the default outside Procgen)",
-                layer: None,
-                world_kinds: &[],
-                accuracy_notes: &[],
-            },
-            $(Preset {
-                name: $name,
-                about: $about,
-                layer: Some(layer!("variant/" $name)),
-                world_kinds: &[$($kind)?],
-                accuracy_notes: &[$($note)?],
-            }),+
-        ];
+/// Makes a list of the layers in a folder.
+macro_rules! layers {
+    ($folder:literal: $($name:literal)+) => {
+        &[$(Layer::built_in(
+            $name,
+            concat!($folder, $name),
+            include_str!(concat!("../presets/", $folder, $name, ".toml")),
+        )),+]
     };
 }
 
-presets! {
-    "tuned" for "procgen":
-        "more exploration, fewer and smaller updates, a soft target network, on three games a residual torso (the default on Procgen)";
-    "paper-observation" for "procgen": "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic";
-    "split" for "procgen": "`paper` with one of 500 Procgen levels per episode, and unseen levels to test on";
-    "exact": "`paper` with products, weights and frames as exact as the program can compute them";
-    "balanced": "`exact` in the learner; bf16 arithmetic and f16 weights in the actors",
-        "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 0.2% of states), see deploy/docs/src/results/tradeoff.md";
-    "fast": "bf16 in learner and actors, f16 weights sent to actors",
-        "fast: bf16 learner (gradients off by up to 15% with DIM), bf16 actors and f16 weights (another greedy action in up to 6% and 0.2% of states), see deploy/docs/src/results/tradeoff.md";
-    "smoke": "a tiny network, batch and replay: shows within a minute that all processes work together";
-}
+const BASE: Layer = Layer::built_in("base", "base", include_str!("../presets/base.toml"));
 
-/// An agent: its name and its layer of settings.
-#[derive(Clone, Debug)]
-pub struct Agent {
-    /// The name, as given to `--agent`.
-    pub name: &'static str,
-    /// The description in `driml presets`, one line.
-    pub(crate) about: &'static str,
-    layer: Layer,
-}
+/// The layer of each kind of world in the registry of worlds.
+const WORLDS: &[Layer] = layers!("world/": "procgen" "mspacman" "chain" "ising" "exec");
 
-/// Makes [`AGENTS`]. A line has the agent's name, which is that of its file in `presets/agent/`, and the description.
-macro_rules! agents {
-    ($($name:literal: $about:literal;)+) => {
-        /// Every agent that `--agent` takes.
-        pub const AGENTS: &[Agent] = &[$(Agent {
-            name: $name,
-            about: $about,
-            layer: layer!("agent/" $name),
-        }),+];
-    };
-}
+/// Every preset, `paper` first. It is laid over base and world, under the agent: a preset does not change what defines an agent, such as
+/// Rainbow's epsilon of 0.
+pub const PRESETS: &[Layer] = layers!("variant/":
+    "paper" "tuned" "paper-observation" "split" "exact" "balanced" "fast" "smoke");
 
-agents! {
-    "c51": "C51 without an auxiliary loss";
-    "rainbow": "c51 with double DQN, rows drawn by priority, a dueling head, and noisy layers in place of epsilon";
-    "driml-fix": "DIM at a fixed k, chosen by game; augments its states on seven of them";
-    "driml-ada": "DIM at a k that follows how predictable the stored actions are (the default)";
-    "driml-randk": "DIM at a k drawn uniformly";
-    "driml-noact": "DIM without the action as input";
-    "cpc": "one InfoNCE for each of k = 1..5, without the action as input";
-    "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
-}
+/// Every agent that `--agent` takes.
+pub const AGENTS: &[Layer] = layers!("agent/":
+    "c51" "rainbow" "driml-fix" "driml-ada" "driml-randk" "driml-noact" "cpc" "curl");
 
-static CUSTOM: OnceLock<Vec<Agent>> = OnceLock::new();
-
-impl Agent {
-    /// Creates an agent that a program adds, for `--agent NAME`. `layer` has its settings, TOML as in `presets/agent/`.
-    pub const fn new(name: &'static str, about: &'static str, layer: &'static str) -> Self {
-        Self {
-            name,
-            about,
-            layer: Layer { name, text: layer },
-        }
-    }
-}
+static CUSTOM: OnceLock<Vec<Layer>> = OnceLock::new();
 
 /// Adds agents, before anything else is done. An existing agent with the same name takes precedence.
 ///
 /// # Panics
 /// If agents were registered before.
-pub fn register(agents: Vec<Agent>) {
+pub fn register(agents: Vec<Layer>) {
     let first = CUSTOM.set(agents);
     first.expect("a program registers its agents once");
 }
 
-pub(crate) fn agents() -> Vec<&'static Agent> {
+pub(crate) fn agents() -> Vec<&'static Layer> {
     let custom = CUSTOM.get().into_iter().flatten();
     AGENTS.iter().chain(custom).collect()
 }
 
-/// The layer of each kind of world in the registry of worlds.
-const WORLDS: &[Layer] = &[
-    layer!("world/procgen"),
-    layer!("world/mspacman"),
-    layer!("world/chain"),
-    layer!("world/ising"),
-    layer!("world/exec"),
-];
-
 fn world_layer(world: WorldName) -> Layer {
-    let name = format!("world/{}", world.kind());
-    let found = WORLDS.iter().find(|layer| layer.name == name).copied();
-    let own = driml_envs::custom_preset(world.kind()).map(|text| Layer {
-        name: world.kind(),
-        text,
-    });
-    let layer = found.or(own);
+    let kind = world.kind();
+    let found = WORLDS.iter().find(|layer| layer.name == kind).copied();
+    let custom = || Some(Layer::custom(kind, "", driml_envs::custom_preset(kind)?));
+    let layer = found.or_else(custom);
     layer.expect("a test checks that each kind has its layers")
 }
 
@@ -174,60 +78,112 @@ pub fn world(name: &str) -> Result<WorldName, Usage> {
 }
 
 /// Finds an agent by name.
-pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
-    let agents = agents();
-    let found = agents.iter().copied().find(|agent| agent.name == name);
-    found.ok_or_else(|| Usage(unknown_name("agent", name, agents.iter().map(|it| it.name))))
+pub fn agent(name: &str) -> Result<&'static Layer, Usage> {
+    find_named("agent", name, &agents())
 }
 
 /// Finds a preset by name.
-pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
-    let found = PRESETS.iter().find(|preset| preset.name == name);
+pub fn preset(name: &str) -> Result<&'static Layer, Usage> {
+    let all: Vec<_> = PRESETS.iter().collect();
+    find_named("preset", name, &all)
+        .map_err(|unknown| usage!("{unknown} (`driml presets` describes them)"))
+}
+
+/// Finds a layer by the value of the flag `--kind`. The error for an unknown name has the nearest name, as a question, and all names.
+fn find_named(kind: &str, name: &str, all: &[&'static Layer]) -> Result<&'static Layer, Usage> {
+    let found = all.iter().copied().find(|layer| layer.name == name);
     found.ok_or_else(|| {
-        let unknown = unknown_name("preset", name, PRESETS.iter().map(|it| it.name));
-        usage!("{unknown} (`driml presets` describes them)")
+        let names: Vec<_> = all.iter().map(|layer| layer.name).collect();
+        let near = did_you_mean(name, names.iter().copied());
+        usage!(
+            "there is no {kind} {name:?}{near}; --{kind} takes {}",
+            names.join(", ")
+        )
     })
 }
 
-/// The error for an unknown name after the flag `kind`: the nearest name, as a question, and all names.
-fn unknown_name(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> String {
-    let all: Vec<_> = all.collect();
-    let (near, names) = (did_you_mean(name, all.iter().copied()), all.join(", "));
-    format!("there is no {kind} {name:?}{near}; --{kind} takes {names}")
+/// What a run is made of: a preset, a world and an agent.
+#[derive(Clone, Copy, Debug)]
+pub struct Choice {
+    pub(crate) preset: &'static Layer,
+    pub(crate) world: WorldName,
+    pub(crate) agent: &'static Layer,
 }
 
-/// Merges base, world, preset and agent in this order: a later layer wins. In each file, the settings for all worlds come first, then each
-/// `[[only]]` block that names the world.
-pub(crate) fn merged(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
-    if !preset.world_kinds.is_empty() && !preset.world_kinds.contains(&world.kind()) {
-        return Err(usage!(
-            "preset {:?} is for {} only, not for {world}; take --preset paper",
-            preset.name,
-            preset.world_kinds.join(", ")
-        ));
+impl Choice {
+    /// Makes a choice by the values of the flags. The default is driml-ada on coinrun, with the preset `tuned` on Procgen and `paper`
+    /// elsewhere.
+    pub fn new(
+        preset: Option<&str>,
+        world: Option<&str>,
+        agent: Option<&str>,
+    ) -> Result<Self, Usage> {
+        let world = self::world(world.unwrap_or("procgen:coinrun"));
+        let world = world.map_err(|e| usage!("--env: {e}"))?;
+        let agent = self::agent(agent.unwrap_or("driml-ada"))?;
+        let is_game = world.kind() == "procgen";
+        let preset = preset.unwrap_or(if is_game { "tuned" } else { "paper" });
+        Ok(Self {
+            preset: self::preset(preset)?,
+            world,
+            agent,
+        })
     }
-    let name = world.without_library().to_string();
-    let mut table = Table::new();
-    for layer in layers(preset, world, agent) {
-        for part in layer.parts().into_iter().filter(|it| it.applies_to(&name)) {
-            merge(&mut table, part.set);
+
+    /// Merges base, world, preset and agent in this order: a later layer wins. In each file, the settings for all worlds come first, then
+    /// each `[[only]]` block that names the world.
+    pub(crate) fn merged(&self) -> Result<Table, Usage> {
+        let (preset, world) = (self.preset, self.world);
+        if let Some(kind) = preset.read().preset.world_kind
+            && kind != world.kind()
+        {
+            return Err(usage!(
+                "preset {:?} is for {kind} only, not for {world}; take --preset paper",
+                preset.name
+            ));
         }
+        let name = world.without_library().to_string();
+        let mut table = Table::new();
+        for part in self.layers().iter().flat_map(Layer::parts) {
+            if part.applies_to(&name) {
+                merge(&mut table, part.set);
+            }
+        }
+        Ok(table)
     }
-    Ok(table)
+
+    /// The layers to be merged, the lowest first.
+    pub(crate) fn layers(&self) -> [Layer; 4] {
+        [BASE, world_layer(self.world), *self.preset, *self.agent]
+    }
 }
 
-/// The layers to be merged, the lowest first.
-pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
-    let below = [BASE, world_layer(world)].into_iter();
-    below.chain(preset.layer).chain([agent.layer]).collect()
+#[derive(Deserialize)]
+struct LayerFile {
+    #[serde(default)]
+    preset: PresetTable,
+    #[serde(default)]
+    only: Vec<LayerPart>,
+    /// The settings for all worlds.
+    #[serde(flatten)]
+    set: Table,
+}
+
+/// The table `[preset]` of a preset: when it can be used, and what to know of it.
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PresetTable {
+    /// The kind of world for which the preset is made; none if it is for all.
+    world_kind: Option<String>,
+    /// The accuracy that the preset gives up for speed, with the largest measured errors: a line that a run prints.
+    accuracy_note: Option<String>,
 }
 
 /// The settings of a layer for all worlds, or one of its `[[only]]` blocks.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct LayerPart {
-    #[serde(skip)]
-    pub(crate) is_general: bool,
+    /// The worlds of a block; empty for all worlds.
     worlds: Vec<String>,
     #[serde(default)]
     set: Table,
@@ -237,31 +193,63 @@ pub(crate) struct LayerPart {
 }
 
 impl LayerPart {
+    pub(crate) fn is_general(&self) -> bool {
+        self.worlds.is_empty()
+    }
+
     pub(crate) fn applies_to(&self, world: &str) -> bool {
-        self.is_general || self.worlds.iter().any(|name| name == world)
+        self.is_general() || self.worlds.iter().any(|name| name == world)
     }
 }
 
 impl Layer {
-    /// The settings for all worlds, then the blocks for some.
-    pub(crate) fn parts(&self) -> Vec<LayerPart> {
-        let bad = |e| -> ! {
+    /// Creates a layer that a program adds: its name, a line that describes it, and its settings, TOML as in `presets/agent/`.
+    pub const fn custom(name: &'static str, about: &'static str, text: &'static str) -> Self {
+        Self {
+            name,
+            about,
+            path: name,
+            text,
+        }
+    }
+
+    /// Creates the layer in the file `presets/PATH.toml`, whose first line, a comment, describes it.
+    const fn built_in(name: &'static str, path: &'static str, text: &'static str) -> Self {
+        let mut end = 0;
+        while text.as_bytes()[end] != b'\n' {
+            end += 1;
+        }
+        let about = text.split_at(end).0.split_at("# ".len()).1;
+        Self {
+            path,
+            ..Self::custom(name, about, text)
+        }
+    }
+
+    fn read(&self) -> LayerFile {
+        toml::from_str(self.text).unwrap_or_else(|e| {
             panic!(
                 "presets/{}.toml, or what a program has registered by that name, is not a layer of settings: {e}",
-                self.name
+                self.path
             )
-        };
-        let mut set: Table = self.text.parse().unwrap_or_else(|e| bad(e));
-        let blocks = set.remove("only");
-        let blocks: Option<Vec<LayerPart>> =
-            blocks.map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
-        let mut parts = vec![LayerPart {
-            is_general: true,
+        })
+    }
+
+    /// The accuracy that a preset gives up, as a line that a run prints.
+    pub(crate) fn accuracy_note(&self) -> Option<String> {
+        self.read().preset.accuracy_note
+    }
+
+    /// The settings for all worlds, then the blocks for some.
+    pub(crate) fn parts(&self) -> Vec<LayerPart> {
+        let LayerFile { set, only, .. } = self.read();
+        let general = LayerPart {
             worlds: Vec::new(),
             set,
             text: String::new(),
-        }];
-        parts.extend(blocks.unwrap_or_default());
+        };
+        let mut parts = vec![general];
+        parts.extend(only);
         for (part, text) in parts.iter_mut().zip(self.text.split("[[only]]")) {
             part.text = text.to_owned();
         }

@@ -2,8 +2,7 @@
 
 use clap::Args;
 use driml_launch::console::print;
-use driml_machine::error::usage;
-use driml_settings::{flags, menu, presets};
+use driml_settings::{menu, presets::Choice};
 
 #[derive(Debug, Args)]
 pub(crate) struct PresetsArgs {
@@ -23,9 +22,8 @@ pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.env.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);
     }
-    let env = args.env.as_deref().unwrap_or(flags::DEFAULT_ENV);
-    let world = presets::world(env).map_err(|e| usage!("--env: {e}"))?;
-    let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
-    let agent = presets::agent(args.agent.as_deref().unwrap_or(flags::DEFAULT_AGENT))?;
-    print(&menu::settings_with_sources(preset, world, agent)?)
+    let names = [&args.preset, &args.env, &args.agent];
+    let [preset, env, agent] = names.map(Option::as_deref);
+    let choice = Choice::new(preset, env, agent)?;
+    print(&menu::settings_with_sources(choice)?)
 }

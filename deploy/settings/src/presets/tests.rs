@@ -26,15 +26,14 @@ const SOURCES: [&str; 8] = [
     "PyTorch",
 ];
 
-/// Every layer, by its name.
+/// Every layer, by its path.
 fn all_layers() -> BTreeMap<&'static str, Layer> {
-    let agents = AGENTS.iter().map(|agent| agent.layer);
     // The command of an external world is not a name; any command serves here.
     let exec = "exec:true".parse().unwrap();
     let worlds = WorldName::all().chain([exec]).map(world_layer);
-    let variants = PRESETS.iter().filter_map(|it| it.layer);
-    let all = agents.chain(worlds).chain(variants).chain([BASE]);
-    all.map(|layer| (layer.name, layer)).collect()
+    let named = AGENTS.iter().chain(PRESETS).copied();
+    let all = worlds.chain(named).chain([BASE]);
+    all.map(|layer| (layer.path, layer)).collect()
 }
 
 fn pinned() -> impl Iterator<Item = (&'static str, Layer)> {
@@ -88,7 +87,7 @@ fn every_number_has_its_source_beside_it() {
 
 #[test]
 fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
-    let of = |name| preset_or_default(None, world(name).unwrap()).unwrap().name;
+    let of = |name| Choice::new(None, Some(name), None).unwrap().preset.name;
     let found = ["coinrun", "mspacman", "chain"].map(of);
     assert_eq!(found, ["tuned", "paper", "paper"]);
 }
@@ -97,9 +96,9 @@ fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
 fn every_layer_says_what_it_is_for_and_names_worlds_that_exist() {
     let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
     for layer in all_layers().values() {
-        assert!(layer.text.starts_with("# "), "{}", layer.name);
+        assert!(layer.text.starts_with("# "), "{}", layer.path);
         for world in layer.parts().iter().flat_map(|part| &part.worlds) {
-            assert!(worlds.contains(world), "{world} in {}", layer.name);
+            assert!(worlds.contains(world), "{world} in {}", layer.path);
         }
     }
 }
