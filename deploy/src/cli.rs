@@ -12,7 +12,7 @@ use crate::commands::{
     replay_server, train, watch,
 };
 
-const EXAMPLES: &str = "\
+pub(crate) const EXAMPLES: &str = "\
 Examples:
   driml train --env chain --agent c51
   driml train --env procgen:starpilot --frames 1e6 --seed 3 --run-dir runs/starpilot
@@ -123,17 +123,5 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
-    }
-
-    #[test]
-    fn the_examples_are_commands() {
-        let examples = EXAMPLES.lines();
-        let examples = examples.filter_map(|line| line.strip_prefix("  "));
-        let examples: Vec<_> = examples.collect();
-        assert_eq!(examples.len(), 3);
-        for example in examples {
-            let parsed = Cli::try_parse_from(example.split(' '));
-            assert!(parsed.is_ok(), "{example}: {:?}", parsed.err());
-        }
     }
 }

@@ -13,7 +13,7 @@ use driml_settings::presets::{Layer, PRESETS};
 use expect_test::expect_file;
 use walkdir::WalkDir;
 
-use crate::cli::Cli;
+use crate::cli::{Cli, EXAMPLES};
 
 const GENERATED: &str =
     "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml --lib reference` rewrites this page. -->";
@@ -164,16 +164,18 @@ fn program_calls(page: &str) -> impl Iterator<Item = &str> {
 }
 
 #[test]
-fn every_command_in_the_pages_parses() {
+fn every_command_in_the_pages_and_every_example_parses() {
     let files = WalkDir::new(root().join("deploy/docs/src")).into_iter();
     let files = files.map(|entry| entry.unwrap().into_path());
     let pages = files.filter(|path| path.extension().is_some_and(|it| it == "md"));
+    let pages = pages.chain([root().join("README.md")]);
+    let pages = pages.map(|path| fs::read_to_string(path).unwrap());
+    let examples = EXAMPLES.replace("Examples:", "```sh").replace("\n  ", "\n");
     let mut num_calls = 0;
-    for path in pages.chain([root().join("README.md")]) {
-        let text = fs::read_to_string(&path).unwrap();
-        for call in program_calls(&text) {
+    for page in pages.chain([examples]) {
+        for call in program_calls(&page) {
             if let Err(e) = Cli::try_parse_from(split_words(call)) {
-                panic!("{}: {call}\n{e}", path.display());
+                panic!("{call}\n{e}");
             }
             num_calls += 1;
         }
