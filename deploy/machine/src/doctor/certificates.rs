@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 
 use driml_protocol::tls::{self, Credentials, Role};
 
-use super::fact::{Fact, Finding, State};
+use super::fact::{Fact, State};
 use crate::units::count;
 
 /// A certificate that expires within this time gets the state `Note`.
@@ -18,10 +18,10 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(e) => {
-            let text = format!(
+            let found = State::Missing.with(format!(
                 "{dir} cannot be read ({e}): `deploy/certs.sh {dir}` makes the certificates"
-            );
-            return vec![Fact::new("tls folder", (State::Missing, text))];
+            ));
+            return vec![Fact::new("tls folder", found)];
         }
     };
     // A certificate or a key alone counts too: the other file is then reported as missing.
@@ -34,16 +34,17 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     };
     let names: BTreeSet<_> = entries.flatten().filter_map(name).collect();
     let (mut facts, mut roles) = (Vec::new(), Vec::new());
-    let mut add = |what: &str, found: Finding| facts.push(Fact::new(what, found));
+    let mut add =
+        |what: &str, state: State, text: String| facts.push(Fact::new(what, state.with(text)));
     for name in &names {
         match name.parse::<Role>() {
             Ok(role) => roles.push(role),
-            Err(e) => add("tls other", (State::Note, format!("{dir}/{name}.*: {e}"))),
+            Err(e) => add("tls other", State::Note, format!("{dir}/{name}.*: {e}")),
         }
     }
     if roles.is_empty() {
         let text = format!("{dir} has no certificates: `deploy/certs.sh {dir}` makes them");
-        add("tls folder", (State::Missing, text));
+        add("tls folder", State::Missing, text);
     }
     roles.sort_by_key(|role| match role {
         Role::ReplayServer => (0, 0),
@@ -55,21 +56,21 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     for role in roles {
         let what = format!("tls {role}");
         match Credentials::read_quietly(folder, role) {
-            Err(e) => add(&what, (State::Missing, e.to_string())),
+            Err(e) => add(&what, State::Missing, e.to_string()),
             Ok(it) => match (advice(&it), role) {
-                (Some(text), _) => add(&what, (State::Note, text)),
+                (Some(text), _) => add(&what, State::Note, text),
                 (None, Role::Actor(number)) => actors.push((number, it)),
                 (None, Role::ReplayServer) => {
                     let (until, names) = (validity(&it), it.hosts.join(", "));
                     let text = format!("{until}, for {names}: connect to one of these names");
-                    add(&what, (State::Ok, text));
+                    add(&what, State::Ok, text);
                 }
-                (None, _) => add(&what, (State::Ok, validity(&it))),
+                (None, _) => add(&what, State::Ok, validity(&it)),
             },
         }
     }
     if let Some(text) = describe_valid_actors(&actors) {
-        add("tls actors", (State::Ok, text));
+        add("tls actors", State::Ok, text);
     }
     // The authority's certificate is checked with each process's certificate.
     let key = tls::authority_path(folder).with_extension("key");
@@ -78,7 +79,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
             "{} can sign any certificate: keep it on the machine that made it alone",
             key.display()
         );
-        add("tls authority", (State::Note, text));
+        add("tls authority", State::Note, text);
     }
     facts
 }

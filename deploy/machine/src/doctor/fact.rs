@@ -19,6 +19,12 @@ pub(super) enum State {
 /// The state of a fact and its text, which says what to do if something should change.
 pub(super) type Finding = (State, String);
 
+impl State {
+    pub(super) fn with(self, text: impl Into<String>) -> Finding {
+        (self, text.into())
+    }
+}
+
 /// The result of the check of one thing that a run needs.
 #[derive(Debug, Serialize)]
 pub(super) struct Fact {

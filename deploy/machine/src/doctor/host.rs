@@ -34,7 +34,7 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     let all = [
         ("cores", cores(&machine)),
         ("vectors", vectors(vector_lanes())),
-        ("kernels", (State::Ok, kernels)),
+        ("kernels", State::Ok.with(kernels)),
         ("memory", memory(&machine)),
         ("shared memory", shared_memory(shared_memory::free_bytes())),
         ("locked memory", locked_memory(lockable_bytes())),
@@ -48,11 +48,8 @@ fn cores(machine: &Machine) -> Finding {
     let (cores, actors) = (machine.cores, machine.default_actors());
     let text = format!("{cores}, all used by the learner; --actors defaults to {actors}");
     match cores {
-        0 | 1 => (
-            State::Note,
-            format!("{text}; all processes share this core"),
-        ),
-        _ => (State::Ok, text),
+        0 | 1 => State::Note.with(text + "; all processes share this core"),
+        _ => State::Ok.with(text),
     }
 }
 
@@ -76,17 +73,12 @@ fn vectors(lanes: Option<u32>) -> Finding {
     match lanes {
         None => {
             let arch = std::env::consts::ARCH;
-            let text = format!("{arch}, not x86-64: its speed was never measured");
-            (State::Note, text)
+            State::Note.with(format!("{arch}, not x86-64: its speed was never measured"))
         }
-        Some(16) => (State::Ok, "AVX-512: 16 float32 at once".into()),
-        Some(8) => (
-            State::Ok,
-            "AVX2 and FMA: 8 float32 at once; AVX-512 is missing".into(),
-        ),
-        Some(_) => (
-            State::Note,
-            "no AVX2 with FMA: matrix products are many times slower; does a virtual machine hide them?".into(),
+        Some(16) => State::Ok.with("AVX-512: 16 float32 at once"),
+        Some(8) => State::Ok.with("AVX2 and FMA: 8 float32 at once; AVX-512 is missing"),
+        Some(_) => State::Note.with(
+            "no AVX2 with FMA: matrix products are many times slower; does a virtual machine hide them?",
         ),
     }
 }
@@ -112,7 +104,7 @@ fn shared_memory(free: Result<u64, String>) -> Finding {
     let folder = shared_memory::FOLDER;
     let why = match free {
         Ok(free) if free >= SHARED_MEMORY_ENOUGH => {
-            return (State::Ok, format!("{} free in {folder}", gib(free)));
+            return State::Ok.with(format!("{} free in {folder}", gib(free)));
         }
         Ok(free) => format!(
             "{} MiB free in {folder}, and a run takes up to {}: sockets are used instead, several times slower; a container needs --shm-size=1g",
@@ -121,26 +113,23 @@ fn shared_memory(free: Result<u64, String>) -> Finding {
         ),
         Err(why) => format!("{why}: sockets are used instead, several times slower"),
     };
-    (State::Note, why)
+    State::Note.with(why)
 }
 
 /// `limit` is the number of bytes of shared memory that a process may lock; none if unlimited. zenoh locks what it shares.
 fn locked_memory(limit: Option<u64>) -> Finding {
     match limit {
-        None => (State::Ok, "no limit (`ulimit -l`)".into()),
+        None => State::Ok.with("no limit (`ulimit -l`)"),
         Some(limit) if limit >= SHARED_MEMORY_ENOUGH => {
-            (State::Ok, format!("{} MiB (`ulimit -l`)", limit >> 20))
+            State::Ok.with(format!("{} MiB (`ulimit -l`)", limit >> 20))
         }
-        Some(limit) => {
-            let text = format!(
+        Some(limit) => State::Note.with(format!(
                 "`ulimit -l` allows {} KiB, and a run with one actor locks up to {} MiB of shared memory: sockets are used instead, several times slower; to raise it, add \
                  \"USER - memlock unlimited\" to /etc/security/limits.conf and log in again; a service needs LimitMEMLOCK=infinity, a \
                  container --ulimit memlock=-1",
                 limit >> 10,
                 SHARED_MEMORY_ENOUGH >> 20
-            );
-            (State::Note, text)
-        }
+            )),
     }
 }
 
@@ -153,16 +142,13 @@ fn disk(runs: &Path) -> Finding {
         (Ok(free), Ok(_)) => {
             let text = format!("{} free in {folder}", gib(free));
             match free {
-                0..DISK_MIN => (State::Missing, text + hint),
-                DISK_MIN..DISK_ENOUGH => (State::Note, text + hint),
-                _ => (State::Ok, text),
+                0..DISK_MIN => State::Missing.with(text + hint),
+                DISK_MIN..DISK_ENOUGH => State::Note.with(text + hint),
+                _ => State::Ok.with(text),
             }
         }
-        (Err(why), _) => (State::Missing, why),
-        (_, Err(why)) => (
-            State::Missing,
-            format!("{folder} cannot be written to: {why}{hint}"),
-        ),
+        (Err(why), _) => State::Missing.with(why),
+        (_, Err(why)) => State::Missing.with(format!("{folder} cannot be written to: {why}{hint}")),
     }
 }
 
@@ -177,25 +163,22 @@ fn engine() -> Finding {
     match checked {
         Ok(engine) => {
             let library = engine.library().display();
-            (State::Ok, format!("the engine is {library} and loads"))
+            State::Ok.with(format!("the engine is {library} and loads"))
         }
         Err(ProcgenError::Missing { reason, .. }) => {
             not_installed(&reason, Engine::describe_source())
         }
-        Err(why) => (State::Missing, why.to_string()),
+        Err(why) => State::Missing.with(why.to_string()),
     }
 }
 
 /// The fact for an engine that is not installed; `source` is where it would be downloaded from.
 fn not_installed(reason: &str, source: Result<String, ProcgenError>) -> Finding {
     match source {
-        Ok(source) => {
-            let text = format!(
-                "the engine: {reason}; `driml procgen install` gets it from {source}, and so does the first run that needs it"
-            );
-            (State::Note, text)
-        }
-        Err(why) => (State::Missing, why.to_string()),
+        Ok(source) => State::Note.with(format!(
+            "the engine: {reason}; `driml procgen install` gets it from {source}, and so does the first run that needs it"
+        )),
+        Err(why) => State::Missing.with(why.to_string()),
     }
 }
 

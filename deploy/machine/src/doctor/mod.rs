@@ -24,12 +24,12 @@ pub struct Report {
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     // Training on the CPU needs no GPU.
     let gpu_fact = |(name, found): GpuCheck| match found {
-        Ok(text) => Fact::new(name, (State::Ok, text)),
-        Err(why) => Fact::new(name, (State::Missing, why)),
+        Ok(text) => Fact::new(name, State::Ok.with(text)),
+        Err(why) => Fact::new(name, State::Missing.with(why)),
     };
     let cuda = match device::gpus() {
         Ok(gpus) => gpus.into_iter().map(gpu_fact).collect(),
-        Err(why) => vec![Fact::new("cuda", (State::Note, why))],
+        Err(why) => vec![Fact::new("cuda", State::Note.with(why))],
     };
     Report {
         cpu: host::facts(run_dir),
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn every_fact_is_a_line_and_the_verdict_follows_what_is_missing() {
-        let fact = |what: &str, state, text: &str| Fact::new(what, (state, text.into()));
+        let fact = |what: &str, state: State, text: &str| Fact::new(what, state.with(text));
         for (disk, cuda, verdict) in [
             (State::Note, State::Ok, "can train on the CPU and with"),
             (State::Ok, State::Missing, "can train on the CPU, not with"),
