@@ -67,6 +67,11 @@ pub(crate) struct BenchFlags {
 }
 
 impl BenchFlags {
+    /// Returns `full`, or `quick` if few iterations are enough.
+    pub(crate) fn unless_quick<T>(&self, full: T, quick: T) -> T {
+        if self.quick { quick } else { full }
+    }
+
     /// Returns the precisions to measure: the named ones, else those that the device supports.
     pub(crate) fn precisions(&self, device: DeviceName) -> Vec<Precision> {
         match (&self.precision[..], device) {

@@ -23,8 +23,6 @@ use crate::{
     subprocess,
 };
 
-/// Frames of the run, and of a quick one.
-const FRAMES: (u64, u64) = (12_000, 5_000);
 /// The number of updates before the measurement: by then all threads run and all memory is allocated.
 const WARMUP_UPDATES: u64 = 10;
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
@@ -39,10 +37,7 @@ const RATIOS: [(f64, u64); 2] = [(8.0, 256), (0.1, 10_000)];
 /// Measures updates and frames per second of a run, the share of time in which the learner computes, and each process's peak memory.
 pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     procgen_sys::Engine::install(&mut console::eprintln)?;
-    let frames = frames.unwrap_or(match bench.flags.quick {
-        true => FRAMES.1,
-        false => FRAMES.0,
-    });
+    let frames = frames.unwrap_or(bench.flags.unless_quick(12_000, 5_000));
     let threads = format!("local.learner_threads={}", bench.flags.threads);
     let mut run = Run::start(&["--frames", &frames.to_string()], &[&threads])?;
     let samples = run.watch_to_end()?;
@@ -73,13 +68,11 @@ pub(super) fn scale(
     bench: &mut Bench<'_>,
 ) -> anyhow::Result<()> {
     procgen_sys::Engine::install(&mut console::eprintln)?;
-    let quick = bench.flags.quick;
-    let actors = match (actors, quick) {
-        ([], true) => &ACTORS[..2],
-        ([], false) => &ACTORS,
-        (asked, _) => asked,
+    let actors = match actors {
+        [] => bench.flags.unless_quick(&ACTORS[..], &ACTORS[..2]),
+        asked => asked,
     };
-    let seconds = seconds.unwrap_or(if quick { 2 } else { 5 });
+    let seconds = seconds.unwrap_or(bench.flags.unless_quick(5, 2));
     let mut rows = Vec::new();
     for (ratio, slack) in RATIOS {
         for &actors in actors {

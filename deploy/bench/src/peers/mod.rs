@@ -28,8 +28,6 @@ use crate::{
 
 /// The load above which another program is running, which slows the two sides unequally.
 const LOAD_MAX: f64 = 0.5;
-/// The number of rounds, and that of a quick comparison.
-const ROUNDS: (u32, u32) = (5, 1);
 
 /// A component's figures, and those of its peer or the reason why there are none.
 #[derive(Debug, Default)]
@@ -75,9 +73,7 @@ pub(super) fn run(
     flags: &BenchFlags,
     machine: MachineInfo,
 ) -> anyhow::Result<()> {
-    let rounds = args
-        .rounds
-        .unwrap_or(if flags.quick { ROUNDS.1 } else { ROUNDS.0 });
+    let rounds = args.rounds.unwrap_or(flags.unless_quick(5, 1));
     let components: BTreeSet<_> = match args.only.as_slice() {
         [] => Component::value_variants().iter().copied().collect(),
         only => only.iter().copied().collect(),
