@@ -159,16 +159,12 @@ impl Layout {
         let q_values = outputs.q_values.iter().copied();
         let best = q_values.fold(f32::NEG_INFINITY, f32::max);
         let chance = if q < best { " (by chance)" } else { "" };
+        let time = format!("episode {}, step {}", shot.episode, shot.step);
+        let rewards = format!("return {:.2} ({:+.2})", shot.total, shot.reward);
         let mut y = area.y + 13.0;
         for (ink, text) in [
-            (
-                Ink::Soft,
-                format!("episode {}, step {}", shot.episode, shot.step),
-            ),
-            (
-                Ink::Plain,
-                format!("return {:.2} ({:+.2})", shot.total, shot.reward),
-            ),
+            (Ink::Soft, time),
+            (Ink::Plain, rewards),
             (Ink::Plain, format!("value {best:.3}")),
             (Ink::Bold, format!("{name}{chance}")),
         ] {
