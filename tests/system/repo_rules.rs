@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_485),
-    ("actor", 10_910),
-    ("replay-server", 11_215),
-    ("learner", 22_920),
-    ("deploy", 31_415),
-    ("tests", 10_590),
+    ("protocol", 7_450),
+    ("actor", 10_715),
+    ("replay-server", 11_100),
+    ("learner", 22_500),
+    ("deploy", 30_950),
+    ("tests", 10_380),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -251,6 +251,8 @@ impl Tradeoff<'_> {
         let plays = wanted.len() as u64 + 1;
         self.session.progress.add_work(units * plays);
         let common = self.settings.common.clone();
+        // An interrupt keeps the runs that are finished.
+        let commands = self.record_command()?;
         let made = queue::run_all(&mut self.session, wanted, common.jobs)?;
         let play = PlaySettings {
             levels: Levels::Train,
@@ -258,7 +260,6 @@ impl Tradeoff<'_> {
             episodes: common.episodes,
             units,
         };
-        let commands = self.record_command()?;
         let mut points = BTreeMap::<String, PointResult>::new();
         let mut random = Vec::new();
         for PointRun { point, plan, run } in made {

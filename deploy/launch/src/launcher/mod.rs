@@ -308,7 +308,7 @@ impl Launch<'_> {
     ) -> (Summary, anyhow::Result<()>) {
         let view = &mut self.poller.view;
         // A run whose servers never answered has no row.
-        if !view.servers.is_empty() {
+        if !view.shards.is_empty() {
             self.recorder.record(view, &[]);
         }
         let logs = self.processes.iter().filter_map(|it| it.log.loss_message());

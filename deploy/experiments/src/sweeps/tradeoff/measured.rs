@@ -99,7 +99,7 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<N
     let parameters = NetworkParameters {
         online: reference.online().clone(),
         target: reference.target().clone(),
-        key_encoder: None,
+        key_encoder: reference.key_encoder().cloned(),
     };
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
         .with_deduplication(config.learner.deduplicate_states);
