@@ -171,6 +171,7 @@ fn every_command_in_the_pages_and_every_example_parses() {
     let pages = pages.chain([root().join("README.md")]);
     let pages = pages.map(|path| fs::read_to_string(path).unwrap());
     let examples = EXAMPLES.replace("Examples:", "```sh").replace("\n  ", "\n");
+    assert_eq!(program_calls(&examples).count(), 3);
     let mut num_calls = 0;
     for page in pages.chain([examples]) {
         for call in program_calls(&page) {

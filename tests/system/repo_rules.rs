@@ -15,7 +15,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 10_715),
     ("replay-server", 11_100),
     ("learner", 22_500),
-    ("deploy", 30_950),
+    ("deploy", 31_020),
     ("tests", 10_380),
 ];
 /// The most lines of one file.

@@ -21,12 +21,14 @@ pub struct Film<W: Write> {
 }
 
 impl<W: Write> Film<W> {
-    /// Begins a film of pictures of `size` (width, height), shown at `pictures_per_second`, and writes it `to` a file.
+    /// Begins a film of pictures of `size` (width, height), shown at `pictures_per_second`, `to` receives the bytes of the file.
     ///
     /// # Panics
     /// A side is above 65,535 pixels, the most that a GIF can have.
     pub fn begin(to: W, size: (usize, usize), pictures_per_second: f64) -> io::Result<Self> {
-        let side = |length: usize| u16::try_from(length).expect("a GIF's side fits 16 bits");
+        let side = |length: usize| {
+            u16::try_from(length).expect("a film has sides of at most 65,535 pixels")
+        };
         let size = (side(size.0), side(size.1));
         let encoder = Encoder::new(to, size.0, size.1, &[]);
         let mut encoder = encoder.map_err(io::Error::other)?;

@@ -240,5 +240,8 @@ fn read<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
 fn read_optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
     let value = find(table, path).cloned().map(Value::try_into);
     let read = value.transpose();
-    read.map_err(|e| usage!("in the settings' [{path}] table: {}", describe(&e)))
+    read.map_err(|e| match find(table, path) {
+        Some(Value::Table(_)) => usage!("in the settings' [{path}] table: {}", describe(&e)),
+        _ => usage!("{path}: {}", describe(&e)),
+    })
 }

@@ -146,19 +146,22 @@ impl Source {
             }
             Self::File(name, text) => derived::parse_file(name, text)?,
         };
-        let sized_by_machine = matches!(self, Self::Presets(_));
-        let numbers = [
+        for (path, value) in [
             ("local.actors", flags.actors.map(u64::from)),
             ("actor.envs", flags.envs.map(u64::from)),
             ("replay.transitions_max", flags.frames),
             ("replay.shards", flags.replay_shards.map(u64::from)),
             ("run.seed", flags.seed),
-        ];
-        let numbers = numbers.into_iter();
-        let sets = numbers.filter_map(|(path, number)| Some(format!("{path}={}", number?)));
-        let sets: Vec<String> = sets.chain(flags.sets.iter().cloned()).collect();
-        let by_hand = apply_sets(&mut table, &sets)?;
-        let is_set = |path: &str| by_hand.iter().any(|(set, _)| set == path);
+        ] {
+            if let Some(number) = value {
+                let whole = i64::try_from(number)
+                    .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
+                insert(&mut table, path, whole.into());
+            }
+        }
+        let sized_by_machine = matches!(self, Self::Presets(_));
+        let by_hand = apply_sets(&mut table, &flags.sets)?;
+        let is_set = |path: &str| by_hand.iter().any(|set| set == path);
         if sized_by_machine || is_set("model.torso") {
             derived::drop_other_torsos(&mut table, is_set)?;
         }
@@ -168,14 +171,7 @@ impl Source {
             Self::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
             _ => e,
         };
-        let mut config = RunConfig::derive(table).map_err(|e| {
-            let unknown = by_hand.iter().find_map(|(path, unknown)| {
-                let key = path.rsplit('.').next()?;
-                let is_it = e.0.contains(&format!("unknown field `{key}`"));
-                unknown.clone().filter(|_| is_it)
-            });
-            unknown.unwrap_or_else(|| in_file(e))
-        })?;
+        let mut config = RunConfig::derive(table).map_err(in_file)?;
         memory::fit(&mut config, is_capacity_set, flags.server_alone, machine).map_err(in_file)?;
         config = config.checked().map_err(in_file)?;
         if let Self::Presets(choice) = self {
@@ -185,18 +181,31 @@ impl Source {
     }
 }
 
-/// Applies every `--set`. Returns the paths that were set, each with the error to report if its key is new and turns out to be no setting:
-/// an optional setting is known only to the type of its table.
-fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<(String, Option<Usage>)>, Usage> {
-    let apply = |text: &String| {
+/// Applies every `--set`; returns the paths that were set.
+fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
+    let mut paths = Vec::with_capacity(sets.len());
+    for text in sets {
         let parsed = Override::parse(text)?;
         if let Some((known, how)) = derived::find_derived(&parsed.path) {
             return Err(usage!("{known} cannot be set: it {how}"));
         }
-        let unknown = parsed.apply(table)?;
-        Ok((parsed.path, unknown))
-    };
-    sets.iter().map(apply).collect()
+        let mut tried = table.clone();
+        let is_new = parsed.apply(&mut tried)?;
+        // A new key may be an optional setting, which the type of its table knows.
+        if is_new {
+            let mut read = tried.clone();
+            derived::resolve_precision(&mut read, false);
+            let read = RunConfig::derive(read);
+            let key = parsed.path.rsplit('.').next().unwrap_or_default();
+            let unknown = format!("unknown field `{key}`");
+            if read.is_err_and(|e| e.0.contains(&unknown)) {
+                return Err(parsed.unknown_key(table));
+            }
+        }
+        *table = tried;
+        paths.push(parsed.path);
+    }
+    Ok(paths)
 }
 
 #[cfg(test)]

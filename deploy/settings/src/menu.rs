@@ -144,7 +144,7 @@ fn find_source<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process
 /// Adds the comment on each setting of a layer, in place of the comment of an earlier layer.
 fn record_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
     for part in layer.parts().iter().filter(|it| it.applies_to(world)) {
-        let how = if part.is_general() { "" } else { ", by world" };
+        let how = if part.is_general { "" } else { ", by world" };
         for (path, comment) in comments(&part.text) {
             let source = format!("{comment} [{}{how}]", layer.path);
             sources.insert(path, source.trim_start().to_owned());

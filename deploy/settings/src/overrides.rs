@@ -34,19 +34,22 @@ impl Override {
         })
     }
 
-    /// Puts the value into `table`. A new key is accepted in an existing table; then this returns the error to report if the reader of that
-    /// table does not know the key.
-    pub(crate) fn apply(&self, table: &mut Table) -> Result<Option<Usage>, Usage> {
+    /// Puts the value into `table`; returns whether the key is new.
+    ///
+    /// A new key is accepted in an existing table; the reader of that table decides whether the key is a setting.
+    pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
         let parent = self.path.rsplit_once('.').map(|(tables, _)| tables);
         let parent = parent.and_then(|tables| find(table, tables));
-        let unknown = self.unknown_key(table);
-        let (value, unknown) = match find(table, &self.path) {
-            Some(old) => (self.convert_to_type_of(old)?, None),
-            None if parent.is_some_and(Value::is_table) => (self.value.clone(), Some(unknown)),
-            None => return Err(unknown),
+        if !parent.is_some_and(Value::is_table) {
+            return Err(self.unknown_key(table));
+        }
+        let old = find(table, &self.path);
+        let (is_new, value) = match old {
+            Some(old) => (false, self.convert_to_type_of(old)?),
+            None => (true, self.value.clone()),
         };
         insert(table, &self.path, value);
-        Ok(unknown)
+        Ok(is_new)
     }
 
     fn convert_to_type_of(&self, old: &Value) -> Result<Value, Usage> {
@@ -71,7 +74,7 @@ impl Override {
     }
 
     /// The error for an unknown key: the keys that exist, and the nearest one.
-    fn unknown_key(&self, table: &Table) -> Usage {
+    pub(crate) fn unknown_key(&self, table: &Table) -> Usage {
         let mut known = table;
         let mut at = Vec::new();
         for name in self.path.split('.') {
@@ -177,7 +180,7 @@ mod tests {
         let mut settings: Table = "[run]\nseed = 1\ntimeout = \"terminal\"".parse().unwrap();
         let mut set = |text| Override::parse(text).unwrap().apply(&mut settings);
         assert!(set("run.seed=1\nother = 2").is_err());
-        assert!(set("run.timeout = \"bootstrap\"").unwrap().is_none());
+        assert_eq!(set("run.timeout = \"bootstrap\"").ok(), Some(false));
         assert_eq!(settings["run"]["timeout"], Value::from("bootstrap"));
         assert_eq!(settings["run"]["seed"], Value::Integer(1));
     }

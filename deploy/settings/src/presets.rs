@@ -170,7 +170,7 @@ struct LayerFile {
 }
 
 /// The table `[preset]` of a preset: when it can be used, and what to know of it.
-#[derive(Default, Deserialize)]
+#[derive(Default, Deserialize, PartialEq)]
 #[serde(deny_unknown_fields)]
 struct PresetTable {
     /// The kind of world for which the preset is made; none if it is for all.
@@ -183,8 +183,11 @@ struct PresetTable {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct LayerPart {
-    /// The worlds of a block; empty for all worlds.
+    /// The worlds of a block.
     worlds: Vec<String>,
+    /// Whether these are the settings for all worlds.
+    #[serde(skip)]
+    pub(crate) is_general: bool,
     #[serde(default)]
     set: Table,
     /// The text in the file, with its comments.
@@ -193,12 +196,8 @@ pub(crate) struct LayerPart {
 }
 
 impl LayerPart {
-    pub(crate) fn is_general(&self) -> bool {
-        self.worlds.is_empty()
-    }
-
     pub(crate) fn applies_to(&self, world: &str) -> bool {
-        self.is_general() || self.worlds.iter().any(|name| name == world)
+        self.is_general || self.worlds.iter().any(|name| name == world)
     }
 }
 
@@ -227,12 +226,20 @@ impl Layer {
     }
 
     fn read(&self) -> LayerFile {
-        toml::from_str(self.text).unwrap_or_else(|e| {
+        let what = "or what a program has registered by that name";
+        let file: LayerFile = toml::from_str(self.text).unwrap_or_else(|e| {
             panic!(
-                "presets/{}.toml, or what a program has registered by that name, is not a layer of settings: {e}",
+                "presets/{}.toml, {what}, is not a layer of settings: {e}",
                 self.path
             )
-        })
+        });
+        let is_preset = self.path.starts_with("variant/");
+        assert!(
+            is_preset || file.preset == PresetTable::default(),
+            "presets/{}.toml, {what}, has a table [preset], but is not a preset",
+            self.path
+        );
+        file
     }
 
     /// The accuracy that a preset gives up, as a line that a run prints.
@@ -245,6 +252,7 @@ impl Layer {
         let LayerFile { set, only, .. } = self.read();
         let general = LayerPart {
             worlds: Vec::new(),
+            is_general: true,
             set,
             text: String::new(),
         };

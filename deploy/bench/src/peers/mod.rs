@@ -80,8 +80,9 @@ pub(super) fn run(
     };
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     for (path, text) in script::SCRIPTS {
-        let name = Path::new(path).file_name().context("a script has a name")?;
-        fs::write(folder.path().join(name), text).with_context(|| format!("writing {path}"))?;
+        let name = Path::new(path).file_name().expect("a script has a name");
+        let written = fs::write(folder.path().join(name), text);
+        written.with_context(|| format!("writing {}", name.display()))?;
     }
     let frames = folder.path().join("frames");
     if components.contains(&Component::Replay) {

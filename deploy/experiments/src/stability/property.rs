@@ -140,6 +140,7 @@ impl Property {
         };
         let mut totals = vec![Tally::default(); self.checks.len() * self.promises.len()];
         for tallies in seeds {
+            assert_eq!(tallies.len(), totals.len(), "each seed has all rows");
             for (total, tally) in totals.iter_mut().zip(tallies) {
                 total.add(tally.cases, tally.worst, || tally.input);
             }

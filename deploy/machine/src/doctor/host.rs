@@ -220,6 +220,8 @@ mod tests {
         let (_, locked) = locked_memory(Some(8 << 20));
         assert!(locked.contains("`ulimit -l` allows 8192 KiB"), "{locked}");
         assert!(locked.contains(" locks up to 256 MiB"), "{locked}");
+        let (_, fetched) = not_installed("", Ok("`pip`".into()));
+        assert!(fetched.contains("`driml procgen install`"), "{fetched}");
     }
 
     #[test]

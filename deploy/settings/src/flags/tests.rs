@@ -206,6 +206,15 @@ fn flags_come_before_set_and_both_before_the_machine() {
     let (run, local) = (&config.run, &config.local);
     let found = (config.frames(), run.seed, local.actors, config.actor.envs);
     assert_eq!(found, (7_000, 6, 3, 2));
+    let too_many = Flags {
+        frames: Some(u64::MAX),
+        ..Flags::default()
+    };
+    let said = source.resolve(&too_many, &MACHINE).unwrap_err();
+    expect![
+        "replay.transitions_max = 18446744073709551615: the largest number is 9223372036854775807"
+    ]
+    .assert_eq(&said.to_string());
 }
 
 #[test]

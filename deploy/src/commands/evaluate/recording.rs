@@ -8,6 +8,7 @@ use std::{
     path::PathBuf,
 };
 
+use anyhow::Context;
 use clap::Args;
 use driml_actor::Step;
 use driml_envs::StepEnd;
@@ -44,7 +45,7 @@ pub(crate) struct RecordArgs {
 
 pub(crate) struct Recording {
     path: PathBuf,
-    /// The file of an unfinished film, which is removed when this is dropped. An older file at `path` stays until then.
+    /// The file of an unfinished film: dropping it removes it. `finish` renames it to `path`, where an older file stays until then.
     tmp_path: TempPath,
     film: Film<BufWriter<File>>,
     layout: Layout,
@@ -192,7 +193,7 @@ impl Recording {
     /// Ends the film, and returns a sentence about its content.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
         while !self.waiting.is_empty() {
-            self.draw_next()?;
+            self.draw_next().context("making the film")?;
         }
         let file = self.film.finish();
         let written = file.and_then(|_| Ok(self.tmp_path.persist(&self.path)?));
