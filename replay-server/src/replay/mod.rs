@@ -61,7 +61,7 @@ impl Replay {
     ) -> Result<Self, ConfigError> {
         config.validate(spec, batch_size)?;
         let shards = config.shards;
-        let why = format_args!("there is no shard {shard}; the first is shard 0");
+        let why = format_args!("shard {shard} does not exist; the first is shard 0");
         check(shard < shards, "replay.shards", shards, why)?;
         let shards = u64::from(config.shards);
         let capacity = config.capacity_transitions / shards;
