@@ -8,7 +8,9 @@ use driml_protocol::{
     config::Settings,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Client, Process, SlowMachine, TestSystem, check_has, new_learner, wait_for};
+use driml_tests::{
+    Client, Process, SlowMachine, TestSystem, check_has, new_learner, wait_for, wait_until,
+};
 use serde_json::Value;
 
 use crate::{
@@ -160,8 +162,13 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back(
     check_has(&status_text(system), &words);
     let watch_once = system.connect_args("watch --once");
     system.fails(&watch_once, "reads its replay back from disk");
-    let mut watched = system.start(&system.connect_args("watch --run-dir seen"));
+    let mut watched =
+        system.start(&system.connect_args("watch --run-dir seen --prometheus run.prom"));
     watched.wait_for_stderr(": reads its replay back from disk, ");
+    let prometheus = system.path("run.prom");
+    fs::remove_file(&prometheus).unwrap();
+    wait_until("the file again", || prometheus.exists());
+    assert!(recovery_progress(system).is_some(), "it still reads");
     actors.push(system.start_actor(1));
     actors[1].wait_for_stderr(WAITING_LOG);
     actors[0].wait_for_stderr("the replay server reads its replay back from disk, ");

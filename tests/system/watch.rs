@@ -148,6 +148,10 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     system
         .run_ok(&watch_once)
         .expect_stdout("the run is over: everything is learned and saved");
+    // A watcher that records nothing does not know how long a resumed run took.
+    system
+        .run_ok(&system.connect_args("watch"))
+        .expect_stdout("finished: 1280 frames and 540 updates, replay ratio");
 
     let samples = parse_prometheus(&system.read("run.prom"));
     let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();

@@ -16,6 +16,9 @@ use crate::wheel::{self, LIBRARY_SHA256, WHEEL_NAME, WHEEL_SHA256};
 /// The Python whose pip fetches and unpacks the engine.
 const PYTHON: &str = "python3";
 
+/// The names of folders in which the engine is unpacked begin with this.
+const UNFINISHED: &str = "install-";
+
 /// How long to wait for another process that installs; then this process installs too.
 const LOCK_WAIT_MAX: Duration = Duration::from_secs(120);
 
@@ -131,13 +134,16 @@ impl Engine {
         let provided = cache.provided_wheel(&reason)?;
         check_private(&cache.folder)?;
         wheel::make_folder(&cache.folder)?;
-        let _lock = lock_install(cache, LOCK_WAIT_MAX);
+        let lock = lock_install(cache, LOCK_WAIT_MAX);
         // Another process may have been faster.
         if let Ok(engine) = Engine::locate_in(cache) {
             return Ok(engine);
         }
+        if lock.is_some() {
+            remove_unfinished(&cache.folder);
+        }
         let folder = tempfile::Builder::new()
-            .prefix("install-")
+            .prefix(UNFINISHED)
             .tempdir_in(&cache.folder)
             .map_err(ProcgenError::io("making a folder in", &cache.folder))?;
         let root = cache.root();
@@ -190,6 +196,15 @@ impl Cache {
                 "{reason}, and DRIML_OFFLINE=1 forbids fetching it"
             ))),
             false => Ok(None),
+        }
+    }
+}
+
+/// Removes what interrupted installations left. A folder that cannot be removed stays and does no harm.
+fn remove_unfinished(folder: &Path) {
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        if entry.file_name().to_string_lossy().starts_with(UNFINISHED) {
+            let _ = fs::remove_dir_all(entry.path());
         }
     }
 }
@@ -254,6 +269,8 @@ mod tests {
     fn installers_that_race_all_succeed_and_damage_is_repaired() {
         let folder = tempfile::tempdir().unwrap();
         let cache = cache_in(folder.path());
+        // As an interrupted installation leaves it.
+        wheel::make_folder(&cache.folder.join("install-x9/fresh")).unwrap();
         for damaged in ["", "libenv.so", "assets"] {
             if !damaged.is_empty() {
                 fs::rename(cache.root().join(damaged), folder.path().join(damaged)).unwrap();

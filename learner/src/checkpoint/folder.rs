@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::lock_file;
+use driml_protocol::{atomic_write, lock_file};
 
 use super::error::{CheckpointError, io_error};
 
@@ -145,7 +145,7 @@ fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
 /// Flushes a folder's entries to disk.
 fn sync(folder: &Path) -> Result<(), CheckpointError> {
     File::open(folder)
-        .and_then(|folder| folder.sync_all())
+        .and_then(|folder| atomic_write::sync_folder(&folder))
         .map_err(io_error("flush", folder))
 }
 

@@ -3,7 +3,7 @@
 
 use std::{
     fs::{File, Permissions},
-    io::{self, Write},
+    io::{self, ErrorKind, Write},
     os::unix::fs::PermissionsExt,
     path::Path,
 };
@@ -27,7 +27,18 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.as_file().sync_all()?;
     file.persist(path).map_err(|e| e.error)?;
     // Otherwise a crash of the machine may undo the renaming.
-    File::open(folder)?.sync_all()
+    sync_folder(&File::open(folder)?)
+}
+
+/// Flushes the entries of a folder to disk, if its file system can: those of some networks answer EINVAL.
+///
+/// # Errors
+/// The disk cannot be written.
+pub fn sync_folder(folder: &File) -> io::Result<()> {
+    match folder.sync_all() {
+        Err(e) if e.kind() == ErrorKind::InvalidInput => Ok(()),
+        flushed => flushed,
+    }
 }
 
 #[cfg(test)]
@@ -35,6 +46,14 @@ mod tests {
     use std::fs;
 
     use super::*;
+
+    #[test]
+    fn a_folder_that_cannot_be_flushed_is_no_error() {
+        let folder = File::open("/proc").unwrap();
+        let why = folder.sync_all().unwrap_err();
+        assert_eq!(why.kind(), ErrorKind::InvalidInput);
+        sync_folder(&folder).unwrap();
+    }
 
     #[test]
     fn a_file_is_replaced_whole_or_not_at_all() {

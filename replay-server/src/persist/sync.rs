@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{LogLimiter, Shutdown, fail_point, lock};
+use driml_protocol::{LogLimiter, Shutdown, atomic_write, fail_point, lock};
 
 /// Maximum segments that wait for a flush. One more causes a flush before anything else is written.
 const UNFLUSHED_SEGMENTS_MAX: usize = 32;
@@ -52,7 +52,7 @@ impl Flusher {
         let flushed = segments
             .iter()
             .try_for_each(|(&number, file)| file.sync_data().inspect_err(|_| failed = Some(number)))
-            .and_then(|()| folder.as_ref().map_or(Ok(()), |folder| folder.sync_all()));
+            .and_then(|()| folder.as_deref().map_or(Ok(()), atomic_write::sync_folder));
         let mut state = lock(&self.state);
         if flushed.is_err() {
             // To be flushed again next time.

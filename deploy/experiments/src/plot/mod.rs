@@ -98,9 +98,13 @@ fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
         let file = metrics.file_name().unwrap_or_default().display();
         return Err(usage!("{named} is not the folder of a run: there is no {file} in it").into());
     }
-    for other in others {
-        let other = other.display();
-        console::eprintln(&format!("skipped {other}: it is not the folder of a run"));
+    if let Some((first, more)) = others.split_first() {
+        let more = match more.len() {
+            0 => String::new(),
+            others => format!(" and {}", count(others, "other path")),
+        };
+        let first = first.display();
+        console::eprintln(&format!("skipped {first}{more}: not the folder of a run"));
     }
     Ok(runs)
 }

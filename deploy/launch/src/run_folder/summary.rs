@@ -213,6 +213,7 @@ impl Summary {
         )
     }
 
+    /// Describes how the run ended and what it counted; without time and speed if the time is not known.
     pub(crate) fn describe_counts(&self) -> String {
         let (of, episodes) = (self.mean_return_of, count(self.episodes, "episode"));
         let returns = match self.mean_return {
@@ -221,18 +222,21 @@ impl Summary {
                 format!("mean return {mean:.2} over the last {of} of {episodes}")
             }
         };
+        let time = Duration::try_from_secs_f64(self.wall_seconds).map(|it| {
+            let (frames, updates) = (self.frames_per_second, self.updates_per_second);
+            let time = duration(it);
+            format!(" in {time} ({frames:.0} frames/s, {updates:.2} updates/s)")
+        });
         let ratio = self.replay_ratio.map(|it| format!("{it:.2}"));
         let how = match self.outcome {
             Outcome::Finished => "finished",
             _ => "interrupted",
         };
         format!(
-            "{how}: {} and {} in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
+            "{how}: {} and {}{}, replay ratio {}, {returns}",
             count(self.frames, "frame"),
             count(self.updates, "update"),
-            duration(Duration::try_from_secs_f64(self.wall_seconds).unwrap_or_default()),
-            self.frames_per_second,
-            self.updates_per_second,
+            time.unwrap_or_default(),
             ratio.as_deref().unwrap_or("-"),
         )
     }

@@ -53,7 +53,7 @@ pub(crate) struct Display {
     /// When the first update since the run's last start was seen.
     learning_since: Option<Instant>,
     /// When the run began; a terminal's bar has a separate clock.
-    pub(crate) began: Instant,
+    began: Instant,
 }
 
 impl Display {

@@ -3,7 +3,10 @@
 
 mod watched;
 
-use std::{path::PathBuf, time::Duration};
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
@@ -120,11 +123,18 @@ fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
 }
 
 /// Waits until the replay servers have read their replay back and a learner has joined. Prints the progress; fails if they are silent.
-fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Result<()> {
+fn wait_until_known(
+    poller: &mut Poller,
+    prometheus: Option<&Path>,
+    interrupted: &Shutdown,
+) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let mut limiter = LogLimiter::default();
     loop {
         let view = poller.poll();
+        if let Some(path) = prometheus {
+            write_prometheus(path, view)?;
+        }
         if view.servers_answered() && view.after_updates.is_some() {
             return Ok(());
         }
@@ -158,7 +168,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
     if is_unknown || poller.view.recovering().next().is_some() {
         // Before that, it is not known what the run has done so far.
-        wait_until_known(&mut poller, &interrupted)?;
+        wait_until_known(&mut poller, flags.prometheus.as_deref(), &interrupted)?;
     }
     let mut watched = WatchedRun::new(&poller, folder.as_ref(), flags.tensorboard)?;
     let mut has_warned = false;

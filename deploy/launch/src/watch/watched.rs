@@ -109,8 +109,8 @@ impl WatchedRun {
     pub(super) fn finish(&mut self, view: &mut RunView, outcome: Outcome) -> Summary {
         self.display.screen.clear();
         let Some(recorder) = &self.recorder else {
-            let seconds = self.display.began.elapsed().as_secs_f64();
-            return Summary::new(outcome, view, seconds, ResumePoint::default());
+            // The servers' clocks do not count the time before a resume or a restart, and their frames do.
+            return Summary::new(outcome, view, f64::NAN, ResumePoint::default());
         };
         let missing = recorder.loss_messages();
         missing.iter().for_each(|line| console::eprintln(line));
