@@ -45,7 +45,13 @@ fn a_call_that_asks_for_help_or_leaves_the_command_out_prints_it() {
     for call in ["", "bench", "experiment"] {
         system.rejects(call, "Usage: ");
     }
-    for call in ["--help", "--version", "local --help", "presets"] {
+    for call in [
+        "--help",
+        "--version",
+        "local --help",
+        "presets",
+        "inspect --worlds --preset tuned",
+    ] {
         let Exit { stdout, stderr, .. } = system.run_ok(call);
         assert!(!stdout.is_empty() && stderr.is_empty(), "{call}");
     }

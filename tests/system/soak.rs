@@ -39,6 +39,10 @@ fn held_resources(system: &TestSystem, process: &str) -> Resources {
 fn nothing_grows() {
     let minutes = std::env::var("DRIML_SOAK_MINUTES");
     let minutes: u64 = minutes.map_or(60, |text| text.parse().expect("a number of minutes"));
+    assert!(
+        minutes >= 7,
+        "two measurements need more than the five minutes before the first one"
+    );
     let end = Instant::now() + Duration::from_secs(60 * minutes);
     let system = system();
     let flags = "--env chain --preset smoke --agent driml-ada --frames 100000000 --set replay.replay_ratio=512";
@@ -81,6 +85,7 @@ fn nothing_grows() {
         "{} transitions, {} rows, {deaths} actors killed, {ends} ended",
         replay.transitions_inserted, replay.rows_sampled
     ));
+    assert!(samples.len() > 1, "nothing to compare");
     let (first, last) = (samples[0], samples[samples.len() - 1]);
     for (before, after) in [(first.0, last.0), (first.1, last.1)] {
         // Allow a tenth and 8 MiB, because the allocator's pools fill unevenly.

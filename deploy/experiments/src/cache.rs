@@ -25,7 +25,7 @@ use serde::{
     Deserialize, Serialize,
     de::{DeserializeOwned, IgnoredAny},
 };
-use serde_json::{Map, Value as Json};
+use serde_json::Value as Json;
 
 use crate::{
     flags::ExperimentFlags,
@@ -286,13 +286,18 @@ pub(crate) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFla
 
 /// Names the first setting that differs, with both values.
 fn describe_change(before: &[u8], now: &[u8]) -> String {
-    let parse = |text| serde_json::from_slice::<Map<String, Json>>(text).unwrap_or_default();
-    let (before, now) = (parse(before), parse(now));
-    let mut keys = before.keys().chain(now.keys());
-    let changed = keys.find(|key| before.get(*key) != now.get(*key)).cloned();
-    changed.map_or("other settings".into(), |key| {
-        let [before, now] = [before, now].map(|it| it.get(&key).cloned().unwrap_or_default());
-        format!("{key} = {before}, not {now}")
+    let [before, now] = [before, now].map(|it| serde_json::from_slice(it).unwrap_or_default());
+    first_change("", &before, &now).unwrap_or_else(|| "other settings".into())
+}
+
+fn first_change(path: &str, before: &Json, now: &Json) -> Option<String> {
+    let (Json::Object(old), Json::Object(new)) = (before, now) else {
+        return (before != now).then(|| format!("{path} = {before}, not {now}"));
+    };
+    old.keys().chain(new.keys()).find_map(|key| {
+        let [before, now] = [old, new].map(|it| it.get(key).unwrap_or(&Json::Null));
+        let dot = if path.is_empty() { "" } else { "." };
+        first_change(&format!("{path}{dot}{key}"), before, now)
     })
 }
 

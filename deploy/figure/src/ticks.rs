@@ -20,7 +20,7 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
     all.map(|i| i as f64 * step).collect()
 }
 
-/// Returns the powers of ten in `low..=high`, with multiples of them if there are fewer than three.
+/// Returns the powers of ten in `low..=high`, with multiples of them if there are fewer than three; in a narrow range, as [`linear`] does.
 pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
     let multiples = |times: &[f64]| -> Vec<f64> {
@@ -37,7 +37,11 @@ pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     if few.len() >= 3 {
         return few;
     }
-    multiples(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0])
+    let many = multiples(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0]);
+    match many.len() {
+        0 | 1 => linear(low, high, 4),
+        _ => many,
+    }
 }
 
 /// Labels of an axis are plain decimals if the largest tick is in this range, else they have powers of ten.
@@ -111,6 +115,10 @@ mod tests {
         assert_eq!(log(1.0, 1000.0), [1.0, 10.0, 100.0, 1000.0]);
         assert_eq!(log(1.0, 25.0), [1.0, 2.0, 5.0, 10.0, 20.0]);
         assert_eq!(log(80.0, 300.0), [100.0, 150.0, 200.0, 300.0]);
+        assert_eq!(
+            labels(&log(3.99, 4.21)).join(" "),
+            "4.00 4.05 4.10 4.15 4.20"
+        );
     }
 
     #[test]

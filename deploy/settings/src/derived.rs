@@ -9,7 +9,7 @@ use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use crate::overrides::{find, inline_text, insert, insert_missing};
+use crate::overrides::{find, inline_text, insert, insert_missing, remove};
 
 /// The derived settings: their paths, and from what they follow.
 const DERIVED: &str = "\
@@ -27,6 +27,27 @@ model.dim model.loss_layers: follows from learner.update";
 fn derived_settings() -> impl Iterator<Item = (&'static str, &'static str)> {
     let lines = DERIVED.lines().filter_map(|line| line.split_once(": "));
     lines.flat_map(|(paths, how)| paths.split(' ').map(move |path| (path, how)))
+}
+
+/// The settings that follow from others unless they are set by hand.
+const FOLLOWING: [&str; 3] = [
+    "actor.epsilon_ladder.actors",
+    "learner.affinity.visible",
+    "replay.sampling.beta_updates",
+];
+
+/// Removes the settings that only follow from others, so that they follow from changed ones too.
+pub(crate) fn remove_following(table: &mut Table) -> Result<(), Usage> {
+    for path in FOLLOWING {
+        let mut others = table.clone();
+        let is = remove(&mut others, path);
+        let mut filled = others.clone();
+        fill_in_derived(&mut filled)?;
+        if is.is_some() && find(&filled, path) == is.as_ref() {
+            *table = others;
+        }
+    }
+    Ok(())
 }
 
 /// The path of a whole frame's size, which is set if frames are cut to what the network reads. Settings of earlier versions lack it, and

@@ -14,9 +14,12 @@ use toml::{Table, Value};
 use crate::{
     config::RunConfig,
     derived, memory,
-    overrides::{Override, insert, insert_missing},
+    overrides::{Override, find, insert, insert_missing, remove},
     presets::Choice,
 };
+
+/// The limit on a compressed replay, which the machine's memory decides if the user does not.
+const COMPRESSED_MAX: &str = "replay.compressed_bytes_max";
 
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
@@ -72,7 +75,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             let name = path.display().to_string();
             let text = std::fs::read_to_string(path);
             let text = text.map_err(|e| usage!("reading the settings {name}: {e}"))?;
-            (Source::File(name.clone(), text), name)
+            (Source::of_another_run(&name, &text)?, name)
         }
         None => {
             let names = [&args.preset, &args.env, &args.agent];
@@ -111,6 +114,13 @@ pub enum Source {
 }
 
 impl Source {
+    /// The settings of another run, from the file `name`. What only follows from them also follows from what flags change.
+    fn of_another_run(name: &str, text: &str) -> Result<Self, Usage> {
+        let mut table = derived::parse_file(name, text)?;
+        derived::remove_following(&mut table)?;
+        Ok(Self::File(name.into(), table.to_string()))
+    }
+
     /// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
     ///
     /// # Errors
@@ -164,6 +174,10 @@ impl Source {
         let is_set = |path: &str| by_hand.iter().any(|set| set == path);
         if sized_by_machine || is_set("model.torso") {
             derived::drop_other_torsos(&mut table, is_set)?;
+        }
+        let compression = find(&table, "replay.compression").and_then(Value::as_str);
+        if compression == Some("none") && !is_set(COMPRESSED_MAX) {
+            remove(&mut table, COMPRESSED_MAX);
         }
         let is_capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
         derived::resolve_precision(&mut table, machine.fast_bf16);

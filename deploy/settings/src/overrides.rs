@@ -46,7 +46,10 @@ impl Override {
         let old = find(table, &self.path);
         let (is_new, value) = match old {
             Some(old) => (false, self.convert_to_type_of(old)?),
-            None => (true, self.value.clone()),
+            None => (
+                true,
+                as_whole(&self.value).unwrap_or_else(|| self.value.clone()),
+            ),
         };
         insert(table, &self.path, value);
         Ok(is_new)
@@ -55,21 +58,17 @@ impl Override {
     fn convert_to_type_of(&self, old: &Value) -> Result<Value, Usage> {
         match (old, &self.value) {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
-            // A number of frames may be written as 1e6. Floats are exact whole numbers up to 2^53.
-            (Value::Integer(_), Value::Float(number))
-                if number.fract() == 0.0 && number.abs() <= WHOLE_MAX =>
-            {
-                Ok(Value::Integer(*number as i64))
-            }
             (old, new) if old.same_type(new) => Ok(new.clone()),
-            (old, new) => Err(usage!(
-                "--set {}={}: this setting takes {}, and {new} is {}",
-                self.path,
-                inline_text(new),
-                type_name(old),
-                type_name(new),
-                new = inline_text(new),
-            )),
+            (old, new) => (old.as_integer().and_then(|_| as_whole(new))).ok_or_else(|| {
+                usage!(
+                    "--set {}={}: this setting takes {}, and {new} is {}",
+                    self.path,
+                    inline_text(new),
+                    type_name(old),
+                    type_name(new),
+                    new = inline_text(new),
+                )
+            }),
         }
     }
 
@@ -105,6 +104,13 @@ impl Override {
     }
 }
 
+/// A float without a fraction as an integer: a number of frames may be written as 1e6. Floats are exact whole numbers up to 2^53.
+fn as_whole(value: &Value) -> Option<Value> {
+    let is_whole = |it: &f64| it.fract() == 0.0 && it.abs() <= WHOLE_MAX;
+    let number = value.as_float().filter(is_whole)?;
+    Some(Value::Integer(number as i64))
+}
+
 pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').unwrap_or((path, ""));
     let value = table.get(first)?;
@@ -127,6 +133,14 @@ pub(crate) fn insert(table: &mut Table, path: &str, value: Value) {
                 insert(inner, rest, value);
             }
         }
+    }
+}
+
+/// Removes the value at `path`, if there is one.
+pub(crate) fn remove(table: &mut Table, path: &str) -> Option<Value> {
+    match path.split_once('.') {
+        None => table.remove(path),
+        Some((first, rest)) => remove(table.get_mut(first)?.as_table_mut()?, rest),
     }
 }
 

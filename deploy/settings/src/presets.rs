@@ -130,13 +130,18 @@ impl Choice {
         })
     }
 
+    /// Whether the preset is for this kind of world.
+    pub fn fits_world(&self) -> bool {
+        let kind = self.preset.read().preset.world_kind;
+        kind.is_none_or(|kind| kind == self.world.kind())
+    }
+
     /// Merges base, world, preset and agent in this order: a later layer wins. In each file, the settings for all worlds come first, then
     /// each `[[only]]` block that names the world.
     pub(crate) fn merged(&self) -> Result<Table, Usage> {
         let (preset, world) = (self.preset, self.world);
-        if let Some(kind) = preset.read().preset.world_kind
-            && kind != world.kind()
-        {
+        if !self.fits_world() {
+            let kind = preset.read().preset.world_kind.unwrap_or_default();
             return Err(usage!(
                 "preset {:?} is for {kind} only, not for {world}; take --preset paper",
                 preset.name

@@ -11,7 +11,10 @@ use driml_launch::{
     run_folder::RunFolder,
 };
 use driml_machine::resources::Machine;
-use driml_settings::flags::{RunFlags, resolve};
+use driml_settings::{
+    flags::{RunFlags, resolve},
+    presets::Choice,
+};
 
 #[derive(Debug, Args)]
 pub(crate) struct InspectArgs {
@@ -31,15 +34,19 @@ pub(crate) struct InspectArgs {
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
     let machine = Machine::detect();
     if args.worlds {
-        let of_world = |world: WorldName| {
-            let flags = RunFlags {
-                env: Some(world.to_string()),
-                ..args.settings.clone()
-            };
-            Inspection::new(&resolve(&flags, &machine)?.0)
-        };
-        let inspections: anyhow::Result<Vec<_>> = WorldName::all().map(of_world).collect();
-        let inspections = inspections?;
+        let RunFlags { preset, agent, .. } = &args.settings;
+        let mut inspections = Vec::new();
+        for world in WorldName::all() {
+            let world = world.to_string();
+            if Choice::new(preset.as_deref(), Some(&world), agent.as_deref())?.fits_world() {
+                let env = Some(world);
+                let flags = RunFlags {
+                    env,
+                    ..args.settings.clone()
+                };
+                inspections.push(Inspection::new(&resolve(&flags, &machine)?.0)?);
+            }
+        }
         return match args.json {
             true => print(&(serde_json::to_string_pretty(&inspections)? + "\n")),
             false => print(&describe_worlds(&inspections)),

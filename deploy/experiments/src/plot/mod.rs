@@ -19,7 +19,10 @@ use driml_launch::{
     stats::mean_and_deviation,
     view::loss_title,
 };
-use driml_machine::{error::usage, units::count};
+use driml_machine::{
+    error::{Usage, usage},
+    units::count,
+};
 
 pub(crate) use self::{
     flags::Band,
@@ -138,18 +141,27 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
         }
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
         let is_loss = runs.iter().any(reports);
-        let mut series = Vec::new();
+        let (mut series, mut apart) = (Vec::new(), Vec::new());
         for (index, group) in groups.iter().enumerate() {
             // Agents differ in their losses: a loss that only other agents report is not drawn for this group.
             if is_loss && !group.runs.iter().any(|run| reports(run)) {
                 continue;
             }
             let curve = group.curve(column, args)?;
+            if curve.points.is_empty() && group.runs.iter().any(|run| run.has_values(column)) {
+                apart.push(format!(
+                    "{} is not in the chart of {column}: its seeds share no range of {}; --separate draws each",
+                    group.name,
+                    args.x.column()
+                ));
+            }
             series.extend((!curve.points.is_empty()).then(|| curve.series(&group.name, index)));
         }
         if !args.column.is_empty() && series.is_empty() {
-            return Err(usage!("none of these runs has a value of {column:?} yet").into());
+            let none = format!("none of these runs has a value of {column:?} yet");
+            return Err(Usage(apart.pop().unwrap_or(none)).into());
         }
+        apart.iter().for_each(|line| console::eprintln(line));
         if column == RETURN || !(args.column.is_empty() || is_loss) {
             missing_messages(column, &runs).for_each(|line| console::eprintln(&line));
         }
@@ -249,7 +261,12 @@ fn random_means(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f6
         let task = (config.world.clone(), config.actor.actions);
         if !known.contains(&task) {
             let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0, || false)?);
-            found.push((config.run.world.clone(), mean));
+            // Two tasks may have the same world, with other settings of it or other actions.
+            let mut name = config.run.world.clone();
+            if found.iter().any(|(other, _)| *other == name) {
+                name += &format!(" as in {}", run.folder.display());
+            }
+            found.push((name, mean));
             known.push(task);
         }
     }

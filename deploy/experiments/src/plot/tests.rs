@@ -231,6 +231,7 @@ fn what_cannot_be_drawn_is_said() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, METRICS);
     let empty = root.run("e", "c51", 1, "frames,mean_return\n0,\n");
+    let late = root.run("l", "c51", 2, "frames,mean_return\n90,1.5\n95,2.5\n");
     let none = root.0.path().join("none");
     let mut eps = root.args(&[&a], &[]);
     eps.out = root.0.path().join("p.eps");
@@ -245,6 +246,10 @@ fn what_cannot_be_drawn_is_said() {
         (
             root.args(&[&empty], &["mean_return"]),
             "none of these runs has a value of \"mean_return\" yet",
+        ),
+        (
+            root.args(&[&a, &late], &["mean_return"]),
+            "its seeds share no range of frames; --separate draws each",
         ),
         (root.args(&[&empty], &[]), "recorded a value yet"),
         (root.args(&[&none], &[]), "is not the folder of a run"),

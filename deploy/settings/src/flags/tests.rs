@@ -38,6 +38,43 @@ fn paper(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
     resolve_names("paper", world, agent, set, &MACHINE).map_err(|e| e.to_string())
 }
 
+/// `driml presets > FILE; driml train --config FILE` with changed settings.
+#[test]
+fn what_follows_from_the_settings_of_a_file_follows_from_changed_ones_too() {
+    let longer = "replay.transitions_max=401000";
+    let ladder = "local.actors=2 actor.epsilon_ladder={base=0.4,alpha=7.0}";
+    let [rungs, beta] = [
+        "actor.epsilon_ladder.actors",
+        "replay.sampling.beta_updates",
+    ];
+    for (agent, before, after, path, expected) in [
+        ("rainbow", "run.seed=1", longer, beta, "12500"),
+        (
+            "rainbow",
+            "replay.sampling.beta_updates=500",
+            longer,
+            beta,
+            "500",
+        ),
+        ("c51", ladder, "local.actors=4", rungs, "4"),
+        (
+            "c51",
+            "replay.compression=lz4",
+            "replay.compression=none",
+            COMPRESSED_MAX,
+            "-",
+        ),
+    ] {
+        let before: Vec<_> = before.split(' ').collect();
+        let file = paper("mspacman", agent, &before).unwrap().to_toml();
+        let source = Source::of_another_run("config.toml", &file).unwrap();
+        let resolved = source.resolve(&sets(&[after]), &MACHINE).unwrap();
+        let resolved = resolved.to_table();
+        let value = find(&resolved, path).map_or("-".into(), Value::to_string);
+        assert_eq!(value, expected, "{agent}: {before:?}, then {after}");
+    }
+}
+
 #[test]
 fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     let mut resolved = 0;

@@ -122,7 +122,8 @@ fn distribution_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 
 /// Returns how far counts deviate from a distribution: their chi-square as standard deviations of a normal with the same tail, 0 or more.
 ///
-/// Pearson's chi-square by Wilson and Hilferty 1931 (cube root). Cells that expect fewer than 5 are merged. Infinite for impossible values.
+/// Pearson's chi-square by Wilson and Hilferty 1931 (cube root). Cells that expect fewer than 5 are merged. Infinite for impossible values,
+/// and if cells that together expect fewer than 5 have more than `RARE_MAX`, which a Poisson variable exceeds with a chance below 1e-6.
 fn deviations(counts: &[u64], distribution: &[f64]) -> f64 {
     let total = counts.iter().sum::<u64>() as f64;
     let (mut cells, mut rare) = (Vec::new(), (0.0, 0.0));
@@ -133,8 +134,11 @@ fn deviations(counts: &[u64], distribution: &[f64]) -> f64 {
             expected => cells.push((count as f64, expected)),
         }
     }
-    if rare.1 >= 5.0 {
-        cells.push(rare);
+    const RARE_MAX: f64 = 20.0;
+    match rare {
+        (_, 5.0..) => cells.push(rare),
+        (have, _) if have > RARE_MAX => return f64::INFINITY,
+        _ => {}
     }
     let degrees = cells.len().saturating_sub(1) as f64;
     if degrees == 0.0 {
@@ -254,5 +258,8 @@ mod tests {
         assert!(deviations(&[500, 510], &[0.5, 0.5]) < 1.0);
         assert!(deviations(&[60_000, 40_000], &[0.5, 0.5]) > 10.0);
         assert!(deviations(&[1, 99], &[0.0, 1.0]).is_infinite());
+        let nearly_certain = [1.0 - 1e-9, 1e-9];
+        assert!(deviations(&[0, 100_000], &nearly_certain).is_infinite());
+        assert_eq!(deviations(&[99_999, 1], &nearly_certain), 0.0);
     }
 }

@@ -49,7 +49,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
         let piece =
-            session.load_or_make("", &format!("seed{seed}"), settings.updates, |progress| {
+            session.load_or_compute("", &format!("seed{seed}"), settings.updates, |progress| {
                 train(&task, seed.into(), progress)
             })?;
         trained.push(piece);

@@ -40,7 +40,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     for (sampling, alpha, seed) in grid {
         let chain = Chain::new(settings.states, alpha);
         let key = format!("{}-alpha{alpha}-seed{seed}", sampling.name());
-        let learnt = session.load_or_make("", &key, settings.updates, |progress| {
+        let learnt = session.load_or_compute("", &key, settings.updates, |progress| {
             train(&chain, &settings, sampling, seed.into(), progress)
         })?;
         let share = settings.share_reached * chain.mutual_information();

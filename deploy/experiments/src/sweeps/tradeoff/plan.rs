@@ -1,22 +1,26 @@
 //! Chooses which levels fit into a budget.
 //! This module only knows seconds and names. The costs come from `measured` or from finished runs.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 
 /// The name of a point, and the seconds that its unfinished runs take.
 pub(super) type Cost = (String, f64);
 
-/// Returns which levels fit into `seconds_max`, each with its base and all seeds, and the seconds of all that fit. Each point is paid once.
+/// Returns which levels fit into `seconds_max`, each with its base and all seeds, and the seconds of all that fit. Each point is paid once,
+/// at its highest cost: as a base, it has more seeds.
 /// A level that costs nothing always fits. One that does not fit leaves its room to later levels.
 pub(super) fn choose_levels(base_and_level: &[[Cost; 2]], seconds_max: f64) -> (Vec<bool>, f64) {
-    let (mut seconds, mut taken) = (0.0, BTreeSet::new());
+    let (mut seconds, mut paid) = (0.0, BTreeMap::new());
     let fits = base_and_level.iter().map(|both| {
-        let new = both.iter().filter(|(key, _)| !taken.contains(key));
-        let more: f64 = new.map(|(_, seconds)| seconds).sum();
+        let due = |(key, cost): &Cost| (cost - paid.get(key).unwrap_or(&0.0)).max(0.0);
+        let more: f64 = both.iter().map(due).sum();
         let fits = more == 0.0 || seconds + more <= seconds_max;
         if fits {
             seconds += more;
-            taken.extend(both.iter().map(|(key, _)| key));
+            for (key, cost) in both {
+                let paid = paid.entry(key).or_insert(0.0);
+                *paid = f64::max(*paid, *cost);
+            }
         }
         fits
     });
@@ -45,6 +49,10 @@ mod tests {
         ];
         // Finished points cost nothing and are always taken.
         let finished = [[("c51", 0.0), ("bf16", 0.0)], [("c51", 0.0), ("f16", 50.0)]];
+        let becomes_a_base = [
+            [("c51", 100.0), ("driml-fix", 100.0)],
+            [("driml-fix", 200.0), ("embedding_dim", 40.0)],
+        ];
         for (levels, seconds_max, chosen, seconds) in [
             (&all[..], 0.0, &[false; 4][..], 0.0),
             (&all, 159.9, &[false; 4], 0.0),
@@ -54,6 +62,8 @@ mod tests {
             (&all, 500.0, &[true; 4], 500.0),
             (&finished, 0.0, &[true, false], 0.0),
             (&finished, 50.0, &[true, true], 50.0),
+            (&becomes_a_base, 339.0, &[true, false], 200.0),
+            (&becomes_a_base, 340.0, &[true, true], 340.0),
         ] {
             let owned = levels
                 .iter()
