@@ -14,7 +14,7 @@ use driml_protocol::{
     session::SessionError,
 };
 
-/// Time-out of the request for one piece.
+/// Time-out of the request for one piece, once those before it have arrived.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pieces requested at the same time.
 const PIECES_IN_FLIGHT_MAX: usize = 4;
@@ -126,7 +126,16 @@ pub(crate) fn wait_for_first(
     let mut log_limiter = LogLimiter::default();
     let pool = BufferPool::new(PIECES_IN_FLIGHT_MAX);
     loop {
-        let pulled = pull(0, |request| send(client, &pool, request));
+        let (from, buffers) = (client.clone(), pool.clone());
+        // A frozen replay server does not keep the actor from exiting.
+        let first = move || {
+            pull(0, |request, timeout| {
+                send(&from, &buffers, request, timeout)
+            })
+        };
+        let Some(pulled) = shutdown.run_unless_set("first-weights", first)? else {
+            return Ok(None);
+        };
         let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());
         if let Some(SessionError::Recovering(recovering)) = error {
             silence.record_answer();
@@ -189,7 +198,8 @@ pub(crate) fn start_puller(
                 continue;
             };
             last_pull = Instant::now();
-            match pull(version, |request| send(&client, &pool, request)) {
+            let send = |request, timeout| send(&client, &pool, request, timeout);
+            match pull(version, send) {
                 Ok(weights) => slot.finish_pull(weights),
                 // The actor is leaving and has closed its session.
                 Err(_) if client.session().is_closed() => return,
@@ -206,16 +216,16 @@ pub(crate) fn start_puller(
     Ok(newest)
 }
 
-/// Pulls the newest weights, piece by piece. `send` requests a piece and returns a function that waits for the reply. Returns `None` if the
-/// weights are not newer than `version`.
+/// Pulls the newest weights, piece by piece. `send` requests a piece, with a time-out, and returns a function that waits for the reply.
+/// Returns `None` if the weights are not newer than `version`.
 fn pull<R>(
     version: u64,
-    send: impl Fn(WeightsRequest) -> anyhow::Result<R>,
+    send: impl Fn(WeightsRequest, Duration) -> anyhow::Result<R>,
 ) -> anyhow::Result<Option<Weights>>
 where
     R: FnOnce() -> Result<(WeightsReply, Buffer), SessionError>,
 {
-    let (reply, first) = send(WeightsRequest::NewerThan(version))?()?;
+    let (reply, first) = send(WeightsRequest::NewerThan(version), PIECE_TIMEOUT)?()?;
     let WeightsReply::Piece {
         weights: header,
         bytes,
@@ -236,7 +246,9 @@ where
         while pending.len() < PIECES_IN_FLIGHT_MAX
             && let Some(request) = requests.next()
         {
-            pending.push_back(send(request)?);
+            // On a slow link, a piece also waits for those before it.
+            let ahead = pending.len() as u32;
+            pending.push_back(send(request, PIECE_TIMEOUT * (ahead + 1))?);
         }
         let Some(receive) = pending.pop_front() else {
             break;
@@ -264,8 +276,9 @@ fn send(
     client: &RunClient,
     pool: &BufferPool,
     request: WeightsRequest,
+    timeout: Duration,
 ) -> anyhow::Result<impl FnOnce() -> Result<(WeightsReply, Buffer), SessionError> + use<>> {
-    let sent = client.send(client.encode(&request)?, PIECE_TIMEOUT);
+    let sent = client.send(client.encode(&request)?, timeout);
     let sent = sent.map_err(|e| anyhow!("requesting weights: {e}"))?;
     let pool = pool.clone();
     Ok(move || sent.receive(&pool))
@@ -328,7 +341,7 @@ mod tests {
         let header = WeightsHeader::new(3, 7, &file);
         // Pulls from a replay server that serves `served` in place of the piece at `wrong`.
         let pulled = |wrong: usize, served: &[u8]| {
-            pull(2, |request| {
+            pull(2, |request, _| {
                 let offset = match request {
                     WeightsRequest::NewerThan(_) => 0,
                     WeightsRequest::Piece { offset, .. } => offset,

@@ -3,7 +3,7 @@
 
 use std::{
     io::{ErrorKind, Read, Write},
-    net::{TcpStream, ToSocketAddrs},
+    net::{SocketAddr, TcpStream, ToSocketAddrs},
     os::unix::net::UnixStream,
     path::PathBuf,
     time::Duration,
@@ -82,6 +82,14 @@ fn connect_error(endpoint: &str, e: std::io::Error) -> Unreachable {
 fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
     let what = match UnixStream::connect(path) {
         Ok(_) => return Ok(()),
+        Err(e) if e.kind() == ErrorKind::PermissionDenied => {
+            return Err(Unreachable {
+                text: format!(
+                    "{endpoint} belongs to another user: run as that user, or connect to a tcp/ endpoint"
+                ),
+                is_retryable: false,
+            });
+        }
         Err(e) if e.kind() == ErrorKind::NotFound => "there is no such socket",
         Err(e) if e.kind() == ErrorKind::ConnectionRefused => {
             "its socket was left by a process that has ended"
@@ -118,6 +126,17 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
         std::thread::sleep(pause);
         pause = (pause * 2).min(pause_max);
     }
+}
+
+/// Returns what to check if the name in `endpoint` resolves to an IPv6 address first: over QUIC, zenoh tries no other.
+pub(crate) fn ipv6_hint(endpoint: &str) -> Option<&'static str> {
+    let first = endpoint
+        .strip_prefix("quic/")?
+        .to_socket_addrs()
+        .ok()?
+        .next();
+    let hint = ". The name has an IPv6 address, which is tried alone: the server must listen on quic/[::]:PORT, not 0.0.0.0";
+    first.filter(SocketAddr::is_ipv6).map(|_| hint)
 }
 
 /// Returns the first line that a foreign server at `endpoint` sends in answer to an HTTP request, if it is printable text.

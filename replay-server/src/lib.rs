@@ -59,7 +59,9 @@ mod storage;
 pub use config::{Compression, Config, RatioStart};
 pub use driml_protocol::NotReady;
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
-pub use persist::{Mark, PersistArgs, PersistError, RecoveryControl, RecoveryReport, ReplayFolder};
+pub use persist::{
+    Mark, PersistArgs, PersistError, RecoveryControl, RecoveryReport, ReplayFolder, kept_capacity,
+};
 pub use rate_limiter::RateLimiter;
 pub use replay::Replay;
 pub use sampling::{

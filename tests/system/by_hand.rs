@@ -1,10 +1,13 @@
 //! Processes started by hand in terminals: they share only an endpoint, and signals end them.
 //! These runs have no launcher.
 
-use std::fs;
+use std::{
+    fs,
+    time::{Duration, Instant},
+};
 
 use driml_protocol::Waiting;
-use driml_tests::{Process, TestSystem, check_nothing_lost};
+use driml_tests::{Process, TestSystem, check_nothing_lost, wait_until};
 use nix::sys::signal::Signal::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::{LONG, SHORT, closed_terminal::skipped_under_nohup, system};
@@ -78,6 +81,27 @@ fn processes_end_by_themselves_when_the_run_is_over() {
         assert_eq!(system.running_processes(), []);
         system.run_ok("evaluate --run run --episodes 2");
     }
+}
+
+#[test]
+fn a_second_interrupt_ends_a_process_at_once() {
+    let system = system();
+    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let learner = system.start_learner("run");
+    // Without `--exit-with-parent`: a launcher signals its processes more than once.
+    let mut actor = system.start(&system.connect_args("actor --id 0"));
+    actor.wait_for_stderr("steps 4 environments");
+    server.kill();
+    learner.kill();
+    // It tries for 20 s to deliver its chunks.
+    actor.signal(SIGINT);
+    let asked = Instant::now();
+    wait_until("a second request", || {
+        asked.elapsed() > Duration::from_secs(1)
+    });
+    actor.signal(SIGTERM);
+    let ended = actor.wait().expect_code(130);
+    ended.expect_stderr("stopped at once by a second signal");
 }
 
 /// Tests each signal that a shell, a service manager or a closed ssh session sends.

@@ -1,7 +1,7 @@
 //! A replay that is kept on disk, and processes that are killed and restarted: every transition is stored once, every planned update made,
 //! nothing reported twice. Reading of logs, intact or damaged, is tested beside the code; these tests use real processes and disks.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, fs};
 
 use driml_tests::{
     Exit, Outcome, Process, RunningProcess, TestSystem, check_has, check_nothing_lost, print_line,
@@ -222,6 +222,17 @@ fn a_resumed_run_continues_with_its_replay() {
     // The replay's log may contain updates that no checkpoint holds.
     let warns = |line: &&str| line.contains("WARN") && !line.contains("repeats the later ones");
     assert_eq!(log.lines().find(warns), None, "{log}");
+
+    // Without its log, the replay counts as lost, and the episodes before stay in their table.
+    for name in system.file_names("run/replay") {
+        if name.starts_with("segment-") {
+            fs::remove_file(system.path("run/replay").join(name)).unwrap();
+        }
+    }
+    let frames = summary.frames + 500;
+    system.run_ok(&format!("local --resume run --frames {frames}"));
+    assert!(run.check_finished().episodes > summary.episodes);
+    assert!(!system.path("run/episodes.aside-1.csv").exists());
 }
 
 /// The old processes still exit while the next launcher starts: the replay server waits for a frozen actor, and holds replay and endpoint.

@@ -69,6 +69,10 @@ pub(crate) fn continues_exactly(flags: &str) {
 
     let half = run(FRAMES / 2, "half");
     assert_ne!(half.weights_sha256, whole.0);
+    // The error leaves the folder as it was.
+    let wrong = format!("local --resume half --frames {FRAMES} --set actor.envs=3");
+    system.fails(&wrong, "environments, not 3");
+    system.run_folder("half").check_finished();
     system.run_ok(&format!("local --resume half --frames {FRAMES}"));
     let prolonged = system.run_folder("half").check_finished();
     assert_eq!(compared_results(prolonged), whole, "prolonged");

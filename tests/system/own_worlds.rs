@@ -120,10 +120,13 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let learner = system.start_learner("run");
     system
         .start_actor(0)
-        .fails("an actor starts no program that only the replay server names")
+        .wait()
+        .expect_code(64)
+        .expect_stderr("an actor starts no program that only the replay server names")
         .expect_stderr("--env \"exec:exec python3 ");
     let actor = |flags: &str| system.start_process(&system.connect_args(&format!("actor {flags}")));
-    actor("--env chain").fails("and not chain");
+    let rejected = actor("--env chain").wait().expect_code(64);
+    rejected.expect_stderr("and not chain");
     // An actor whose world takes long to start stops at once.
     let mut starting = actor("--id 2 --env 'exec:echo starts >&2; exec sleep 100'");
     starting.wait_for_stderr("starts");

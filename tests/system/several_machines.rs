@@ -169,6 +169,24 @@ fn a_narrow_link_stops_no_process() {
     run.check_end();
 }
 
+/// The learner receives 12 kbit/s, so that two batches take longer than a request waits at first.
+#[test]
+fn batches_come_over_a_slow_link() {
+    let system = system();
+    system.pause_learners_at(100);
+    let Some(run) = Run::start(system, 1, 1_000, 8) else {
+        return;
+    };
+    let updates = || run.status()?["replay"]["updates"].as_u64();
+    wait_until("updates", || updates() >= Some(90));
+    if !run.network.limit_rate("learner", 256, 12) {
+        return skip("tc knows no tbf");
+    }
+    run.system.release_learners();
+    // Batches that were fetched before, and one more.
+    wait_until("further updates", || updates() > Some(104));
+}
+
 /// Disconnects each process for 30 s, then for 90 s. Run by hand: it takes seven minutes.
 #[test]
 #[ignore = "seven minutes: cargo nextest run --workspace --run-ignored only -E 'test(cut_off_for_long)'"]

@@ -34,6 +34,10 @@ fn missing_processes_are_named_with_what_to_do() {
     // The server also logs this itself.
     server.wait_for_stderr("no learner has joined yet; waiting for");
 
+    let twice = format!("status --connect {endpoint}");
+    let words = "are both shard 0: give each endpoint once";
+    system.rejects(&system.connect_args(&twice), words);
+
     let mut learner = system.start_learner("run");
     wait_for_status(&system, &["learner up ", "warm-up 0/", &act]);
     learner.wait_for_stderr("waiting for a batch for 10 s: warm-up 0/");

@@ -1,6 +1,8 @@
 //! The interface of a world's settings: what a run must know of a world before it is built, and how to build it.
 //! `registry` lists the worlds.
 
+use std::time::Duration;
+
 use crate::environment::{Environment, FrameShape};
 use crate::error::EnvError;
 
@@ -68,6 +70,11 @@ pub trait WorldSettings {
     /// Whether a run in this world can be resumed, with new episodes: false if one episode's state influences the next.
     fn is_resumable(&self) -> bool {
         true
+    }
+
+    /// How long the start and `steps` steps may take before the world itself reports an error; zero if it does not measure time.
+    fn steps_time_max(&self, _steps: u32) -> Duration {
+        Duration::ZERO
     }
 
     /// Installs what the world needs on this machine; `progress` gets a line for each step.

@@ -19,6 +19,9 @@ const PYTHON: &str = "python3";
 /// The names of folders in which the engine is unpacked begin with this.
 const UNFINISHED: &str = "install-";
 
+/// How old such a folder must be to be removed: a process that found no lock may still unpack into a younger one.
+const UNFINISHED_AGE_MIN: Duration = Duration::from_secs(3600);
+
 /// How long to wait for another process that installs; then this process installs too.
 const LOCK_WAIT_MAX: Duration = Duration::from_secs(120);
 
@@ -140,7 +143,7 @@ impl Engine {
             return Ok(engine);
         }
         if lock.is_some() {
-            remove_unfinished(&cache.folder);
+            remove_unfinished(&cache.folder, UNFINISHED_AGE_MIN);
         }
         let folder = tempfile::Builder::new()
             .prefix(UNFINISHED)
@@ -161,6 +164,10 @@ impl Engine {
         wheel::check_hash(&fresh.join("libenv.so"), library_sha256)?;
         // A crash of the machine must not leave a folder in place whose files are empty.
         let _ = File::open(&fresh).map(nix::unistd::syncfs);
+        // Another process may hold no lock either, as on file systems that have none: a whole engine may be in use, and stays.
+        if let Ok(engine) = Engine::locate_in(cache) {
+            return Ok(engine);
+        }
         if root.exists() {
             // The temporary folder is deleted with all that is moved into it.
             fs::rename(&root, folder.path().join("damaged"))
@@ -200,10 +207,13 @@ impl Cache {
     }
 }
 
-/// Removes what interrupted installations left. A folder that cannot be removed stays and does no harm.
-fn remove_unfinished(folder: &Path) {
+/// Removes what installations left that were interrupted more than `age_min` ago. A folder that cannot be removed stays and does no harm.
+fn remove_unfinished(folder: &Path, age_min: Duration) {
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(UNFINISHED) {
+        let changed = entry.metadata().and_then(|it| it.modified());
+        let age = changed.map(|it| it.elapsed().unwrap_or_default());
+        let is_unfinished = entry.file_name().to_string_lossy().starts_with(UNFINISHED);
+        if is_unfinished && age.is_ok_and(|age| age >= age_min) {
             let _ = fs::remove_dir_all(entry.path());
         }
     }
@@ -271,6 +281,9 @@ mod tests {
         let cache = cache_in(folder.path());
         // As an interrupted installation leaves it.
         wheel::make_folder(&cache.folder.join("install-x9/fresh")).unwrap();
+        remove_unfinished(&cache.folder, UNFINISHED_AGE_MIN);
+        assert_eq!(file_names(&cache), ["install-x9"]);
+        remove_unfinished(&cache.folder, Duration::ZERO);
         for damaged in ["", "libenv.so", "assets"] {
             if !damaged.is_empty() {
                 fs::rename(cache.root().join(damaged), folder.path().join(damaged)).unwrap();

@@ -39,6 +39,9 @@ const PIP_LIMITS: &str = "--timeout 30 --retries 2 --no-input --disable-pip-vers
 /// The most lines of pip's output that a message quotes.
 const OUTPUT_LINES_MAX: usize = 6;
 
+/// The most characters of each; a full disk names every file in one line.
+const LINE_CHARS_MAX: usize = 300;
+
 /// The command that fetches the wheel into the current folder, for people.
 pub(crate) fn fetch_command() -> String {
     format!("python3 -m pip download procgen==0.10.7 {PIP_SELECTION}")
@@ -70,9 +73,15 @@ pub(crate) fn unpack(python: &str, to: &Path, provided: Option<&Path>) -> Result
     let stderr = String::from_utf8_lossy(&output.stderr);
     let lines = stderr.lines().filter(|line| !line.trim().is_empty());
     let lines: Vec<&str> = lines.collect();
-    let last = &lines[lines.len().saturating_sub(OUTPUT_LINES_MAX)..];
+    let last = lines[lines.len().saturating_sub(OUTPUT_LINES_MAX)..].iter();
+    let cut = |line: &&str| line.chars().take(LINE_CHARS_MAX).collect::<String>();
+    let last: Vec<_> = last.map(cut).collect();
+    let hint = match stderr.contains("No space left") {
+        true => "make room, or choose other places with DRIML_CACHE and TMPDIR",
+        false => "check the network and which package index pip uses",
+    };
     Err(ProcgenError::Fetch(format!(
-        "`{python} -m pip install` failed ({}); check the network and which package index pip uses. Its output:\n  {}\n",
+        "`{python} -m pip install` failed ({}); {hint}. Its output:\n  {}\n",
         output.status,
         last.join("\n  ")
     )))
@@ -97,7 +106,7 @@ pub(crate) fn run_pip(python: &str, arguments: &[&str]) -> Result<Output, Procge
         // The exit status of a shell that finds no Python, or of a launcher that finds none.
         Ok(output) if output.status.code() == Some(127) => missing(python),
         Ok(output) if String::from_utf8_lossy(&output.stderr).contains("No module named pip") => {
-            missing("pip")
+            missing("pip (in a virtual environment: `python3 -m ensurepip`)")
         }
         Ok(output) => Ok(output),
     }

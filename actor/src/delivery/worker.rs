@@ -19,9 +19,11 @@ use super::state::{DeliveryLimits, DeliveryState};
 
 /// How long the queued chunks may take to be stored after `Shutdown`.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
-/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`]. Of a longer time
-/// between two tries, in which this process was stopped, only twice as much counts.
-const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
+/// Time-out of the reply to one of these chunks, which is then sent again. Two tries must fit into [`DRAIN_MAX`]. Of a longer time between
+/// two tries, in which this process was stopped, only twice as much counts.
+const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(8);
+/// After so many stored chunks, one more may be in flight than before.
+const WINDOW_TRIAL_CHUNKS: u64 = 64;
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How often the thread checks for `Shutdown` while it waits for a reply.
@@ -61,6 +63,10 @@ pub(super) struct DeliveryWorker {
     outgoing: VecDeque<OutgoingChunk>,
     /// The most chunks in flight: 1 after a chunk had to wait or be sent again, and 1 more for each chunk that is stored at once.
     window: usize,
+    /// The largest window: half of one in which a chunk was late, as on a slow link each waits for those before it.
+    window_max: usize,
+    /// Chunks stored since the start.
+    stored: u64,
     silence: Silence,
     /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
@@ -88,6 +94,8 @@ impl DeliveryWorker {
             state,
             outgoing: VecDeque::new(),
             window: 1,
+            window_max: limits.chunks_in_flight_max,
+            stored: 0,
             silence: Silence::with_try_timeout(limits.ack_timeout),
             held_since: None,
             out_of_order: None,
@@ -176,7 +184,9 @@ impl DeliveryWorker {
         }
         let reply = self.send_window().and_then(|()| self.wait_for_first());
         let Some(reply) = reply.transpose() else {
-            // Sent again with `leaving` set, the chunk passes the rate limiter at once.
+            // A poll with `leaving` set takes the chunk past the rate limiter at once. On a slow link, a second copy would take too long.
+            let sent = self.outgoing.iter_mut().take(self.window);
+            sent.for_each(|it| it.is_kept = true);
             return Ok(self.prepare_resend());
         };
         if reply.is_ok() {
@@ -194,9 +204,13 @@ impl DeliveryWorker {
                 progress.actors = actors;
                 progress.is_held = was_held;
                 drop(progress);
+                self.stored += 1;
+                if self.stored.is_multiple_of(WINDOW_TRIAL_CHUNKS) {
+                    self.window_max = (self.window_max + 1).min(self.limits.chunks_in_flight_max);
+                }
                 self.window = match was_held {
                     true => 1,
-                    false => (self.window + 1).min(self.limits.chunks_in_flight_max),
+                    false => (self.window + 1).min(self.window_max),
                 };
                 self.pool.report_arrival(self.outgoing[0].in_shared_memory);
                 Ok(Outcome::Stored)
@@ -248,6 +262,9 @@ impl DeliveryWorker {
                 }
                 if let Some(suppressed) = self.retry_log.admit() {
                     tracing::warn!("retrying chunk {sequence}: {e}{suppressed}");
+                }
+                if matches!(e, SessionError::TimedOut { .. }) {
+                    self.window_max = (self.window / 2).max(1);
                 }
                 // A chunk without a reply may not have arrived, whatever an earlier reply said.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);

@@ -12,7 +12,7 @@ use std::{
 use anyhow::Context as _;
 use console::Term;
 use driml_machine::units::count;
-use driml_protocol::{last_warning, lock};
+use driml_protocol::{LogLimiter, last_warning, lock};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use tracing::{Event, Level, Subscriber, field::Field};
 use tracing_subscriber::{
@@ -218,37 +218,16 @@ impl<S: Subscriber> Layer<S> for LastWarning {
 
 /// For how long one line about a full disk stands for the lines of all processes and files.
 const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
+/// The texts of the system's errors about a full disk.
+const FULL_DISK_CAUSES: [&str; 2] = ["No space left on device", "Disk quota exceeded"];
 
 /// Where messages go: stderr, above a progress bar if there is one and stderr is a terminal. Clones share the bar, but each
 /// has a separate time of its next plain line.
 #[derive(Clone, Debug, Default)]
 pub struct Screen {
     bar: Option<ProgressBar>,
-    full_disk: Arc<Mutex<FullDiskLimiter>>,
+    full_disk: Arc<Mutex<LogLimiter>>,
     next_plain_line: Option<Instant>,
-}
-
-/// When a full disk was last reported, and how many lines about it were left out.
-#[derive(Debug, Default)]
-struct FullDiskLimiter {
-    reported_at: Option<Instant>,
-    omitted: u64,
-}
-
-impl FullDiskLimiter {
-    fn is_due(&mut self, text: &str, now: Instant) -> bool {
-        let mut causes = ["No space left on device", "Disk quota exceeded"].iter();
-        if !causes.any(|it| text.contains(it)) {
-            return true;
-        }
-        let is_fresh = |said| now.saturating_duration_since(said) < FULL_DISK_PERIOD;
-        let is_due = !self.reported_at.is_some_and(is_fresh);
-        match is_due {
-            true => self.reported_at = Some(now),
-            false => self.omitted += 1,
-        }
-        is_due
-    }
 }
 
 impl Screen {
@@ -265,8 +244,8 @@ impl Screen {
         });
         Self {
             bar,
+            full_disk: Arc::new(Mutex::new(LogLimiter::with_period(FULL_DISK_PERIOD))),
             next_plain_line: Some(Instant::now() + PLAIN_PERIOD),
-            ..Self::default()
         }
     }
 
@@ -277,7 +256,9 @@ impl Screen {
 
     /// Writes one line. A line about a full disk is left out if another one was written less than ten minutes ago.
     pub fn print_line(&self, text: &str) {
-        if !lock(&self.full_disk).is_due(text, Instant::now()) {
+        let is_full = |cause: &&str| text.contains(cause);
+        let is_full = FULL_DISK_CAUSES.iter().any(is_full);
+        if is_full && lock(&self.full_disk).admit().is_none() {
             return;
         }
         match &self.bar {
@@ -307,7 +288,7 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        let more = std::mem::take(&mut lock(&self.full_disk).omitted);
+        let more = lock(&self.full_disk).take_suppressed();
         if more > 0 {
             let more = count(more, "further line");
             eprintln(&format!("left out {more} about the full disk"));
@@ -362,13 +343,12 @@ mod tests {
 
     #[test]
     fn a_full_disk_is_one_line() {
-        let (mut full, start) = (FullDiskLimiter::default(), Instant::now());
-        let mut is_due = |text, seconds| full.is_due(text, start + Duration::from_secs(seconds));
-        assert!(is_due("a.csv: No space left on device (os error 28)", 0));
-        assert!(!is_due("b.csv: No space left on device (os error 28)", 1));
-        assert!(is_due("learner is gone", 1));
-        assert!(is_due("a.csv: No space left on device (os error 28)", 601));
-        assert_eq!(full.omitted, 1);
+        let screen = Screen::new(1, "{msg}");
+        for name in ["a.csv", "b.csv", "c.csv"] {
+            screen.print_line(&format!("{name}: No space left on device (os error 28)"));
+        }
+        screen.print_line("learner is gone");
+        assert_eq!(lock(&screen.full_disk).take_suppressed(), 2);
 
         let lost = "lost 2 rows of a: full\nx\nlost 1 row of b: full";
         let joined = join_losses(lost.lines().map(str::to_owned));

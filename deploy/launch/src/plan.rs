@@ -1,15 +1,13 @@
 //! What a run will do and about how long it takes, printed before the run starts.
 //! This module decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
-use std::time::Duration;
-
 use driml_learner::{
     DeviceName, Precision,
     cost::{UpdateCost, UpdateShape},
 };
 use driml_machine::{
     resources::Machine,
-    units::{count, duration},
+    units::{count, rough_duration},
 };
 use driml_settings::{
     config::RunConfig,
@@ -28,15 +26,14 @@ const GFLOPS_PER_CORE: f64 = 75.0;
 /// Width in characters of the labels in front of the plan's facts.
 pub const INDENT: usize = 12;
 
-/// Estimates how long the run takes on `cores` cores: its updates, and one forward pass per frame.
-pub fn estimate(config: &RunConfig, cores: u32) -> Duration {
+/// Estimates the seconds that the run takes on `cores` cores: its updates, and one forward pass per frame.
+fn estimate_s(config: &RunConfig, cores: u32) -> f64 {
     let shape = UpdateShape::for_learner(&config.learner, config.run.horizon.positives());
     let update = UpdateCost::compute(&config.model, &shape).total() as f64;
     let layers = config.model.without_dim().layer_costs();
     let forward: u64 = layers.iter().map(|layer| layer.forward).sum();
     let flops = config.updates() as f64 * update + config.frames() as f64 * forward as f64;
-    let seconds = flops / (GFLOPS_PER_CORE * 1e9 * f64::from(cores.max(1)));
-    Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX)
+    flops / (GFLOPS_PER_CORE * 1e9 * f64::from(cores.max(1)))
 }
 
 /// The plan of a run that starts at `resume_point`, one fact per line.
@@ -59,7 +56,7 @@ pub fn describe(
         false => "",
     };
     let left = (1.0 - resume_point.updates as f64 / updates.max(1) as f64).max(0.0);
-    let time = format_estimate(estimate(config, machine.cores).mul_f64(left));
+    let time = rough_duration(left * estimate_s(config, machine.cores));
     let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
     let (updates, rows) = (count(updates, "update"), count(rows, "row"));
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);
@@ -72,7 +69,7 @@ pub fn describe(
          processes   {processes}\n\
          replay      the newest {held} transitions, up to {bytes} of memory{disk}\n\
          run folder  {run_dir}\n\
-         time        {time} (roughly, from the network's arithmetic)\n{notes}"
+         time        roughly {time}, from the network's arithmetic\n{notes}"
     )
 }
 
@@ -102,18 +99,6 @@ fn format_size(bytes: u64) -> String {
     }
 }
 
-/// Formats a time with no more precision than an estimate has.
-fn format_estimate(time: Duration) -> String {
-    let time = match time.as_secs() {
-        0..60 => return "under a minute".into(),
-        seconds @ 60..7200 => format!("{} min", seconds.div_ceil(60)),
-        seconds => duration(Duration::from_secs(seconds.div_ceil(3600) * 3600))
-            .replace(" 0 min", "")
-            .replace(" 0 h", ""),
-    };
-    format!("about {time}")
-}
-
 #[cfg(test)]
 mod tests {
     use expect_test::expect;
@@ -141,24 +126,12 @@ mod tests {
 
     #[test]
     fn more_cores_and_less_to_learn_take_less_time() {
-        let time = |agent, cores| estimate(&config("paper", "procgen:bigfish", agent, &[]), cores);
+        let time =
+            |agent, cores| estimate_s(&config("paper", "procgen:bigfish", agent, &[]), cores);
         assert!(time("driml-ada", 4) < time("driml-ada", 2));
         let time = |agent| time(agent, 2);
         let ascending = ["c51", "driml-ada", "driml-fix", "cpc"].map(time);
         assert!(ascending.is_sorted(), "{ascending:?}");
         assert!(time("c51") < time("curl") && time("curl") < time("cpc"));
-    }
-
-    #[test]
-    fn estimates_are_not_precise() {
-        for (seconds, text) in [
-            (5, "under a minute"),
-            (600, "about 10 min"),
-            (7_300, "about 3 h"),
-            (90_000, "about 1 d 1 h"),
-            (86_400, "about 1 d"),
-        ] {
-            assert_eq!(format_estimate(Duration::from_secs(seconds)), text);
-        }
     }
 }

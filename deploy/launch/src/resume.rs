@@ -20,7 +20,7 @@ use driml_machine::{
     units::count,
 };
 use driml_protocol::Sampling;
-use driml_replay_server::RatioStart;
+use driml_replay_server::{RatioStart, kept_capacity};
 use driml_settings::{
     config::RunConfig,
     flags::{Flags, Source},
@@ -219,7 +219,7 @@ fn check_changes(
 ///
 /// # Errors
 /// The folder is not a run's, the settings cannot work, it has no checkpoint, or the run is still running.
-pub fn prepare(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Resumption> {
+pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> {
     let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
@@ -230,7 +230,7 @@ pub fn prepare(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::
     // Wait first: a run that is still exiting holds memory.
     wait_until_free(folder)?;
     let before = RunConfig::parse(&name, &text)?;
-    let mut config = Source::File(name, text).resolve(flags, machine)?;
+    let mut config = Source::File(name, text).resolve(flags, &Machine::detect())?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
     let (_, newest) = all.last().with_context(|| {
@@ -280,7 +280,9 @@ pub fn prepare(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::
              `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains it up to N frames"
         )));
     }
-    let replay_is_kept = lockstep || config.local.durable && folder.replay().is_dir();
+    let shards = config.replay.shards;
+    let has_log = |shard| kept_capacity(&folder.replay(), shard, shards).is_some();
+    let replay_is_kept = lockstep || config.local.durable && (0..shards).all(has_log);
     let alpha = |it: &RunConfig| match it.replay.sampling {
         Sampling::Prioritised { alpha, .. } => Some(alpha),
         Sampling::Uniform {} => None,

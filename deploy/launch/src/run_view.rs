@@ -26,6 +26,9 @@ pub struct Plan {
     /// Rows sampled per stored transition.
     pub(crate) replay_ratio_planned: f64,
     pub(crate) actors_planned: u32,
+    /// Replay servers of the run.
+    #[serde(skip)]
+    pub(crate) shards: u32,
     /// The schedule of the probability of a random action, common to all actors; none if they differ in it.
     #[serde(skip)]
     pub(crate) epsilon: Option<Schedule>,
@@ -46,6 +49,7 @@ impl Plan {
             updates_planned: config.updates(),
             replay_ratio_planned: config.replay.replay_ratio,
             actors_planned: config.local.actors,
+            shards: config.replay.shards,
             // Without a ladder, the schedule of actor 0 is the schedule of every actor.
             epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
             losses: config.learner.update.auxiliary_loss.loss_names(),

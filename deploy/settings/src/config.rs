@@ -88,19 +88,21 @@ impl RunConfig {
         published.weights_bytes(self.learner.publish_dtype)
     }
 
-    /// Returns the path of the first setting in `[world]` or `[run]` that differs in `other`: a run keeps them. Time-outs of a world do
-    /// not count, as they do not change the task.
+    /// Returns the path of the first setting of world, run or loss that differs in `other`: a run keeps them. Time-outs of a world do not
+    /// count, as they do not change the task.
     pub fn first_change_of_task(&self, other: &Self) -> Option<String> {
         let tables = [self, other].map(Self::to_table);
         let [before, after] = [0, 1].map(|at| BTreeMap::from_iter(leaves(&tables[at])));
         let differs = |path: &&String| before.get(*path) != after.get(*path);
         let is_kept = |path: &&String| !path.ends_with("_timeout_ms") && differs(path);
-        ["world.", "run."].into_iter().find_map(|table| {
-            let mut paths = before.keys().chain(after.keys());
-            paths
-                .find(|path| path.starts_with(table) && is_kept(path))
-                .cloned()
-        })
+        ["world.", "run.", "learner.update.auxiliary_loss"]
+            .into_iter()
+            .find_map(|table| {
+                let mut paths = before.keys().chain(after.keys());
+                paths
+                    .find(|path| path.starts_with(table) && is_kept(path))
+                    .cloned()
+            })
     }
 
     /// Reads every table into its component's Config. The derived settings must be in `table`.
@@ -159,7 +161,8 @@ impl RunConfig {
         let start = self.replay.ratio_start();
         let frames = self.frames().saturating_sub(start.transitions);
         let rows = frames as f64 * self.replay.replay_ratio;
-        start.updates + (rows / f64::from(self.learner.batch_size)) as u64
+        let updates = (rows / f64::from(self.learner.batch_size)) as u64;
+        start.updates.saturating_add(updates)
     }
 
     /// Returns these settings if they pass the checks of each component and those that span two tables.

@@ -1,9 +1,10 @@
 //! `driml actor`: one actor of a run.
 
 use clap::Args;
+use driml_envs::EnvError;
 use driml_launch::endpoint::check_connect_endpoints;
 use driml_machine::{error::usage, whole_number};
-use driml_protocol::{Shutdown, tls::Role};
+use driml_protocol::{Shutdown, config::ConfigError, tls::Role};
 use driml_settings::presets;
 
 use super::join::{JoinFlags, TlsFlags, clean_up_after, prepare_join};
@@ -62,5 +63,12 @@ pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
         envs: args.envs,
         world,
     };
-    clean_up_after(driml_actor::run(run, &shutdown))
+    clean_up_after(driml_actor::run(run, &shutdown).map_err(|e| {
+        // Another start would find the same settings.
+        let is_setting = matches!(e.downcast_ref(), Some(EnvError::Config(_)));
+        match is_setting || e.is::<ConfigError>() {
+            true => usage!("{e:#}").into(),
+            false => e,
+        }
+    }))
 }

@@ -10,7 +10,7 @@ use driml_launch::{
 };
 use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::{GracefulShutdown, tls::Role};
-use driml_replay_server::PersistError;
+use driml_replay_server::{PersistError, kept_capacity};
 use driml_settings::flags::{self, RunFlags};
 
 use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_after, prepare_join};
@@ -18,7 +18,7 @@ use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_afte
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
     /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. For other machines use
-    /// quic/HOST:PORT, such as quic/0.0.0.0:7447, with --tls-dir
+    /// quic/HOST:PORT, such as quic/[::]:7447, with --tls-dir
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) listen: Vec<String>,
     /// Router to connect to as well; not with --tls-dir, because a router does not apply the rules for roles, nor with several shards
@@ -48,6 +48,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;
     args.run.flags.server_alone = true;
+    keep_capacity(&mut args);
     let (config, _) = flags::resolve(&args.run, &Machine::detect())?;
     if config.replay.shards > 1 && !args.connect.is_empty() {
         let why = "replay shards behind one router would each store every transition: leave --connect out";
@@ -81,4 +82,18 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         Some(PersistError::Unusable(..)) => usage!("{e:#}").into(),
         _ => e,
     }))
+}
+
+/// Keeps the capacity of the log in the replay's folder, unless the user sets one: an earlier start may have found more free memory, and a
+/// smaller replay would delete transitions.
+fn keep_capacity(args: &mut ReplayServerArgs) {
+    const CAPACITY: &str = "replay.capacity_transitions=";
+    let flags = &mut args.run.flags;
+    let is_set = args.run.config.is_some() || flags.sets.iter().any(|it| it.starts_with(CAPACITY));
+    let shards = flags.replay_shards.unwrap_or(1);
+    if let Some(dir) = args.replay_dir.as_ref().filter(|_| !is_set)
+        && let Some(capacity) = kept_capacity(dir, args.shard, shards)
+    {
+        flags.sets.push(format!("{CAPACITY}{capacity}"));
+    }
 }

@@ -60,7 +60,7 @@ pub(crate) struct TrainArgs {
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
     /// Endpoint of the replay server [default: a unix socket in a fresh folder]; with --tls-dir, one for other machines, such as
-    /// quic/0.0.0.0:7447, while local processes use a unix socket
+    /// quic/[::]:7447, while local processes use a unix socket
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
     #[command(flatten)]
@@ -98,7 +98,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     let (config, from, resume_point) = match &args.resume {
         Some(folder) => {
-            let found = match resume::prepare(&RunFolder::new(folder), &args.run.flags, &machine)? {
+            let found = match resume::prepare(&RunFolder::new(folder), &args.run.flags)? {
                 Resumption::Done(sentence) => return console::print(&format!("{sentence}\n")),
                 Resumption::Resumed(found) => found,
             };

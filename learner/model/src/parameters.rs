@@ -130,7 +130,7 @@ impl Parameters {
             check_finite(name, &values)?;
             let bytes = dtype.encode(&values).map_err(|at| {
                 let why = format!(
-                    "is {} at index {at}, too large for {dtype}: set learner.publish_dtype to f32 or bf16",
+                    "is {} at index {at}, too large for {dtype}: learner.publish_dtype = \"f32\" or \"bf16\" publishes it",
                     values[at]
                 );
                 ModelError::parameter(name, why)

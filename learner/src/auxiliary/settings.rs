@@ -73,12 +73,12 @@ impl Lambda {
         }
     }
 
-    /// Checks that every weight is finite and not negative.
+    /// Checks that every weight is from 0 to 1e30.
     pub fn validate(&self) -> Result<(), UpdateError> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
-            if !(value >= 0.0 && value.is_finite()) {
+            if !(0.0..=1e30).contains(&value) {
                 return Err(UpdateError::Settings(format!(
-                    "lambda.{name} = {value}, which must be a finite number of at least 0"
+                    "lambda.{name} = {value}, which must be a number from 0 to 1e30"
                 )));
             }
         }

@@ -22,8 +22,10 @@ use rand_chacha::ChaCha8Rng;
 use super::shards::{PartialBatch, ShardState};
 use crate::run_counts::{BatchPart, RunCounts};
 
-/// Time-out of a request. A replay server replies within a second, if only that it has no batch yet.
+/// Time-out of a request at first. A replay server replies within a second, if only that it has no batch yet.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Longest time-out of a request, for batches over a slow link.
+const SLOW_REQUEST_TIMEOUT: Duration = Duration::from_secs(160);
 /// Pause before a retry when the replay server is unreachable.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// Pause before empty shards are asked again.
@@ -150,9 +152,18 @@ pub(super) struct Fetcher {
     /// Identifier of the next request for a whole batch.
     request_id: RequestId,
     rng: ChaCha8Rng,
+    /// Time-out of the next request: twice that of one that was lost, or twice the time that the last batch took.
+    timeout: Duration,
     /// Whether batches may come through shared memory.
     trust: Trust,
     log_limiter: LogLimiter,
+}
+
+/// A request for a batch, or for a shard's part of one, whose reply is awaited.
+struct SentRequest {
+    reply: PendingReply<BatchReply>,
+    shared_memory: bool,
+    sent: Instant,
 }
 
 impl Fetcher {
@@ -163,6 +174,7 @@ impl Fetcher {
             shared: shared.clone(),
             request_id: RequestId::first(rng.random()),
             rng,
+            timeout: REQUEST_TIMEOUT,
             trust: Trust::default(),
             log_limiter: LogLimiter::default(),
         }
@@ -175,9 +187,10 @@ impl Fetcher {
             1 => 1,
             _ => shared.requests.in_flight,
         };
-        let mut silence = Silence::with_try_timeout(REQUEST_TIMEOUT * turns);
+        let mut silence = Silence::default();
         while !self.shared.shutdown.is_set() {
             fail_point::reach("batches");
+            silence.set_try_timeout(self.timeout * turns);
             let fetched = self.fetch();
             let fetched = match fetched {
                 Ok(NextBatch::NotYet(_)) => {
@@ -378,7 +391,7 @@ impl Fetcher {
         id: RequestId,
         rows: u32,
         other_shards: Option<ShardCounts>,
-    ) -> anyhow::Result<(PendingReply<BatchReply>, bool)> {
+    ) -> anyhow::Result<SentRequest> {
         let request = BatchRequest {
             learner: self.shared.requests.learner_id,
             id,
@@ -388,28 +401,32 @@ impl Fetcher {
             other_shards,
         };
         let client = &self.shared.clients[shard];
-        let pending = client.send(client.encode(&request)?, REQUEST_TIMEOUT)?;
-        Ok((pending, request.shared_memory))
+        Ok(SentRequest {
+            reply: client.send(client.encode(&request)?, self.timeout)?,
+            shared_memory: request.shared_memory,
+            sent: Instant::now(),
+        })
     }
 
     /// Receives a shard's reply: a batch, or why there is none.
-    fn receive_reply(
-        &mut self,
-        (pending, shared_memory): (PendingReply<BatchReply>, bool),
-    ) -> anyhow::Result<Result<Batch, NotReady>> {
-        // A process that may not map shared memory never receives the reply: the request looks unanswered.
-        let (reply, payload) = pending.receive(&self.shared.pool).inspect_err(|e| {
-            let is_lost = matches!(
-                e,
-                SessionError::TimedOut { .. } | SessionError::NoResponder { .. }
-            );
+    fn receive_reply(&mut self, pending: SentRequest) -> anyhow::Result<Result<Batch, NotReady>> {
+        let (shared_memory, sent) = (pending.shared_memory, pending.sent);
+        let received = pending.reply.receive(&self.shared.pool);
+        let (reply, payload) = received.inspect_err(|e| {
+            let is_late = matches!(e, SessionError::TimedOut { .. });
+            let is_lost = is_late || matches!(e, SessionError::NoResponder { .. });
+            // A process that may not map shared memory never receives the reply: the request looks unanswered.
             if shared_memory && is_lost {
                 self.trust.record_loss();
+            } else if is_late {
+                self.timeout = (self.timeout * 2).min(SLOW_REQUEST_TIMEOUT);
             }
         })?;
         Ok(match reply {
             BatchReply::Batch(header) => {
                 self.trust.record_arrival(shared_memory);
+                let twice = 2 * sent.elapsed();
+                self.timeout = twice.clamp(REQUEST_TIMEOUT, SLOW_REQUEST_TIMEOUT);
                 Ok(Batch::from_payload(header, payload)?)
             }
             BatchReply::NotReady(not_ready) => {

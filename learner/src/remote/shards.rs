@@ -22,9 +22,19 @@ use crate::run_counts::{BatchPart, RunCounts};
 const COUNTS_AGE_MAX: Duration = Duration::from_millis(500);
 const EMPTY_COUNTS_AGE_MAX: Duration = Duration::from_millis(50);
 
+/// The settings that may differ between shards, beside the table `[local]`.
+const OF_THE_MACHINE: [(&str, &str); 4] = [
+    ("actor", "precision"),
+    ("learner", "precision"),
+    ("replay", "capacity_transitions"),
+    ("replay", "compressed_bytes_max"),
+];
+
 /// Sessions with all shards of a run, in the order of their numbers, and the run's settings.
 pub(crate) struct Shards {
     pub(crate) sessions: Vec<Session>,
+    /// Whether each shard already knows a learner of the run.
+    has_learner: Vec<bool>,
     pub(crate) config_toml: String,
 }
 
@@ -62,9 +72,13 @@ impl Shards {
         // When a learner joins again, its endpoints may have another order.
         let mut shards: Vec<_> = run_infos.iter().zip(sessions).collect();
         shards.sort_by_key(|(run_info, _)| run_info.shard.0);
-        let sessions = shards.into_iter().map(|(_, session)| session);
+        let shards = shards.into_iter();
+        let (has_learner, sessions) = shards
+            .map(|(it, session)| (it.has_learner, session))
+            .unzip();
         Ok(Some(Self {
-            sessions: sessions.collect(),
+            sessions,
+            has_learner,
             config_toml,
         }))
     }
@@ -89,7 +103,11 @@ impl Shards {
             weights_version: 0,
             _liveliness: Vec::new(),
         };
-        for (shard, client) in clients.iter().enumerate() {
+        // A shard that knows the run's learner rejects a wrong one, before a shard that was started anew accepts it.
+        let mut order = Vec::from_iter(0..clients.len());
+        order.sort_by_key(|&shard| !self.has_learner[shard]);
+        for shard in order {
+            let client = &clients[shard];
             // Declared before the learner joins, so that no other learner can take its place from then on.
             let alive = client.declare_alive(Peer::learner(learner));
             let alive = alive.map_err(|e| anyhow::anyhow!("declaring the learner alive: {e}"))?;
@@ -130,8 +148,9 @@ fn single_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Resul
         .context("no endpoint of a replay server was given")?;
     for (at, run_info) in run_infos.iter().enumerate() {
         let (endpoint, shard) = (&connect[at], run_info.shard.0);
+        let [ours, theirs] = [run_info, first].map(|it| shared_settings(&it.config_toml));
         ensure!(
-            run_info.config_toml == first.config_toml,
+            ours? == theirs?,
             "{endpoint} and {} are replay servers of runs with different settings: start both with the same",
             connect[0]
         );
@@ -149,6 +168,17 @@ fn single_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Resul
         run_infos.len()
     );
     Ok(first)
+}
+
+/// The settings that all shards must share: those that do not follow from the machine on which each server started.
+fn shared_settings(config_toml: &str) -> anyhow::Result<toml::Table> {
+    let mut shared: toml::Table = config_toml.parse()?;
+    shared.remove("local");
+    for (table, key) in OF_THE_MACHINE {
+        let table = shared.get_mut(table).and_then(toml::Value::as_table_mut);
+        table.and_then(|table| table.remove(key));
+    }
+    Ok(shared)
 }
 
 /// One shard's counts, and its part of the current batch.
@@ -427,13 +457,31 @@ mod tests {
         };
         let connect = ["a".to_owned(), "b".to_owned()];
         let said = |run_infos: &[RunInfo]| single_run(&connect, run_infos).unwrap_err().to_string();
-        assert!(
-            said(&[run_info("x", (0, 2)), run_info("y", (1, 2))]).contains("different settings")
-        );
-        assert!(said(&[run_info("x", (1, 2)), run_info("x", (1, 2))]).contains("both shard 1"));
-        assert!(said(&[run_info("x", (0, 3)), run_info("x", (1, 3))]).contains("has 3 shards"));
-        assert!(said(&[run_info("x", (0, 2))]).contains("has 2 shards"));
-        let whole = [run_info("x", (1, 2)), run_info("x", (0, 2))];
-        assert_eq!(single_run(&connect, &whole).unwrap().config_toml, "x");
+        let config = |precision: &str, capacity: u32, ratio: u32| {
+            format!(
+                "[local]\nactors = {capacity}\n[actor]\nprecision = {precision:?}\n[replay]\ncapacity_transitions = {capacity}\nreplay_ratio = {ratio}\n"
+            )
+        };
+        let [ours, theirs] = [config("f32", 7, 2), config("bf16", 9, 2)];
+        let other_run = config("f32", 7, 4);
+        for (infos, expected) in [
+            (
+                &[(&ours, (0, 2)), (&other_run, (1, 2))][..],
+                "different settings",
+            ),
+            (&[(&ours, (1, 2)), (&ours, (1, 2))], "both shard 1"),
+            (&[(&ours, (0, 3)), (&ours, (1, 3))], "has 3 shards"),
+            (&[(&ours, (0, 2))], "has 2 shards"),
+        ] {
+            let infos: Vec<_> = infos
+                .iter()
+                .map(|(it, shard)| run_info(it, *shard))
+                .collect();
+            let said = said(&infos);
+            assert!(said.contains(expected), "{said}");
+        }
+        // What follows from each server's machine may differ.
+        let whole = [run_info(&ours, (1, 2)), run_info(&theirs, (0, 2))];
+        assert_eq!(single_run(&connect, &whole).unwrap().config_toml, ours);
     }
 }

@@ -1,32 +1,52 @@
-//! Limits log lines that could come many times a second: the first of a kind at once, then at most one every 10 s with a count.
+//! Limits log lines that could come many times a second: the first of a kind at once, then at most one in each period, with a count.
 //! The caller writes the lines.
 
 use std::time::{Duration, Instant};
 
-/// The shortest time between two written lines of a kind.
-const PERIOD: Duration = Duration::from_secs(10);
-
 /// Decides which lines of one kind are written.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct LogLimiter {
+    /// The shortest time between two written lines.
+    period: Duration,
     last_written: Option<Instant>,
     suppressed: u64,
 }
 
+/// One line every 10 s.
+impl Default for LogLimiter {
+    fn default() -> Self {
+        Self::with_period(Duration::from_secs(10))
+    }
+}
+
 impl LogLimiter {
+    /// One line in each `period`.
+    pub const fn with_period(period: Duration) -> Self {
+        Self {
+            period,
+            last_written: None,
+            suppressed: 0,
+        }
+    }
+
+    /// Returns how many lines were left out since the last one, and counts them no longer.
+    pub const fn take_suppressed(&mut self) -> u64 {
+        std::mem::replace(&mut self.suppressed, 0)
+    }
+
     /// Returns `None` if a line must not be written now, else the text to append: how many like it were left out since the last, if any.
     pub fn admit(&mut self) -> Option<String> {
         self.admit_at(Instant::now())
     }
 
     fn admit_at(&mut self, now: Instant) -> Option<String> {
-        let is_fresh = |written| now.saturating_duration_since(written) < PERIOD;
+        let is_fresh = |written| now.saturating_duration_since(written) < self.period;
         if self.last_written.is_some_and(is_fresh) {
             self.suppressed += 1;
             return None;
         }
         self.last_written = Some(now);
-        Some(match std::mem::take(&mut self.suppressed) {
+        Some(match self.take_suppressed() {
             0 => String::new(),
             n => format!(" (and {n} more like this since the last such line)"),
         })
@@ -39,6 +59,7 @@ mod tests {
 
     #[test]
     fn the_first_line_comes_at_once_and_the_others_are_counted() {
+        const PERIOD: Duration = Duration::from_secs(10);
         let (mut limiter, start) = (LogLimiter::default(), Instant::now());
         assert_eq!(limiter.admit_at(start).as_deref(), Some(""));
         for _ in 0..3 {

@@ -18,6 +18,9 @@ const TICK: Duration = Duration::from_millis(50);
 /// Signals closer together count as one request to exit: tools such as `timeout` signal the process and its group.
 const SAME_REQUEST_MAX: Duration = Duration::from_millis(300);
 
+/// Exit code after Ctrl-C, as a shell has it.
+const INTERRUPTED: i32 = 130;
+
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]
 pub struct Shutdown {
@@ -89,17 +92,21 @@ pub struct GracefulShutdown {
 
 impl GracefulShutdown {
     /// Raises `drain` at any reason to exit, and `immediate` at SIGINT and SIGTERM, or without a `parent` at any reason. With a parent, its
-    /// death, SIGHUP and a closed stderr raise only `drain`, because the other processes then exit too.
+    /// death, SIGHUP and a closed stderr raise only `drain`, because the other processes then exit too. Without one, a second SIGINT or
+    /// SIGTERM exits the process at once.
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let flags = Self::default();
-        let raised = flags.clone();
+        let (raised, mut first) = (flags.clone(), None);
         termination::watch("signals", parent, move |reason| {
             raised.drain.set();
-            if reason == ExitReason::Abandoned && parent.is_some() {
-                return ControlFlow::Continue(());
+            if reason == ExitReason::Request || parent.is_none() {
+                raised.immediate.set();
             }
-            raised.immediate.set();
-            ControlFlow::Break(())
+            if parent.is_none() && is_repeated(reason, &mut first, Instant::now()) {
+                eprintln!("stopped at once by a second signal");
+                std::process::exit(INTERRUPTED);
+            }
+            ControlFlow::Continue(())
         })?;
         Ok(flags)
     }
@@ -117,13 +124,17 @@ impl GracefulShutdown {
 
     /// Handles a reason that came up at `now`. `first` is the time of the first one.
     fn handle_reason(&self, reason: ExitReason, first: &mut Option<Instant>, now: Instant) {
-        let first = *first.get_or_insert(now);
         self.drain.set();
-        // A closed terminal causes SIGHUP and then other reasons, but no user there asks for a faster exit.
-        if reason == ExitReason::Request && now - first > SAME_REQUEST_MAX {
+        if is_repeated(reason, first, now) {
             self.immediate.set();
         }
     }
+}
+
+/// Whether a person asks again to exit. A closed terminal causes SIGHUP and then other reasons, but no user there asks for a faster exit.
+fn is_repeated(reason: ExitReason, first: &mut Option<Instant>, now: Instant) -> bool {
+    let first = *first.get_or_insert(now);
+    reason == ExitReason::Request && now - first > SAME_REQUEST_MAX
 }
 
 /// Waits until all of `threads` have ended, for at most `wait_max`.

@@ -39,6 +39,11 @@ impl Silence {
         }
     }
 
+    /// Changes the time-out of the attempts.
+    pub fn set_try_timeout(&mut self, try_timeout: Duration) {
+        self.gap_max = GAP_MAX + try_timeout;
+    }
+
     /// Records an answer: the silence begins again.
     pub fn record_answer(&mut self) {
         (self.length, self.last_attempt) = (Duration::ZERO, Instant::now());

@@ -192,7 +192,12 @@ fn open_with_settings(
             true => format!(
                 "no replay server accepts this process at {connect}: is it running, with --tls-dir, and is the endpoint right (its port is \
                  one of UDP)? If so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay \
-                 server's log say why"
+                 server's log say why{}",
+                endpoints
+                    .connect
+                    .iter()
+                    .find_map(|it| reach::ipv6_hint(it))
+                    .unwrap_or_default()
             ),
             false => format!(
                 "something listens on {connect} that is not driml ({what}): is the endpoint right? If it is, its process may be suspended"

@@ -12,7 +12,7 @@ use std::{
 use driml_protocol::{PROTOCOL_VERSION, RunSpec, TRANSITION_BYTES, atomic_write, codec, lock_file};
 use serde::{Deserialize, Serialize};
 
-use super::{record, snapshot::Snapshot};
+use super::{record, shard_dir, snapshot::Snapshot};
 use crate::config::{Config, SEGMENT_BYTES_MIN};
 
 /// Format of the log (thousands) and of the messages in it (ones). A log of another format is rejected.
@@ -145,7 +145,7 @@ impl ReplayFolder {
         };
         let known = match folder.read_id()? {
             Some(id) => Some(id),
-            None => folder.find_id()?,
+            None => newest_header(path)?.map(|it| it.log),
         };
         if let Some(known) = known {
             folder.check_same_run(&known)?;
@@ -155,28 +155,11 @@ impl ReplayFolder {
     }
 
     pub(super) fn segment_path(&self, number: u64) -> PathBuf {
-        self.path.join(format!("segment-{number:012}.log"))
+        segment_path(&self.path, number)
     }
 
     pub(super) fn segment_numbers(&self) -> Result<Vec<u64>, PersistError> {
-        let number = |entry: io::Result<fs::DirEntry>| {
-            let name = entry?.file_name();
-            let name = name.to_str();
-            let digits = name.and_then(|it| it.strip_prefix("segment-")?.strip_suffix(".log"));
-            let number = digits.and_then(|digits| digits.parse().ok());
-            // Ignores a copy named without the leading zeros, as its number is another segment's.
-            let is_own = |&number: &u64| {
-                let own = self.segment_path(number);
-                number <= SEGMENT_NUMBER_MAX && own.file_name().and_then(OsStr::to_str) == name
-            };
-            Ok(number.filter(is_own))
-        };
-        let numbers = fs::read_dir(&self.path)
-            .and_then(|entries| entries.map(number).collect::<io::Result<Vec<_>>>())
-            .map_err(io_error("listing", &self.path))?;
-        let mut numbers: Vec<_> = numbers.into_iter().flatten().collect();
-        numbers.sort_unstable();
-        Ok(numbers)
+        segment_numbers(&self.path)
     }
 
     pub(super) fn read_segment(&self, number: u64) -> Result<Vec<u8>, PersistError> {
@@ -212,18 +195,6 @@ impl ReplayFolder {
         })
     }
 
-    /// Returns the identity of the log from the newest segment that can be read; `None` if none can.
-    fn find_id(&self) -> Result<Option<LogId>, PersistError> {
-        for number in self.segment_numbers()?.into_iter().rev() {
-            if let Ok(record) = record::read_first(&self.read_segment(number)?)
-                && let Ok(header) = codec::decode_value::<SegmentHeader>(record.body)
-            {
-                return Ok(Some(header.log));
-            }
-        }
-        Ok(None)
-    }
-
     pub(super) fn write_id(&self) -> Result<(), PersistError> {
         let path = self.path.join(ID_FILE);
         let text = toml::to_string(&self.id).expect("a struct of numbers is TOML");
@@ -255,6 +226,52 @@ impl ReplayFolder {
             "holds the replay of another run ({why}): use that run's settings, or choose another --replay-dir"
         ))
     }
+}
+
+/// Returns the capacity of the whole replay whose log for shard `shard` of `shards` is in `dir`, as of the newest segment; `None` if there is no
+/// log that can be read.
+pub fn kept_capacity(dir: &Path, shard: u32, shards: u32) -> Option<u64> {
+    let newest = newest_header(&shard_dir(dir, shard, shards)).ok()??;
+    Some(newest.snapshot.capacity.saturating_mul(shards.into()))
+}
+
+fn segment_path(folder: &Path, number: u64) -> PathBuf {
+    folder.join(format!("segment-{number:012}.log"))
+}
+
+fn segment_numbers(folder: &Path) -> Result<Vec<u64>, PersistError> {
+    let number = |entry: io::Result<fs::DirEntry>| {
+        let name = entry?.file_name();
+        let name = name.to_str();
+        let digits = name.and_then(|it| it.strip_prefix("segment-")?.strip_suffix(".log"));
+        let number = digits.and_then(|digits| digits.parse().ok());
+        // Ignores a copy named without the leading zeros, as its number is another segment's.
+        let is_own = |&number: &u64| {
+            let own = segment_path(folder, number);
+            number <= SEGMENT_NUMBER_MAX && own.file_name().and_then(OsStr::to_str) == name
+        };
+        Ok(number.filter(is_own))
+    };
+    let numbers = fs::read_dir(folder)
+        .and_then(|entries| entries.map(number).collect::<io::Result<Vec<_>>>())
+        .map_err(io_error("listing", folder))?;
+    let mut numbers: Vec<_> = numbers.into_iter().flatten().collect();
+    numbers.sort_unstable();
+    Ok(numbers)
+}
+
+/// Returns the header of the newest segment whose header can be read; `None` if there is none.
+fn newest_header(folder: &Path) -> Result<Option<SegmentHeader>, PersistError> {
+    for number in segment_numbers(folder)?.into_iter().rev() {
+        let path = segment_path(folder, number);
+        let bytes = fs::read(&path).map_err(io_error("reading", &path))?;
+        if let Ok(record) = record::read_first(&bytes)
+            && let Ok(header) = codec::decode_value(record.body)
+        {
+            return Ok(Some(header));
+        }
+    }
+    Ok(None)
 }
 
 /// Returns the size of a segment, the disk budget of the shard, and the period between flushes.

@@ -90,7 +90,14 @@ pub(super) fn recover(
     replay: &mut Replay,
     control: &RecoveryControl,
 ) -> Result<(LogPosition, RecoveryReport), PersistError> {
-    let numbers = folder.segment_numbers()?;
+    let mut numbers = folder.segment_numbers()?;
+    // After a power cut, segments may be empty that were begun after the last one with records.
+    while let [_, .., last] = numbers[..]
+        && folder.read_segment(last)?.iter().all(|byte| *byte == 0)
+    {
+        folder.remove_segment(last)?;
+        numbers.pop();
+    }
     let packer = replay.packer();
     replay.is_recovering = true;
     let mut reader = LogReader {

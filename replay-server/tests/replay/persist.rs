@@ -9,7 +9,7 @@ use std::{
 use driml_protocol::{Batch, Buffer, Horizon, RequestId, RunSpec, Shutdown};
 use driml_replay_server::{
     Compression, Config, PersistArgs, PersistError, RecoveryControl, RecoveryReport, Replay,
-    ReplayFolder,
+    ReplayFolder, kept_capacity,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -267,6 +267,11 @@ proptest! {
                     fs::remove_file(later).unwrap();
                 }
             }
+            if seed % 2 == 0 {
+                // The power failed, and the next segment was begun.
+                let number: u64 = path.file_stem().unwrap().to_str().unwrap()[8..].parse().unwrap();
+                fs::write(torn.join(format!("segment-{:012}.log", number + 1)), "").unwrap();
+            }
             // Skips cases in which this write removed segments, which would still exist if it had not completed.
             for older in &known {
                 let kept = torn.join(older.file_name().unwrap());
@@ -283,6 +288,16 @@ proptest! {
         prop_assert_eq!(stored(&replay), after);
         check_continues(&setup, replay);
     }
+}
+
+#[test]
+fn a_log_tells_its_capacity() {
+    let root = tempfile::tempdir().unwrap();
+    let dir = root.path().join("ring");
+    assert_eq!(kept_capacity(&dir, 0, 1), None);
+    let setup = StoredReplay::begin(&dir, Config::unlimited(100), 2_000, 5);
+    drop(setup);
+    assert_eq!(kept_capacity(&dir, 0, 1), Some(100));
 }
 
 #[test]

@@ -301,7 +301,7 @@ impl Queue {
         if !is_resumable {
             return Ok(None);
         }
-        match resume::prepare(&folder, &Flags::default(), &Machine::detect())? {
+        match resume::prepare(&folder, &Flags::default())? {
             Resumption::Done(sentence) => {
                 progress.line(&sentence);
                 Ok(None)

@@ -33,7 +33,7 @@ use crate::{
 const POLL: Duration = Duration::from_secs(1);
 /// How long the replay servers or the learner may leave requests unanswered, also after their start, before the run fails.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
-/// How long a run may make no progress before it fails.
+/// How long a run may make no progress before it fails, or longer if its world may take longer.
 const STALL_MAX: Duration = Duration::from_secs(600);
 /// How long actors may take to deliver their transitions, once they are not needed or told to stop.
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
@@ -156,6 +156,8 @@ impl Launch<'_> {
 
     fn watch(&mut self) -> anyhow::Result<Outcome> {
         let (mut standstill, mut work_before) = (Silence::default(), (0, 0));
+        let steps = self.config.actor.steps_per_chunk;
+        let stall_max = STALL_MAX.max(self.config.world.steps_time_max(steps));
         loop {
             if self.shutdown.drain.wait_timeout(POLL) {
                 return Ok(Outcome::Interrupted);
@@ -196,10 +198,10 @@ impl Launch<'_> {
             if work != work_before || view.recovering().next().is_some() {
                 standstill.record_answer();
                 work_before = work;
-            } else if standstill.record_failure() > STALL_MAX {
+            } else if standstill.record_failure() > stall_max {
                 bail!(
                     "no frame and no update for {}, at {} and {} ({}): see {}",
-                    duration(STALL_MAX),
+                    duration(stall_max),
                     count(view.replay.transitions_inserted, "frame"),
                     count(view.learner.updates, "update"),
                     view.replay.waiting,

@@ -45,9 +45,13 @@ pub fn run(
     exit_on_second_interrupt(immediate)?;
     let mut schedule = EvaluationSchedule::new(config, run_dir)?;
     let events = config.local.tensorboard;
+    // A state that does not fit the settings is an error before the folder changes.
+    let restored = resumed
+        .map(|_| Lockstep::resume(config, run_dir))
+        .transpose()?;
     let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed, events)?;
-    let mut lockstep = match resumed {
-        Some(_) => Lockstep::resume(config, run_dir)?,
+    let mut lockstep = match restored {
+        Some(restored) => restored,
         None => Lockstep::begin(config, run_dir)?,
     };
     let point = resumed.unwrap_or_default();

@@ -151,10 +151,11 @@ impl Candidate {
             best.updates == row.updates
                 || row.episodes >= best.episodes && row.mean_return > best.mean_return
         });
+        // First, because a kept checkpoint without a row would not count as the best.
+        row.append_to(folder)?;
         if is_best {
             self.replace_best(&folder.best())?;
         }
-        row.append_to(folder)?;
         Ok(is_best)
     }
 

@@ -130,7 +130,7 @@ impl RunFolder {
         };
         let saved = checkpoint::list(&self.checkpoints());
         let entries: Vec<_> = entries.flatten().collect();
-        entries.is_empty()
+        entries.iter().all(|it| it.path() == self.lock_file())
             || entries.iter().all(is_run_file)
                 && self.config().exists()
                 && !tables.iter().any(has_frames)
@@ -218,10 +218,12 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let write = |path: PathBuf, text: &str| fs::write(path, text).unwrap();
+        // As on a full disk, where settings cannot be written.
+        write(folder.lock_file(), "");
+        assert!(folder.check_free().is_ok());
         write(folder.config(), "[run]\n");
         write(folder.metrics(), "seconds,frames\n0.5,0\n");
         write(folder.episodes(), "seconds,frames\n");
-        write(root.path().join(".lock"), "");
         write(folder.summary(), "{}");
         fs::create_dir_all(folder.logs()).unwrap();
         fs::create_dir_all(folder.checkpoints()).unwrap();

@@ -67,9 +67,11 @@ impl RunRecorder {
                 let rows = Vec::new();
                 (Table { header, rows }, 0.0)
             }
-            Some(point) => rows_up_to(&folder.metrics(), header, point)?,
+            Some(point) => {
+                let (rows, seconds) = rows_up_to(&folder.metrics(), header, point)?;
+                (rows, seconds.max(seconds_before))
+            }
         };
-        let seconds = seconds.max(seconds_before);
         let unknown = kept.map(|it| it.episodes);
         let episodes = TrainingEpisodes::open(folder, resumed.map(|it| it.frames), unknown)?;
         if resumed.is_some() {

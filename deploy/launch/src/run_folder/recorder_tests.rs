@@ -105,6 +105,20 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 }
 
 #[test]
+fn the_time_of_a_failed_start_is_not_that_of_the_next_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunFolder::new(folder.path().join("run"));
+    let failed = open(&run, &[], None).unwrap();
+    let failed = failed.summarise(Outcome::Failed, &mut RunView::default());
+    let summary = Summary {
+        wall_seconds: 120.0,
+        ..failed
+    };
+    summary.write(&run).unwrap();
+    assert!(open(&run, &[], None).unwrap().seconds() < 60.0);
+}
+
+#[test]
 fn a_resumed_run_continues_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));

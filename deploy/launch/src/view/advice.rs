@@ -43,6 +43,7 @@ pub(super) fn limiter_waits(view: &RunView) -> Vec<String> {
 pub(crate) fn actions_needed(view: &RunView) -> Vec<String> {
     let servers = view.servers.iter().filter(|_| !view.is_over());
     let mut needed: Vec<_> = servers.filter_map(server_action).collect();
+    needed.extend(missing_shards(view));
     needed.extend(server_statuses(view).filter_map(disk_action));
     if !view.is_over() && server_statuses(view).next().is_some() {
         needed.extend(learner_action(view));
@@ -51,6 +52,14 @@ pub(crate) fn actions_needed(view: &RunView) -> Vec<String> {
         }
     }
     needed
+}
+
+/// A message if the view is not that of the whole replay.
+pub(crate) fn missing_shards(view: &RunView) -> Option<String> {
+    let (given, shards) = (view.servers.len(), view.plan.shards as usize);
+    (0 < given && given < shards).then(|| {
+        format!("the run's replay has {shards} shards, and these are the numbers of {given}: give --connect once for each shard")
+    })
 }
 
 fn server_action(server: &ServerAnswer) -> Option<String> {

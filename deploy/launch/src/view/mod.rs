@@ -7,7 +7,7 @@ mod page;
 mod poll;
 
 pub(crate) use self::{
-    advice::{actions_needed, describe_recovery},
+    advice::{actions_needed, describe_recovery, missing_shards},
     export::{run_json, write_prometheus},
     live::Display,
     page::status_page,

@@ -1,7 +1,10 @@
 //! The poller: asks the processes of a run for their status, as any client could, and keeps the answers in a [`RunView`].
 //! This module judges nothing and changes nothing.
 
-use std::time::{Duration, Instant};
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Usage, usage};
@@ -78,17 +81,25 @@ impl Poller {
         let keys = Keys::new(namespace).map_err(Usage)?;
         let mut servers = Vec::new();
         let mut config: Option<RunConfig> = None;
+        let mut shards = BTreeMap::new();
         for endpoint in endpoints {
             let server = Endpoints::connect_to(vec![endpoint.clone()]);
             // An observer does not wait for a server that does not listen yet.
             reach::check_listening(endpoint)?;
             let session = session::open_as(&server, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
-            let served = fetch_settings(&session, &keys, endpoint, namespace)?;
+            let (served, shard) = fetch_settings(&session, &keys, endpoint, namespace)?;
             let hash = served.run.hash();
             if config.get_or_insert(served).run.hash() != hash {
                 bail!(usage!(
                     "{} and {endpoint} belong to different runs: give the endpoints of one run",
                     endpoints[0]
+                ));
+            }
+            if let Some(shard) = shard
+                && let Some(earlier) = shards.insert(shard, endpoint)
+            {
+                bail!(usage!(
+                    "{earlier} and {endpoint} are both shard {shard}: give each endpoint once"
                 ));
             }
             servers.push(ServerConnection {
@@ -210,15 +221,16 @@ impl ServerConnection {
 }
 
 /// The settings that a replay server reports, also while it reads its replay back from disk.
+/// Returns the run's settings and the server's shard, which is not known while the server reads its replay back.
 fn fetch_settings(
     session: &Session,
     keys: &Keys,
     endpoint: &str,
     namespace: &str,
-) -> anyhow::Result<RunConfig> {
-    let config_toml = match join::fetch_run_info_once(session, keys, ANSWER_MAX) {
-        Ok(run_info) => run_info.config_toml,
-        Err(SessionError::Recovering(recovering)) => recovering.config_toml,
+) -> anyhow::Result<(RunConfig, Option<u32>)> {
+    let (config_toml, shard) = match join::fetch_run_info_once(session, keys, ANSWER_MAX) {
+        Ok(run_info) => (run_info.config_toml, Some(run_info.shard.0)),
+        Err(SessionError::Recovering(recovering)) => (recovering.config_toml, None),
         Err(SessionError::Unreadable { why, .. }) => {
             return Err(why).context(format!(
                 "reading the run info of the replay server on {endpoint}"
@@ -234,10 +246,8 @@ fn fetch_settings(
             return Err(anyhow::Error::new(other).context(what));
         }
     };
-    Ok(RunConfig::parse(
-        "the replay server's settings",
-        &config_toml,
-    )?)
+    let config = RunConfig::parse("the replay server's settings", &config_toml)?;
+    Ok((config, shard))
 }
 
 #[cfg(test)]

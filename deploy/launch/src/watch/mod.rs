@@ -10,7 +10,10 @@ use std::{
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use driml_machine::{error::Interrupted, units::count};
+use driml_machine::{
+    error::{Interrupted, usage},
+    units::count,
+};
 use driml_protocol::{LogLimiter, Shutdown, reach};
 use serde::Serialize;
 
@@ -23,7 +26,10 @@ use crate::{
     run_folder::{
         Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_progress,
     },
-    view::{Poller, actions_needed, describe_recovery, run_json, status_page, write_prometheus},
+    view::{
+        Poller, actions_needed, describe_recovery, missing_shards, run_json, status_page,
+        write_prometheus,
+    },
 };
 
 /// What `driml watch` does with a run.
@@ -169,6 +175,9 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     if is_unknown || poller.view.recovering().next().is_some() {
         // Before that, it is not known what the run has done so far.
         wait_until_known(&mut poller, flags.prometheus.as_deref(), &interrupted)?;
+    }
+    if let Some(missing) = missing_shards(&poller.view) {
+        bail!(usage!("{missing}"));
     }
     let mut watched = WatchedRun::new(&poller, folder.as_ref(), flags.tensorboard)?;
     let mut has_warned = false;

@@ -308,6 +308,10 @@ fn a_setting_that_makes_another_task_is_named() {
         (&["learner.batch_size=32"][..], None),
         (&["run.gamma=0.5"], Some("run.gamma")),
         (
+            &["learner.update.auxiliary_loss=curl"],
+            Some("learner.update.auxiliary_loss"),
+        ),
+        (
             &["run.gamma=0.5", "world.step_limit=77"],
             Some("world.step_limit"),
         ),

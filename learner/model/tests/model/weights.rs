@@ -200,6 +200,6 @@ fn a_weight_that_is_too_large_for_its_type_is_named() {
     weight.set(&large).unwrap();
     let error = parameters.to_safetensors_as(WeightDtype::F16, |_| true);
     let said = error.unwrap_err().to_string();
-    let words = "head.weight: is 100000 at index 0, too large for f16: set learner.publish_dtype";
+    let words = "head.weight: is 100000 at index 0, too large for f16: learner.publish_dtype";
     assert!(said.contains(words), "{said}");
 }

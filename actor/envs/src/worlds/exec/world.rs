@@ -255,6 +255,10 @@ impl WorldSettings for ExecConfig {
         Ok(())
     }
 
+    fn steps_time_max(&self, steps: u32) -> Duration {
+        Duration::from_millis(self.start_timeout_ms + u64::from(steps) * self.step_timeout_ms)
+    }
+
     /// `height` x `width` x `channels`.
     fn frame_shape(&self) -> FrameShape {
         FrameShape::new(self.height, self.width, self.channels)
