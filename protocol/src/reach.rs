@@ -121,7 +121,7 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
             return Err(e);
         }
         if waited > CONNECT_TIMEOUT && !std::mem::replace(&mut is_logged, true) {
-            tracing::info!("waiting for {} s: {e}", wait_max.as_secs());
+            tracing::info!("waiting up to {} s: {e}", wait_max.as_secs());
         }
         std::thread::sleep(pause);
         pause = (pause * 2).min(pause_max);

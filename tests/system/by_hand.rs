@@ -138,7 +138,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         client.wait_for_replay("a waiting learner", |replay| {
             replay.waiting == Waiting::LearnerWaitsForActors
         });
-        ends(learner, "saved run/checkpoints/checkpoint-").expect_stderr("finished after ");
+        ends(learner, "saved run/checkpoints/checkpoint-").expect_stderr("stopped after ");
         assert!(!system.run_folder("run").checkpoints().is_empty());
         drop(client);
         ends(server, "replay server stops");

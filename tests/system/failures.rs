@@ -117,7 +117,7 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
     system.wait_until_all_have_ended();
     for (role, words) in [
         ("actor", "actor 0 leaves: "),
-        ("learner", "finished after "),
+        ("learner", "stopped after "),
         ("server", "told to stop; processes still connected: 0"),
     ] {
         let stderr = system.read(role);

@@ -147,7 +147,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     // The text output is that of `driml status`.
     system
         .run_ok(&watch_once)
-        .expect_stdout("the run is over: everything is learned and saved");
+        .expect_stdout("the run is over: all updates are made and saved");
     // A watcher that records nothing does not know how long a resumed run took.
     system
         .run_ok(&system.connect_args("watch"))

@@ -97,7 +97,7 @@ pub(crate) fn run_pip(python: &str, arguments: &[&str]) -> Result<Output, Procge
     command.envs([("PIP_USER", "0"), ("PIP_REQUIRE_VIRTUALENV", "0")]);
     let missing = |what: &str| {
         let text = format!(
-            "{what} is not installed; install Python and pip (`apt-get install python3-pip`, `dnf install python3-pip`)"
+            "{what} is not installed; install Python and pip (`apt-get install python3-pip`, `dnf install python3-pip`, in a virtual environment `python3 -m ensurepip`)"
         );
         Err(ProcgenError::Fetch(text))
     };
@@ -106,7 +106,7 @@ pub(crate) fn run_pip(python: &str, arguments: &[&str]) -> Result<Output, Procge
         // The exit status of a shell that finds no Python, or of a launcher that finds none.
         Ok(output) if output.status.code() == Some(127) => missing(python),
         Ok(output) if String::from_utf8_lossy(&output.stderr).contains("No module named pip") => {
-            missing("pip (in a virtual environment: `python3 -m ensurepip`)")
+            missing("pip")
         }
         Ok(output) => Ok(output),
     }

@@ -48,6 +48,10 @@ pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Res
     let share = 100.0 * computing / (computing + waiting);
     let updates = per_second(&samples, |it| it.learner.updates);
     let frames = per_second(&samples, |it| it.replay.transitions_inserted);
+    ensure!(
+        frames > 0.0,
+        "all frames were stored before the measurement began: add --frames with a larger number"
+    );
     let computes = "share of its time in which the learner computes";
     let figures = &mut bench.figures;
     figures.record("updates", updates, "updates/s");

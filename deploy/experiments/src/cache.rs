@@ -11,7 +11,7 @@ use std::{
 use anyhow::{Context, bail, ensure};
 use driml_figure::{Figure, Format, Look};
 use driml_launch::{
-    console::{self, print},
+    console::{self, print_wrapped},
     output,
 };
 use driml_machine::{
@@ -273,7 +273,7 @@ impl Session {
         let text = render_page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
         output::write_file("--out", &path, text.as_bytes())?;
-        print(&format!("{}{}\n", summary(&text), path.display()))?;
+        print_wrapped(&format!("{}{}\n", summary(&text), path.display()), 2)?;
         self.check_none_missing()
     }
 }

@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use driml_launch::console::Screen;
+use driml_launch::console::{Screen, wrap};
 use driml_machine::{error::Interrupted, units::rough_duration};
 use driml_protocol::GracefulShutdown;
 
@@ -97,7 +97,7 @@ impl Progress {
         let (task, percent) = (&self.task, 100 * self.done / self.total.max(1));
         let done = self.done.min(self.total);
         self.screen.show(done, |beside_bar| match beside_bar {
-            true => format!("{task}, {left}"),
+            true => wrap(&format!("{task}, {left}"), " ", 0),
             false => format!("{percent:>3}%  {task}, {left}"),
         });
     }

@@ -25,10 +25,11 @@ const DRAWS_PER_SECOND: u8 = 20;
 /// How often progress is printed as a plain line without a progress bar.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 
-/// Writes a line to stderr. A line that cannot be written is dropped, as the run continues after a closed pipe or on a full disk.
+/// Writes a line to stderr, wrapped at words on a terminal. A line that cannot be written is dropped, as the run continues after a closed
+/// pipe or on a full disk.
 pub fn eprintln(text: &str) {
     // A single write, so that lines of several threads do not mix.
-    let _ = stderr().write_all(format!("{text}\n").as_bytes());
+    let _ = stderr().write_all(format!("{}\n", wrap(text, " ", 2)).as_bytes());
 }
 
 /// Writes a command's result to stdout; a closed pipe is not an error.
@@ -64,7 +65,7 @@ pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
 
 /// Breaks the lines of `text` at `separator`, so that no line is wider than the terminal where that is possible. A wrapped line
 /// continues after `indent` blanks.
-pub(crate) fn wrap(text: &str, separator: &str, indent: usize) -> String {
+pub fn wrap(text: &str, separator: &str, indent: usize) -> String {
     let size = Term::stderr().size_checked();
     let width = size.map_or(usize::MAX, |it| it.1.into());
     wrap_to(text, separator, indent, width)

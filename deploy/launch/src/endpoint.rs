@@ -3,9 +3,10 @@
 
 use std::{
     fs,
-    io::ErrorKind,
+    io::{Error, ErrorKind},
     net::{TcpListener, ToSocketAddrs, UdpSocket},
     os::unix::fs::FileTypeExt,
+    path::Path,
     time::{Duration, Instant},
 };
 
@@ -76,17 +77,28 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
                  --connect for all others"
             ));
         }
-        let is_used = match endpoint.split_once('/') {
-            Some(("tcp", address)) => is_taken(TcpListener::bind(address)),
-            Some(("quic", address)) => is_taken(UdpSocket::bind(address)),
-            _ => reach::check_listening(endpoint).is_ok(),
+        let folder = path.and_then(|path| Path::new(path).parent());
+        let folder = folder.filter(|it| !it.as_os_str().is_empty());
+        let bound = match endpoint.split_once('/') {
+            Some(("tcp", address)) => TcpListener::bind(address).map(drop),
+            Some(("quic", address)) => UdpSocket::bind(address).map(drop),
+            _ if folder.is_some_and(|it| !it.is_dir()) => {
+                Err(Error::other("there is no such folder"))
+            }
+            _ => match reach::check_listening(endpoint) {
+                Ok(()) => Err(ErrorKind::AddrInUse.into()),
+                Err(_) => Ok(()),
+            },
         };
-        if is_used {
-            return Err(usage!(
+        bound.map_err(|e| match e.kind() {
+            ErrorKind::AddrInUse => usage!(
                 "cannot listen on {endpoint}: another process listens there. Stop it, or choose another port or path, with --listen for this \
                  command and --connect for all others"
-            ));
-        }
+            ),
+            _ => usage!(
+                "cannot listen on {endpoint}: {e}; choose an address of this machine, such as 127.0.0.1 or 0.0.0.0, or a path in an existing folder"
+            ),
+        })?;
     }
     Ok(())
 }
@@ -108,10 +120,6 @@ pub fn wait_until_listening(
         }
     }
     Ok(true)
-}
-
-fn is_taken<T>(bound: std::io::Result<T>) -> bool {
-    bound.is_err_and(|e| e.kind() == ErrorKind::AddrInUse)
 }
 
 fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {

@@ -86,7 +86,7 @@ fn load_bytes(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
     }
     let model = config.model.without_dim();
     let network = Parameters::load_safetensors(&model, bytes, &Compute::CPU.device)
-        .with_context(|| format!("{name} does not have the weights of its settings"))?;
+        .with_context(|| usage!("{name} does not have the weights of its settings"))?;
     Ok(Player {
         config,
         network,

@@ -223,9 +223,7 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
     let path = folder.config();
     let name = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| {
-        usage!(
-            "reading the settings {name}: {e}; --resume takes the folder of a run that was interrupted"
-        )
+        usage!("reading the settings {name}: {e}; --resume takes the folder of a run")
     })?;
     // Wait first: a run that is still exiting holds memory.
     wait_until_free(folder)?;

@@ -283,10 +283,14 @@ impl RunView {
         self.is_finished() || self.servers_ended() && self.replay.waiting == Waiting::Finished
     }
 
-    /// Seconds since the run began, by the clocks of its replay servers.
+    /// Seconds since the run began, or that it took, by the clocks of its replay servers.
     pub(crate) fn uptime_s(&self) -> Option<f64> {
         let processes = self.servers.iter().filter_map(|it| it.processes.as_ref());
-        processes.map(|it| it.up_s).reduce(f64::max)
+        let ran_s = |it: &ProcessesStatus| match it.waiting {
+            Waiting::Finished => it.up_s - it.waiting_s,
+            _ => it.up_s,
+        };
+        processes.map(ran_s).reduce(f64::max)
     }
 
     /// The learner's status if it answers, or its last status if no process is left to ask.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_launch::console::print;
+use driml_launch::console::{print, print_wrapped};
 use driml_machine::doctor;
 
 #[derive(Debug, Args)]
@@ -24,9 +24,9 @@ pub(crate) struct DoctorArgs {
 
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
-    print(&match args.json {
-        true => report.json()?,
-        false => report.describe(),
-    })?;
+    match args.json {
+        true => print(&report.json()?)?,
+        false => print_wrapped(&report.describe(), 4)?,
+    }
     report.check(args.cuda)
 }

@@ -1,7 +1,7 @@
 //! `driml presets`: lists worlds, agents and presets, or prints all settings of one game and agent with their sources.
 
 use clap::Args;
-use driml_launch::console::print;
+use driml_launch::console::{print, print_wrapped};
 use driml_settings::{menu, presets::Choice};
 
 #[derive(Debug, Args)]
@@ -20,7 +20,7 @@ pub(crate) struct PresetsArgs {
 /// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` accepts.
 pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.env.is_none() && args.agent.is_none() && args.preset.is_none() {
-        return print(&menu::menu()?);
+        return print_wrapped(&menu::menu()?, 4);
     }
     let names = [&args.preset, &args.env, &args.agent];
     let [preset, env, agent] = names.map(Option::as_deref);

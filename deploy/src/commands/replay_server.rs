@@ -8,7 +8,7 @@ use driml_launch::{
     open_files,
     output::check_folder,
 };
-use driml_machine::{error::usage, resources::Machine};
+use driml_machine::{error::usage, resources::Machine, units::count};
 use driml_protocol::{GracefulShutdown, tls::Role};
 use driml_replay_server::{PersistError, kept_capacity};
 use driml_settings::flags::{self, RunFlags};
@@ -50,7 +50,13 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     args.run.flags.server_alone = true;
     keep_capacity(&mut args);
     let (config, _) = flags::resolve(&args.run, &Machine::detect())?;
-    if config.replay.shards > 1 && !args.connect.is_empty() {
+    let (shard, shards) = (args.shard, config.replay.shards);
+    if shard >= shards {
+        let shards = count(shards, "replay shard");
+        let why = "which --replay-shards sets; the first is 0";
+        return Err(usage!("--shard {shard} does not exist: the run has {shards}, {why}").into());
+    }
+    if shards > 1 && !args.connect.is_empty() {
         let why = "replay shards behind one router would each store every transition: leave --connect out";
         return Err(usage!("{why}").into());
     }

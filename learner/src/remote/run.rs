@@ -168,7 +168,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let is_run_over = learned?;
     saved?;
     publisher.update_status(|status| status.finished = true);
-    tracing::info!("finished after {} updates", learner.updates());
+    let how = if is_run_over { "finished" } else { "stopped" };
+    tracing::info!("{how} after {} updates", learner.updates());
+    if is_run_over {
+        let (updates, who) = (learner.updates(), Participant::Learner(learner_id));
+        reporter::report_finished(&clients, who, updates, shutdown);
+    }
     if args.keep_alive {
         activity.begin("has finished and is kept alive");
         shutdown.wait();
@@ -177,10 +182,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     if sampling.is_prioritised() {
         let arrived = publisher.priorities.acknowledged.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
-    }
-    if is_run_over {
-        let (updates, who) = (learner.updates(), Participant::Learner(learner_id));
-        reporter::report_finished(&clients, who, updates, shutdown);
     }
     drop(membership);
     let closed = shards.close();

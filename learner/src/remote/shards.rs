@@ -164,7 +164,7 @@ fn single_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Resul
     let count = first.shard.1 as usize;
     ensure!(
         run_infos.len() == count,
-        "the run's replay has {count} shards, {} endpoints were given: give --connect once for each shard",
+        "the run's replay has {count} shards, and --connect was given {} times: give it once for each shard",
         run_infos.len()
     );
     Ok(first)

@@ -121,6 +121,7 @@ impl Service {
             let state = self.state();
             let all_stored = state.replay.limiter.all_stored();
             let now = state.participants.missing_process(all_stored);
+            let now = now.filter(|_| !state.participants.is_run_over());
             drop(state);
             if now != missing.map(|(before, ..)| before) {
                 missing = now.map(|now| (now, Instant::now(), MISSING_MAX));

@@ -114,7 +114,7 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nothing listens there.
             let mut process = system.start(&format!("{command} {}", system.endpoint()));
-            process.wait_for_stderr("waiting for 30 s: nothing listens on ");
+            process.wait_for_stderr("waiting up to 30 s: nothing listens on ");
             process.signal(signal);
             process.wait().expect_code(130);
             // Something listens, and sends nothing.

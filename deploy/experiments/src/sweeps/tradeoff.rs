@@ -9,7 +9,10 @@ mod plan;
 mod report;
 mod results;
 
-use std::{collections::BTreeMap, time::Instant};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Instant,
+};
 
 use driml_launch::{checkpoint_choice::read_config, console::print, evaluate::Levels};
 use driml_machine::error::usage;
@@ -140,7 +143,14 @@ impl Tradeoff<'_> {
             "{program}, {}, {:?}, {:?}",
             common.env, common.preset, common.sets
         );
-        for point in settings.levels.iter().flat_map(DialLevel::points) {
+        let points = || settings.levels.iter().flat_map(DialLevel::points);
+        let requested = points().filter(|it| !self.args.queue.report && settings.requests(it));
+        let keys = requested
+            .map(|it| &it.key)
+            .filter(|it| !self.speeds.contains_key(*it));
+        let count = keys.collect::<BTreeSet<_>>().len() as u64;
+        self.session.progress.add_work(units * count);
+        for point in points() {
             if self.speeds.contains_key(&point.key) {
                 continue;
             }
@@ -151,7 +161,6 @@ impl Tradeoff<'_> {
             } else {
                 let base = common.config(settings.timing_base(point))?;
                 let config = common.config(point)?;
-                self.session.progress.add_work(units);
                 let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
                 Some(self.session.load_or_make(&source, &key, units, measure)?)
             };

@@ -30,7 +30,6 @@ use crate::{
     view::{Display, Poller, ServerConnection},
 };
 
-const POLL: Duration = Duration::from_secs(1);
 /// How long the replay servers or the learner may leave requests unanswered, also after their start, before the run fails.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
 /// How long a run may make no progress before it fails, or longer if its world may take longer.
@@ -159,7 +158,7 @@ impl Launch<'_> {
         let steps = self.config.actor.steps_per_chunk;
         let stall_max = STALL_MAX.max(self.config.world.steps_time_max(steps));
         loop {
-            if self.shutdown.drain.wait_timeout(POLL) {
+            if self.shutdown.drain.wait_timeout(self.poller.pause()) {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_intact()?;

@@ -91,7 +91,7 @@ impl RunFolder {
     pub fn check_free(&self) -> Result<(), Usage> {
         let taken = match fs::read_dir(&self.path) {
             Ok(entries) => !self.is_empty_run(entries),
-            Err(_) => self.path.exists(),
+            Err(_) => self.path.is_dir(),
         };
         if taken {
             return Err(usage!(
@@ -195,7 +195,7 @@ mod tests {
         fs::create_dir(path("empty")).unwrap();
         fs::write(path("file"), "").unwrap();
         let said = refused("file");
-        assert!(said.contains("exists and is not empty"), "{said}");
+        assert!(said.contains("Not a directory"), "{said}");
         fs::create_dir(path("closed")).unwrap();
         fs::set_permissions(path("closed"), fs::Permissions::from_mode(0o555)).unwrap();
         // Root may write everywhere.

@@ -109,12 +109,12 @@ fn the_time_of_a_failed_start_is_not_that_of_the_next_run() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let failed = open(&run, &[], None).unwrap();
-    let failed = failed.summarise(Outcome::Failed, &mut RunView::default());
     let summary = Summary {
         wall_seconds: 120.0,
-        ..failed
+        ..failed.summarise(Outcome::Failed, &mut RunView::default())
     };
     summary.write(&run).unwrap();
+    drop(failed);
     assert!(open(&run, &[], None).unwrap().seconds() < 60.0);
 }
 
@@ -276,7 +276,7 @@ fn next_steps_stand_in_columns() {
     });
     expect![[r#"
         Greedy return (averaged weights): 45.12, 95% interval 41.80 to 48.40, 100 episodes; a random policy earns 3.90 (3.10 to 4.70).
-          driml evaluate runs/x --record play.gif     films the agent, beside a random policy
+          driml evaluate runs/x --record play.gif     films the agent
           driml plot runs/x --out plot.png            return, losses, k and speed
           driml train --resume runs/x --frames 2560   continues training
     "#]]

@@ -179,7 +179,7 @@ impl Summary {
     pub(crate) fn next_steps(&self, run_dir: &RunFolder, is_resumable: bool) -> String {
         let run = run_dir.quoted();
         let more = self.frames.saturating_mul(2);
-        let film = "films the agent, beside a random policy";
+        let film = "films the agent";
         let mut next = vec![
             (format!("evaluate {run} --record play.gif"), film),
             plot_command(run_dir),

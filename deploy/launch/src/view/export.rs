@@ -79,7 +79,7 @@ fn prometheus_text(view: &RunView) -> String {
         page.add_gauge("updates_planned", "Updates of the whole run.", planned[1]);
         let flags = [view.is_finished(), actions_needed(view).is_empty()].map(f64::from);
         let [finished, healthy] = [
-            "Whether everything is learned and saved.",
+            "Whether all updates are made and saved.",
             "Whether no process of the run is missing.",
         ];
         page.add_gauge("finished", finished, flags[0]);

@@ -29,6 +29,7 @@ pub(crate) fn status_page(view: &RunView) -> String {
     let is_known = view.servers_answered() || view.servers_ended();
     let frames = is_known.then_some(replay.transitions_inserted);
     let updates = view.learner_status().map(|it| it.updates);
+    let updates = updates.or(replay.learner_finished.then_some(replay.updates));
     let mut page = format!(
         "{}, {}: {} of {}\n",
         plan.world,
@@ -78,7 +79,7 @@ pub(crate) fn status_page(view: &RunView) -> String {
     page.push('\n');
     let needed = actions_needed(view);
     page += match needed.is_empty() {
-        _ if view.is_finished() => "the run is over: everything is learned and saved\n",
+        _ if view.is_finished() => "the run is over: all updates are made and saved\n",
         _ if view.is_over() => "the run is over: all frames were stored and sampled\n",
         true => "nothing is missing\n",
         false => "",

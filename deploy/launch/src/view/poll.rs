@@ -26,6 +26,11 @@ use crate::{
 /// How long an answer may take; a process that is busy may answer the next poll.
 const ANSWER_MAX: Duration = Duration::from_secs(3);
 
+/// The time between two polls.
+const POLL: Duration = Duration::from_secs(1);
+/// The same once all frames are stored: the learner may exit soon after its last status, and the end of a run is timed by it.
+const LAST_POLL: Duration = Duration::from_millis(200);
+
 /// A replay server to which the poller is connected.
 #[derive(Debug)]
 pub struct ServerConnection {
@@ -109,6 +114,14 @@ impl Poller {
             });
         }
         Ok(Self::new(&config.context("no endpoint to ask")?, servers))
+    }
+
+    /// The time until the next poll.
+    pub(crate) const fn pause(&self) -> Duration {
+        match self.view.replay.finished {
+            true => LAST_POLL,
+            false => POLL,
+        }
     }
 
     /// Polls all processes. The view names those that do not answer.

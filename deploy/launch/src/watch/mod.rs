@@ -53,9 +53,6 @@ pub struct WatchFlags {
     prometheus: Option<PathBuf>,
 }
 
-const POLL: Duration = Duration::from_secs(1);
-/// The time between polls once all frames are stored: shorter, as the learner may exit soon after its last status.
-const LAST_POLL: Duration = Duration::from_millis(200);
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
 /// Polls a run and prints a page or a JSON object: once, or with `repeat` until the run is over or Ctrl-C. If no process can be asked
@@ -72,7 +69,7 @@ pub fn print_status(
     let interrupted = Shutdown::on_signals(None)?;
     // The first poll starts the speed, which counts what happens until the next.
     poller.poll();
-    if interrupted.wait_timeout(POLL) {
+    if interrupted.wait_timeout(poller.pause()) {
         return Err(Interrupted.into());
     }
     loop {
@@ -156,7 +153,7 @@ fn wait_until_known(
                 console::eprintln("no learner has joined the run yet: waiting for it");
             }
         }
-        if interrupted.wait_timeout(POLL) {
+        if interrupted.wait_timeout(poller.pause()) {
             return Err(Interrupted.into());
         }
     }
@@ -187,11 +184,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
             Ok(true) => break Ok(Outcome::Finished),
             Err(e) => break Err(e),
         }
-        let pause = match poller.view.replay.finished {
-            true => LAST_POLL,
-            false => POLL,
-        };
-        if interrupted.wait_timeout(pause) {
+        if interrupted.wait_timeout(poller.pause()) {
             break Ok(Outcome::Interrupted);
         }
         poller.poll();
@@ -211,11 +204,11 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     }
     match &folder {
         Some(folder) => {
-            console::print(&summary.describe(folder))?;
+            console::print_wrapped(&summary.describe(folder), 2)?;
             summary.write(folder)?;
             console::print(&format_commands(&[plot_command(folder)]))
         }
-        None => console::print(&format!("{}\n", summary.describe_counts())),
+        None => console::print_wrapped(&format!("{}\n", summary.describe_counts()), 2),
     }
 }
 
@@ -265,7 +258,11 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<Vec<String>> {
     let is_locked = folder.is_locked();
     let counts =
         |it: Progress| [count(it.frames, "frame"), count(it.episodes, "episode")].join(" and ");
-    let so_far = read_progress(folder).map_or("nothing".into(), counts);
+    let saved = || resume::newest_updates(folder);
+    let so_far = read_progress(folder)
+        .map(counts)
+        .or_else(|| Some(format!("a checkpoint after {}", count(saved()?, "update"))));
+    let so_far = so_far.unwrap_or_else(|| "nothing".into());
     let mut state = UnreachableRun {
         finished: !is_locked && Summary::is_finished(folder),
         message: "the run is over".into(),

@@ -77,7 +77,9 @@ impl WatchedRun {
         let silent = view.replay_silence.length();
         // The servers exit once the learner has saved. Another client may have received the learner's last answer, or the launcher may
         // have stopped the learner before it was polled again.
-        if silent > EXIT_SILENCE_MAX && view.replay.waiting == Waiting::Finished {
+        let is_reported = view.replay.learner_finished && !view.is_learner_answering;
+        let has_exited = is_reported || silent > EXIT_SILENCE_MAX;
+        if has_exited && view.replay.waiting == Waiting::Finished {
             self.count_served_updates(poller);
             return Ok(true);
         }

@@ -75,7 +75,7 @@ impl Report {
         let missing = names_where(&self.cuda, |state| state != State::Ok);
         ensure!(
             !cuda || self.is_ready_for_cuda(),
-            "--device cuda needs: {missing}"
+            "--device cuda cannot work without: {missing}"
         );
         Ok(())
     }

@@ -303,12 +303,12 @@ fn a_file_s_torso_is_switched_with_its_settings() {
 
 #[test]
 fn a_setting_that_makes_another_task_is_named() {
-    let chain = |sets: &[&str]| paper("chain", "c51", sets).unwrap();
+    let chain = |sets: &[&str]| paper("chain", "driml-fix", sets).unwrap();
     for (sets, expected) in [
         (&["learner.batch_size=32"][..], None),
         (&["run.gamma=0.5"], Some("run.gamma")),
         (
-            &["learner.update.auxiliary_loss=curl"],
+            &["learner.update.auxiliary_loss=cpc"],
             Some("learner.update.auxiliary_loss"),
         ),
         (
