@@ -91,6 +91,7 @@ fn a_second_interrupt_ends_a_process_at_once() {
     // Without `--exit-with-parent`: a launcher signals its processes more than once.
     let mut actor = system.start(&system.connect_args("actor --id 0"));
     actor.wait_for_stderr("steps 4 environments");
+    system.connect().wait_for_updates(1);
     server.kill();
     learner.kill();
     // It tries for 20 s to deliver its chunks.

@@ -19,9 +19,9 @@ use super::state::{DeliveryLimits, DeliveryState};
 
 /// How long the queued chunks may take to be stored after `Shutdown`.
 const DRAIN_MAX: Duration = Duration::from_secs(20);
-/// Time-out of the reply to one of these chunks, which is then sent again. Two tries must fit into [`DRAIN_MAX`]. Of a longer time between
-/// two tries, in which this process was stopped, only twice as much counts.
-const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(8);
+/// Time-out of the reply to one of these chunks, which is then sent again. Several tries must fit into [`DRAIN_MAX`]. Of a longer time
+/// between two tries, in which this process was stopped, only twice as much counts.
+const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 /// After so many stored chunks, one more may be in flight than before.
 const WINDOW_TRIAL_CHUNKS: u64 = 64;
 /// Pause between two tries when the replay server is out of reach or has no room.
@@ -65,8 +65,6 @@ pub(super) struct DeliveryWorker {
     window: usize,
     /// The largest window: half of one in which a chunk was late, as on a slow link each waits for those before it.
     window_max: usize,
-    /// Chunks stored since the start.
-    stored: u64,
     silence: Silence,
     /// When the rate limiter began to hold the first chunk.
     held_since: Option<Instant>,
@@ -95,7 +93,6 @@ impl DeliveryWorker {
             outgoing: VecDeque::new(),
             window: 1,
             window_max: limits.chunks_in_flight_max,
-            stored: 0,
             silence: Silence::with_try_timeout(limits.ack_timeout),
             held_since: None,
             out_of_order: None,
@@ -204,8 +201,7 @@ impl DeliveryWorker {
                 progress.actors = actors;
                 progress.is_held = was_held;
                 drop(progress);
-                self.stored += 1;
-                if self.stored.is_multiple_of(WINDOW_TRIAL_CHUNKS) {
+                if (sequence + 1).is_multiple_of(WINDOW_TRIAL_CHUNKS) {
                     self.window_max = (self.window_max + 1).min(self.limits.chunks_in_flight_max);
                 }
                 self.window = match was_held {
@@ -263,11 +259,15 @@ impl DeliveryWorker {
                 if let Some(suppressed) = self.retry_log.admit() {
                     tracing::warn!("retrying chunk {sequence}: {e}{suppressed}");
                 }
-                if matches!(e, SessionError::TimedOut { .. }) {
-                    self.window_max = (self.window / 2).max(1);
+                // A chunk that is late alone does not tell how many a link can take.
+                if self.window > 1 && matches!(e, SessionError::TimedOut { .. }) {
+                    self.window_max = self.window / 2;
                 }
-                // A chunk without a reply may not have arrived, whatever an earlier reply said.
-                self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
+                // A chunk without a reply may not have arrived, whatever an earlier reply said. A poll at the end is just sent again: its
+                // reply may come late because the chunk is still on its way.
+                if !(self.outgoing[0].is_kept && self.outgoing[0].header.leaving) {
+                    self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
+                }
                 // The replay server may be unable to read shared memory: these chunks and the next ones go through the socket.
                 if self.outgoing[0].in_shared_memory {
                     self.pool.report_shared_loss();

@@ -7,7 +7,7 @@ use driml_launch::console::{Screen, wrap};
 use driml_machine::{error::Interrupted, units::rough_duration};
 use driml_protocol::GracefulShutdown;
 
-const PROGRESS_TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
+const PROGRESS_TEMPLATE: &str = "{bar:40} {percent:>3}%\n{msg}";
 
 /// Counts units of work, such as updates.
 #[derive(Debug)]

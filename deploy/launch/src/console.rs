@@ -245,8 +245,8 @@ impl Screen {
         });
         Self {
             bar,
-            full_disk: Arc::new(Mutex::new(LogLimiter::with_period(FULL_DISK_PERIOD))),
             next_plain_line: Some(Instant::now() + PLAIN_PERIOD),
+            ..Self::default()
         }
     }
 
@@ -259,7 +259,11 @@ impl Screen {
     pub fn print_line(&self, text: &str) {
         let is_full = |cause: &&str| text.contains(cause);
         let is_full = FULL_DISK_CAUSES.iter().any(is_full);
-        if is_full && lock(&self.full_disk).admit().is_none() {
+        if is_full
+            && lock(&self.full_disk)
+                .admit_within(FULL_DISK_PERIOD)
+                .is_none()
+        {
             return;
         }
         match &self.bar {

@@ -83,7 +83,7 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
             Some(("tcp", address)) => TcpListener::bind(address).map(drop),
             Some(("quic", address)) => UdpSocket::bind(address).map(drop),
             _ if folder.is_some_and(|it| !it.is_dir()) => {
-                Err(Error::other("there is no such folder"))
+                Err(Error::other("there is no such folder; make it"))
             }
             _ => match reach::check_listening(endpoint) {
                 Ok(()) => Err(ErrorKind::AddrInUse.into()),
@@ -95,8 +95,11 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
                 "cannot listen on {endpoint}: another process listens there. Stop it, or choose another port or path, with --listen for this \
                  command and --connect for all others"
             ),
+            ErrorKind::PermissionDenied => {
+                usage!("cannot listen on {endpoint}: {e}; choose a port from 1024 on")
+            }
             _ => usage!(
-                "cannot listen on {endpoint}: {e}; choose an address of this machine, such as 127.0.0.1 or 0.0.0.0, or a path in an existing folder"
+                "cannot listen on {endpoint}: {e}; or choose an address of this machine, such as 127.0.0.1 or 0.0.0.0"
             ),
         })?;
     }

@@ -206,7 +206,17 @@ fn check_changes(
             count(shards_before, "shard")
         ));
     }
-    if !lockstep && config.local.durable && !before.local.durable && replay.is_dir() {
+    let is_durable = config.local.durable && !lockstep;
+    let lost = (0..shards).filter(|&shard| kept_capacity(&replay, shard, shards).is_none());
+    let lost: Vec<_> = lost.collect();
+    if is_durable && (1..shards as usize).contains(&lost.len()) {
+        bail!(usage!(
+            "{} has no log of shard {}: remove that folder, then resume",
+            replay.display(),
+            lost[0]
+        ));
+    }
+    if is_durable && !before.local.durable && replay.is_dir() {
         bail!(usage!(
             "{} lacks what the run stored later, without --durable: remove that folder, then resume",
             replay.display()

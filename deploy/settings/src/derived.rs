@@ -39,12 +39,11 @@ const FOLLOWING: [&str; 3] = [
 /// Removes the settings that only follow from others, so that they follow from changed ones too.
 pub(crate) fn remove_following(table: &mut Table) -> Result<(), Usage> {
     for path in FOLLOWING {
-        let mut others = table.clone();
-        let is = remove(&mut others, path);
-        let mut filled = others.clone();
+        let mut filled = table.clone();
+        let is = remove(&mut filled, path);
         fill_in_derived(&mut filled)?;
         if is.is_some() && find(&filled, path) == is.as_ref() {
-            *table = others;
+            remove(table, path);
         }
     }
     Ok(())

@@ -176,7 +176,8 @@ impl Source {
             derived::drop_other_torsos(&mut table, is_set)?;
         }
         let compression = find(&table, "replay.compression").and_then(Value::as_str);
-        if compression == Some("none") && !is_set(COMPRESSED_MAX) {
+        let is_off = compression == Some("none") && is_set("replay.compression");
+        if is_off && !is_set(COMPRESSED_MAX) {
             remove(&mut table, COMPRESSED_MAX);
         }
         let is_capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;

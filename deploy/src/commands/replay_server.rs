@@ -93,13 +93,17 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
 /// Keeps the capacity of the log in the replay's folder, unless the user sets one: an earlier start may have found more free memory, and a
 /// smaller replay would delete transitions.
 fn keep_capacity(args: &mut ReplayServerArgs) {
-    const CAPACITY: &str = "replay.capacity_transitions=";
     let flags = &mut args.run.flags;
-    let is_set = args.run.config.is_some() || flags.sets.iter().any(|it| it.starts_with(CAPACITY));
-    let shards = flags.replay_shards.unwrap_or(1);
-    if let Some(dir) = args.replay_dir.as_ref().filter(|_| !is_set)
-        && let Some(capacity) = kept_capacity(dir, args.shard, shards)
+    if let (None, Some(dir)) = (&args.run.config, &args.replay_dir)
+        && let Some(capacity) = kept_capacity(dir, args.shard, flags.replay_shards.unwrap_or(1))
     {
-        flags.sets.push(format!("{CAPACITY}{capacity}"));
+        tracing::info!(
+            "the replay in {} holds up to {capacity} transitions",
+            dir.display()
+        );
+        // First, so that the user's own --set replaces it.
+        flags
+            .sets
+            .insert(0, format!("replay.capacity_transitions={capacity}"));
     }
 }

@@ -152,7 +152,7 @@ pub(super) struct Fetcher {
     /// Identifier of the next request for a whole batch.
     request_id: RequestId,
     rng: ChaCha8Rng,
-    /// Time-out of the next request: twice that of one that was lost, or twice the time that the last batch took.
+    /// Time-out of the next request: twice that of the last late one, or twice the time that the last batch took.
     timeout: Duration,
     /// Whether batches may come through shared memory.
     trust: Trust,

@@ -22,8 +22,9 @@ use crate::run_counts::{BatchPart, RunCounts};
 const COUNTS_AGE_MAX: Duration = Duration::from_millis(500);
 const EMPTY_COUNTS_AGE_MAX: Duration = Duration::from_millis(50);
 
-/// The settings that may differ between shards, beside the table `[local]`.
-const OF_THE_MACHINE: [(&str, &str); 4] = [
+/// The settings that may differ between shards, beside the table `[local]`: the machine of each server decides them.
+const OF_THE_MACHINE: [(&str, &str); 5] = [
+    ("actor", "epsilon_ladder"),
     ("actor", "precision"),
     ("learner", "precision"),
     ("replay", "capacity_transitions"),
@@ -146,11 +147,11 @@ fn single_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Resul
     let first = run_infos
         .first()
         .context("no endpoint of a replay server was given")?;
+    let shared = shared_settings(&first.config_toml)?;
     for (at, run_info) in run_infos.iter().enumerate() {
         let (endpoint, shard) = (&connect[at], run_info.shard.0);
-        let [ours, theirs] = [run_info, first].map(|it| shared_settings(&it.config_toml));
         ensure!(
-            ours? == theirs?,
+            shared_settings(&run_info.config_toml)? == shared,
             "{endpoint} and {} are replay servers of runs with different settings: start both with the same",
             connect[0]
         );

@@ -2,7 +2,7 @@
 //! Each process drains and saves by itself; `termination` watches for the external reasons that raise the flag.
 
 use std::{
-    ops::ControlFlow,
+    io::Write,
     sync::{Arc, Condvar, Mutex, mpsc},
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -102,11 +102,12 @@ impl GracefulShutdown {
             if reason == ExitReason::Request || parent.is_none() {
                 raised.immediate.set();
             }
-            if parent.is_none() && is_repeated(reason, &mut first, Instant::now()) {
-                eprintln!("stopped at once by a second signal");
+            // A closed terminal is not the first of two signals.
+            let is_signal = reason == ExitReason::Request && parent.is_none();
+            if is_signal && is_repeated(reason, &mut first, Instant::now()) {
+                let _ = writeln!(std::io::stderr(), "stopped at once by a second signal");
                 std::process::exit(INTERRUPTED);
             }
-            ControlFlow::Continue(())
         })?;
         Ok(flags)
     }
@@ -117,7 +118,6 @@ impl GracefulShutdown {
         let (raised, mut first) = (flags.clone(), None);
         termination::watch("interrupts", parent, move |reason| {
             raised.handle_reason(reason, &mut first, Instant::now());
-            ControlFlow::Continue(())
         })?;
         Ok(flags)
     }

@@ -3,7 +3,6 @@
 
 use std::{
     fs,
-    ops::ControlFlow,
     os::{fd::AsFd, unix::process::parent_id},
     time::Duration,
 };
@@ -28,14 +27,14 @@ pub(super) enum ExitReason {
     Abandoned,
 }
 
-/// Calls `on_reason` at each reason, on a thread of this `name`, until it breaks or the process exits. `parent` is the number of the
+/// Calls `on_reason` at each reason, on a thread of this `name`, until the process exits. `parent` is the number of the
 /// process whose death is a reason, even if it died before this call.
 ///
 /// SIGHUP stays ignored if it is ignored at the start, as under `nohup`.
 pub(super) fn watch(
     name: &'static str,
     parent: Option<u32>,
-    mut on_reason: impl FnMut(ExitReason) -> ControlFlow<()> + Send + 'static,
+    mut on_reason: impl FnMut(ExitReason) + Send + 'static,
 ) -> std::io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -73,9 +72,7 @@ pub(super) fn watch(
                     ExitReason::Abandoned
                 }
             };
-            if on_reason(reason).is_break() {
-                return;
-            }
+            on_reason(reason);
         }
     };
     std::thread::Builder::new()

@@ -12,7 +12,7 @@ use std::{
 use driml_protocol::{PROTOCOL_VERSION, RunSpec, TRANSITION_BYTES, atomic_write, codec, lock_file};
 use serde::{Deserialize, Serialize};
 
-use super::{record, shard_dir, snapshot::Snapshot};
+use super::{record, snapshot::Snapshot};
 use crate::config::{Config, SEGMENT_BYTES_MIN};
 
 /// Format of the log (thousands) and of the messages in it (ones). A log of another format is rejected.
@@ -233,6 +233,13 @@ impl ReplayFolder {
 pub fn kept_capacity(dir: &Path, shard: u32, shards: u32) -> Option<u64> {
     let newest = newest_header(&shard_dir(dir, shard, shards)).ok()??;
     Some(newest.snapshot.capacity.saturating_mul(shards.into()))
+}
+
+pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
+    match shards {
+        1 => dir.to_owned(),
+        _ => dir.join(format!("shard-{shard}")),
+    }
 }
 
 fn segment_path(folder: &Path, number: u64) -> PathBuf {

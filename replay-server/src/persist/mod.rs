@@ -22,6 +22,6 @@ mod upkeep;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use folder::shard_dir;
 pub use folder::{Mark, PersistArgs, PersistError, ReplayFolder, kept_capacity};
 pub use recover::{RecoveryControl, RecoveryReport};
-pub(crate) use upkeep::shard_dir;

@@ -1,10 +1,7 @@
 //! Connects a replay to its log: recovers the replay, begins segments and sets marks as the replay runs, takes and restores snapshots.
 //! `journal` writes the log; `recover` reads it. A replay in memory has no log, and these methods do nothing.
 
-use std::{
-    borrow::Cow,
-    path::{Path, PathBuf},
-};
+use std::borrow::Cow;
 
 use driml_protocol::{Chunk, ChunkHeader, CodecError, End, RunSpec, Shutdown, codec};
 
@@ -56,13 +53,6 @@ impl ReplayFolder {
         replay.journal = Some(Journal::begin(self, position, &snapshot)?);
         replay.rotate_and_prune();
         Ok((replay, recovery))
-    }
-}
-
-pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
-    match shards {
-        1 => dir.to_owned(),
-        _ => dir.join(format!("shard-{shard}")),
     }
 }
 

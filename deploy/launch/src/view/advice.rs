@@ -43,7 +43,7 @@ pub(super) fn limiter_waits(view: &RunView) -> Vec<String> {
 pub(crate) fn actions_needed(view: &RunView) -> Vec<String> {
     let servers = view.servers.iter().filter(|_| !view.is_over());
     let mut needed: Vec<_> = servers.filter_map(server_action).collect();
-    needed.extend(missing_shards(view));
+    needed.extend(missing_shards(view).filter(|_| !view.is_over()));
     needed.extend(server_statuses(view).filter_map(disk_action));
     if !view.is_over() && server_statuses(view).next().is_some() {
         needed.extend(learner_action(view));

@@ -10,7 +10,7 @@ use anyhow::{Context, bail};
 use driml_machine::error::{Usage, usage};
 use driml_protocol::{
     CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, ReplayStatus,
-    RunClient, RunInfo, join, reach,
+    RunClient, RunInfo, Waiting, join, reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
@@ -28,7 +28,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 
 /// The time between two polls.
 const POLL: Duration = Duration::from_secs(1);
-/// The same once all frames are stored: the learner may exit soon after its last status, and the end of a run is timed by it.
+/// The same once all rows are sampled: the learner may exit soon after its last status, and the end of a run is timed by it.
 const LAST_POLL: Duration = Duration::from_millis(200);
 
 /// A replay server to which the poller is connected.
@@ -118,9 +118,9 @@ impl Poller {
 
     /// The time until the next poll.
     pub(crate) const fn pause(&self) -> Duration {
-        match self.view.replay.finished {
-            true => LAST_POLL,
-            false => POLL,
+        match self.view.replay.waiting {
+            Waiting::Finished => LAST_POLL,
+            _ => POLL,
         }
     }
 
@@ -233,8 +233,7 @@ impl ServerConnection {
     }
 }
 
-/// The settings that a replay server reports, also while it reads its replay back from disk.
-/// Returns the run's settings and the server's shard, which is not known while the server reads its replay back.
+/// The settings and the shard that a replay server reports. While it reads its replay back from disk, its shard is not known.
 fn fetch_settings(
     session: &Session,
     keys: &Keys,

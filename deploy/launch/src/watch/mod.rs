@@ -258,10 +258,11 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<Vec<String>> {
     let is_locked = folder.is_locked();
     let counts =
         |it: Progress| [count(it.frames, "frame"), count(it.episodes, "episode")].join(" and ");
-    let saved = || resume::newest_updates(folder);
-    let so_far = read_progress(folder)
-        .map(counts)
-        .or_else(|| Some(format!("a checkpoint after {}", count(saved()?, "update"))));
+    let saved = || {
+        let updates = resume::newest_updates(folder)?;
+        Some(format!("a checkpoint after {}", count(updates, "update")))
+    };
+    let so_far = read_progress(folder).map(counts).or_else(saved);
     let so_far = so_far.unwrap_or_else(|| "nothing".into());
     let mut state = UnreachableRun {
         finished: !is_locked && Summary::is_finished(folder),
