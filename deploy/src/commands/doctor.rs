@@ -26,7 +26,8 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
     match args.json {
         true => print(&report.json()?)?,
-        false => print_wrapped(&report.describe(), 4)?,
+        // To where the columns of state and name end.
+        false => print_wrapped(&report.describe(), 27)?,
     }
     report.check(args.cuda)
 }

@@ -5,4 +5,5 @@ pub mod batch_source;
 mod fetcher;
 mod publish;
 pub mod run;
+mod same_run;
 mod shards;

@@ -66,7 +66,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)
         .context("the settings that the replay server sent")?;
-    let compute = args.device.open(config.learner.precision)?;
+    let compute = args.device.open(config.learner.precision);
+    let compute = compute.context("settings of the replay server, which takes --set")?;
     let folder = args.run_dir.join(checkpoint::FOLDER);
     let _lock = checkpoint::lock(&folder)?;
     let rows = config.learner.batch_size;
