@@ -217,11 +217,7 @@ mod tests {
                 width: 12,
                 input_channels: 1,
                 num_actions: 3,
-                conv: vec![ConvLayer {
-                    out: 2,
-                    kernel: 4,
-                    stride: 4,
-                }],
+                conv: vec![ConvLayer::new(2, 4, 4)],
                 ..model()
             },
             actor: Config {

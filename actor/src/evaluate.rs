@@ -80,7 +80,7 @@ pub fn episode_returns(
 
 #[cfg(test)]
 mod tests {
-    use driml_envs::{EnvError, FrameShape};
+    use driml_envs::{FrameShape, StepResult};
     use rand::SeedableRng;
 
     use super::*;
@@ -108,12 +108,7 @@ mod tests {
             frames.fill(0);
         }
 
-        fn step(
-            &mut self,
-            _actions: &[u8],
-            rewards: &mut [f32],
-            ends: &mut [StepEnd],
-        ) -> Result<(), EnvError> {
+        fn step(&mut self, _: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
             for (env, script) in self.scripts.iter().enumerate() {
                 (rewards[env], ends[env]) = script[self.step % script.len()];
             }

@@ -165,11 +165,7 @@ pub(crate) mod tests {
             v_min: -1.0,
             v_max: 1.0,
             torso: TorsoName::Nature,
-            conv: vec![ConvLayer {
-                out: 2,
-                kernel: 2,
-                stride: 2,
-            }],
+            conv: vec![ConvLayer::new(2, 2, 2)],
             channels: vec![],
             scale_blocks: false,
             hidden: 4,

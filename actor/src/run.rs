@@ -6,7 +6,7 @@ use std::{sync::Arc, time::Duration};
 use anyhow::Context;
 use driml_envs::WorldName;
 use driml_protocol::{
-    Activity, ActorJoin, Keys, Participant, RunClient, Shutdown, Weights, join, reporter,
+    Activity, ActorJoin, Keys, Participant, RunClient, Shutdown, join, reporter,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -68,10 +68,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         settings.transport.shared_memory = false;
     }
     let spec_hash = settings.spec.hash();
-    let join = ActorJoin {
-        actor: args.actor,
-        incarnation: rand::random(),
-    };
+    let join = ActorJoin::new(args.actor, rand::random());
     let participant = Participant::Actor(join);
     // Declared before joining, so that no other process can join as this actor from then on.
     let client = RunClient::new(session, keys, spec_hash);
@@ -164,17 +161,13 @@ fn produce_chunks(
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
     while !shutdown.is_set() && !delivery.progress().is_finished {
-        let newer = newest.take_within(delivery.fresh_weights_wait_max());
-        if let Some(Weights {
-            header,
-            safetensors,
-        }) = newer
-            && let Err(e) = collector.set_weights(header.version, &safetensors)
-        {
-            tracing::warn!(
-                "weights {} were rejected, and the previous ones stay in use: {e:#}",
-                header.version
-            );
+        if let Some(newer) = newest.take_within(delivery.fresh_weights_wait_max()) {
+            let version = newer.header.version;
+            if let Err(e) = collector.set_weights(version, &newer.safetensors) {
+                tracing::warn!(
+                    "weights {version} were rejected, and the previous ones stay in use: {e:#}"
+                );
+            }
         }
         activity.begin("plays");
         let progress = delivery.progress();

@@ -128,11 +128,8 @@ pub(crate) fn wait_for_first(
     loop {
         let (from, buffers) = (client.clone(), pool.clone());
         // A frozen replay server does not keep the actor from exiting.
-        let first = move || {
-            pull(0, |request, timeout| {
-                send(&from, &buffers, request, timeout)
-            })
-        };
+        let send = move |request, timeout| send(&from, &buffers, request, timeout);
+        let first = move || pull(0, send);
         let Some(pulled) = shutdown.run_unless_set("first-weights", first)? else {
             return Ok(None);
         };

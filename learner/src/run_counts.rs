@@ -47,10 +47,7 @@ impl RunCounts {
         let (frames, rows, count) = (self.frames(), self.rows(), shards as u64);
         let share = |all: u64, shard: u64| all / count + u64::from(shard < all % count);
         self.shards = (0..count)
-            .map(|shard| ShardCounts {
-                inserted: share(frames, shard),
-                rows_sampled: share(rows, shard),
-            })
+            .map(|shard| ShardCounts::new(share(frames, shard), share(rows, shard)))
             .collect();
     }
 

@@ -41,11 +41,7 @@ const QUEUE_BYTES_MAX: usize = 1 << 29;
 
 /// A request that has arrived and has yet to be answered.
 #[derive(Debug)]
-pub struct Incoming<R> {
-    query: Query,
-    spec_hash: u64,
-    request: PhantomData<fn() -> R>,
-}
+pub struct Incoming<R: Request>(Responder<R::Reply>);
 
 impl<R: Request> Incoming<R> {
     /// Reads a request without payload.
@@ -56,12 +52,13 @@ impl<R: Request> Incoming<R> {
 
     /// Reads a request and copies its payload into private memory from `pool`. A request at another process's key is an error.
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
+        let (query, spec_hash) = (&self.0.query, Some(self.0.spec_hash));
         let nothing = ZBytes::new();
-        let bytes = self.query.payload().unwrap_or(&nothing);
+        let bytes = query.payload().unwrap_or(&nothing);
         let (request, payload): (R, _) =
-            codec::decode_from(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
+            codec::decode_from(bytes.reader(), bytes.len(), pool, spec_hash)?;
         // Where each process has its own key, access control guards only the key, so the request must come at the key of its sender.
-        let (key, actor) = (self.query.key_expr().as_str(), request.actor());
+        let (key, actor) = (query.key_expr().as_str(), request.actor());
         if R::KEY_PER_ACTOR && Keys::parse_actor(key) != actor {
             let key = key.to_owned();
             return Err(CodecError::Actor { actor, key });
@@ -71,11 +68,7 @@ impl<R: Request> Incoming<R> {
 
     /// Returns the responder that sends the reply.
     pub fn into_responder(self) -> Responder<R::Reply> {
-        Responder {
-            query: self.query,
-            spec_hash: self.spec_hash,
-            reply: PhantomData,
-        }
+        self.0
     }
 }
 
@@ -147,11 +140,11 @@ pub fn answer_queries<R: Request + 'static>(
         let handle = move |work| match work {
             Work::Query(query) => {
                 bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
-                answer(Incoming {
+                answer(Incoming(Responder {
                     query,
                     spec_hash,
-                    request: PhantomData,
-                });
+                    reply: PhantomData,
+                }));
             }
             Work::Rejected(bytes) => on_rejected(bytes),
         };

@@ -46,10 +46,7 @@ fn replay(config: &RunConfig, compression: Compression) -> Replay {
         ..Config::unlimited(TRANSITIONS)
     };
     let mut replay = Replay::new(&config.run, &replay, ROWS).unwrap();
-    let join = ActorJoin {
-        actor: 0,
-        incarnation: 1,
-    };
+    let join = ActorJoin::new(0, 1);
     replay.join_actor(join).unwrap();
     replay
 }

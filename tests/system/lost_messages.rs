@@ -432,10 +432,7 @@ fn a_shard_that_waits_hears_what_the_other_gave() {
         }
         insert(&mut replay, 1)
     };
-    let actors_ahead = ShardCounts {
-        inserted: 2 * slack,
-        rows_sampled: 0,
-    };
+    let actors_ahead = ShardCounts::new(2 * slack, 0);
     let reply = insert_second(Some(actors_ahead));
     assert!(matches!(reply, InsertReply::Wait { .. }), "{reply:?}");
     wait_until("the shard's inserts wait no more", || {

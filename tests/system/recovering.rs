@@ -4,7 +4,7 @@
 use std::{fs, path::Path};
 
 use driml_protocol::{
-    Chunk, ChunkHeader, End, InsertReply, ReplayStatus, RunInfo, RunSpec, WeightsUpload,
+    ActorJoin, Chunk, ChunkHeader, End, InsertReply, ReplayStatus, RunInfo, RunSpec, WeightsUpload,
     config::Settings,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
@@ -14,7 +14,7 @@ use driml_tests::{
 use serde_json::Value;
 
 use crate::{
-    refusals::{Row, actor_join, batch_request, check_replies, upload},
+    refusals::{Row, batch_request, check_replies, upload},
     status::status_text,
     system, tiny_replay,
 };
@@ -119,7 +119,7 @@ fn check_postponed(system: &TestSystem, spec: &RunSpec) {
         Row::new(client.keys.actor_key::<ChunkHeader>(5), chunk, postponed),
         Row::new(client.keys.key::<WeightsUpload>(), weights, postponed),
         Row::of(&client, &batch_request(99, 16), postponed),
-        Row::of(&client, &actor_join(5, 1), postponed),
+        Row::of(&client, &ActorJoin::new(5, 1), postponed),
         Row::of(&client, &new_learner(99), postponed),
         Row::new(client.keys.key::<RunInfo>(), [], postponed),
         Row::new(client.keys.key::<ReplayStatus>(), [], postponed),

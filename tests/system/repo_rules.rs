@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_520),
-    ("actor", 10_795),
-    ("replay-server", 11_140),
-    ("learner", 22_585),
-    ("deploy", 31_300),
-    ("tests", 10_460),
+    ("protocol", 7_515),
+    ("actor", 10_740),
+    ("replay-server", 11_125),
+    ("learner", 22_560),
+    ("deploy", 31_215),
+    ("tests", 10_435),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -31,10 +31,7 @@ pub(crate) fn config(transitions: u64) -> Config {
 const INCARNATION: u64 = 1;
 
 pub(crate) fn join_actor(replay: &mut Replay, actor: u32) {
-    let join = ActorJoin {
-        actor,
-        incarnation: INCARNATION,
-    };
+    let join = ActorJoin::new(actor, INCARNATION);
     replay.join_actor(join).unwrap();
 }
 

@@ -47,6 +47,9 @@ pub enum StepEnd {
     Terminal = 3,
 }
 
+/// The result of [`Environment::step`].
+pub type StepResult = Result<(), EnvError>;
+
 /// Environments of one game, stepped together.
 ///
 /// Deterministic: the same construction arguments and actions give the same frames, rewards and ends.
@@ -68,12 +71,7 @@ pub trait Environment: Send {
     ///
     /// # Errors
     /// An action out of range, or a fault of the engine. After an error the world must not be stepped again.
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError>;
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult;
 
     /// Returns the complete state of all environments, including their generators. A world made with the same arguments
     /// continues exactly as this one does after it [`load`](Self::load)s the state.

@@ -5,7 +5,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Serialize, de::DeserializeOwned};
 
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd, StepResult};
 use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::WorldSettings;
@@ -78,12 +78,7 @@ impl<E: SingleEnv> Environment for SerialWorld<E> {
         }
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
         check_step(self.num_envs(), self.num_actions(), actions, rewards, ends)?;
         for (i, (env, &action)) in self.envs.iter_mut().zip(actions).enumerate() {
             (rewards[i], ends[i]) = env.act(&self.config, action);

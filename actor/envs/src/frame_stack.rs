@@ -40,11 +40,9 @@ impl FrameStack {
     /// # Panics
     /// If a slice has the wrong length: both come from the caller's own buffers.
     pub fn push(&mut self, frames: &[u8], first: &[bool]) {
-        assert_eq!(
-            frames.len(),
-            self.shape.bytes() * self.num_envs,
-            "frames must be [N, H, W, C]"
-        );
+        let bytes = self.shape.bytes();
+        let expected = bytes * self.num_envs;
+        assert_eq!(frames.len(), expected, "frames must be [N, H, W, C]");
         assert_eq!(first.len(), self.num_envs, "first must be [N]");
         if self.stack == 1 {
             self.stacked.copy_from_slice(frames);
@@ -52,15 +50,11 @@ impl FrameStack {
         }
         let channels = self.shape.channels;
         let stacked_channels = channels * self.stack;
-        let envs = self
-            .stacked
-            .chunks_exact_mut(self.shape.bytes() * self.stack);
-        for ((stacked, frame), &first) in
-            envs.zip(frames.chunks_exact(self.shape.bytes())).zip(first)
-        {
+        let envs = self.stacked.chunks_exact_mut(bytes * self.stack);
+        for ((stacked, frame), &first) in envs.zip(frames.chunks_exact(bytes)).zip(first) {
             let pixels = frame.chunks_exact(channels);
             if first {
-                for (out, pixel) in stacked.chunks_exact_mut(channels * self.stack).zip(pixels) {
+                for (out, pixel) in stacked.chunks_exact_mut(stacked_channels).zip(pixels) {
                     out.chunks_exact_mut(channels)
                         .for_each(|slot| slot.copy_from_slice(pixel));
                 }

@@ -61,7 +61,7 @@ mod saved;
 mod settings;
 mod worlds;
 
-pub use environment::{Environment, FrameShape, StepEnd};
+pub use environment::{Environment, FrameShape, StepEnd, StepResult};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};

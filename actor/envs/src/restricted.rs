@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd, StepResult};
 use crate::envs::check_frames;
 use crate::error::{EnvError, require};
 
@@ -94,12 +94,7 @@ impl Environment for RestrictedWorld {
         }
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
         self.step_actions.clear();
         for &action in actions {
             let Some(&raw) = self.actions.get(usize::from(action)) else {

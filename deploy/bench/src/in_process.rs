@@ -110,10 +110,7 @@ impl FullReplay {
         let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
         let rows = config.learner.batch_size;
         let mut replay = Replay::new(&config.run, &config.replay, rows)?;
-        let join = ActorJoin {
-            actor: 0,
-            incarnation: INCARNATION,
-        };
+        let join = ActorJoin::new(0, INCARNATION);
         replay.join_actor(join).map_err(anyhow::Error::msg)?;
         while replay.inserted_total() <= held {
             let reply = replay.insert(&chunks.next_chunk());

@@ -94,10 +94,7 @@ impl Server {
     ) -> anyhow::Result<f64> {
         self.actors += 1;
         let (actor, pool) = (self.actors, self.actor.chunk_buffers());
-        let join = ActorJoin {
-            actor,
-            incarnation: INCARNATION,
-        };
+        let join = ActorJoin::new(actor, INCARNATION);
         let who = Peer::actor(actor, INCARNATION);
         let (client, alive) = self.join_run(Role::Actor(actor), who, &join)?;
         let limits = DeliveryLimits::from_config(&self.actor.actor);

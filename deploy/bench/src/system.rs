@@ -13,7 +13,7 @@ use driml_launch::{
     run_folder::{RunFolder, Summary},
     view::{Poller, ServerConnection},
 };
-use driml_machine::units::format_number;
+use driml_machine::{error::EXIT_INTERRUPTED, units::format_number};
 use driml_protocol::{LearnerStatus, ReplayStatus};
 use tempfile::TempDir;
 
@@ -28,7 +28,6 @@ const WARMUP_UPDATES: u64 = 10;
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// The time-out of each wait, including that for the end of a run.
 const WAIT_MAX: Duration = Duration::from_secs(300);
-const INTERRUPTED: i32 = 130;
 const ACTORS: [u32; 6] = [1, 2, 4, 8, 16, 32];
 /// Replay ratios, and at each how far either side may run ahead, in transitions. At the first ratio the actors wait for the learner, at the
 /// second they limit the run.
@@ -57,10 +56,9 @@ pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Res
     figures.record("updates", updates, "updates/s");
     figures.record("frames", frames, "frames/s");
     figures.record(computes, share, "%");
-    for (process, mib) in &summary.rss_mib_max {
-        if let Some(mib) = *mib {
-            figures.record(format!("memory of {process}"), mib, "MiB");
-        }
+    let memory = summary.rss_mib_max.iter();
+    for (process, mib) in memory.filter_map(|(process, mib)| Some((process, (*mib)?))) {
+        figures.record(format!("memory of {process}"), mib, "MiB");
     }
     Ok(())
 }
@@ -126,7 +124,7 @@ fn measure_columns(
     thread::sleep(until.saturating_duration_since(Instant::now()));
     let samples = [first, run.wait_for(|_| true)?];
     run.launcher.ask_to_stop();
-    let summary = run.finish(INTERRUPTED)?;
+    let summary = run.finish(EXIT_INTERRUPTED.into())?;
     let frames = per_second(&samples, |it| it.replay.transitions_inserted);
     let updates = per_second(&samples, |it| it.learner.updates);
     // From the launcher's start to the last actor's first frame.
@@ -159,7 +157,6 @@ fn per_second([first, last]: &[StatusSample; 2], count: fn(&StatusSample) -> u64
     (count(last) - count(first)) as f64 / seconds
 }
 
-#[derive(Clone)]
 struct StatusSample {
     at: Instant,
     replay: ReplayStatus,
@@ -192,14 +189,10 @@ impl Run {
 
     /// Requests the statuses; `None` while a process does not answer, as they start after the replay server and end before it.
     fn sample_status(&mut self) -> anyhow::Result<Option<StatusSample>> {
-        if self.launcher.exit_status().is_some() {
-            bail!("{}", self.launcher.exit_report());
-        }
+        self.launcher.check_alive()?;
         let answers = self.poller.poll_replay();
-        if answers.and_then(|()| self.poller.poll_learner()).is_err() {
-            return Ok(None);
-        }
-        Ok(Some(StatusSample {
+        let answers = answers.and_then(|()| self.poller.poll_learner());
+        Ok(answers.is_ok().then(|| StatusSample {
             at: Instant::now(),
             replay: self.poller.view.replay.clone(),
             learner: self.poller.view.learner.clone(),

@@ -1,6 +1,8 @@
 //! A custom world: an island with a treasure on it, at another place in each episode.
 
-use driml_envs::{BuildResult, EnvError, Environment, FrameShape, StepEnd, WorldSettings};
+use driml_envs::{
+    BuildResult, EnvError, Environment, FrameShape, StepEnd, StepResult, WorldSettings,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -112,12 +114,7 @@ impl Environment for Islands {
         }
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
         let config = &self.config;
         let last = config.side - 1;
         for (env, (island, &action)) in self.islands.iter_mut().zip(actions).enumerate() {

@@ -23,25 +23,20 @@ pub(super) fn linear(low: f64, high: f64, count: usize) -> Vec<f64> {
 /// Returns the powers of ten in `low..=high`, with multiples of them if there are fewer than three; in a narrow range, as [`linear`] does.
 pub(super) fn log(low: f64, high: f64) -> Vec<f64> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
-    let multiples = |times: &[f64]| -> Vec<f64> {
-        let all = (first..=last.min(first + 50))
-            .flat_map(|power| times.iter().map(move |times| times * 10f64.powi(power)));
-        all.filter(|value| (low * 0.999..=high * 1.001).contains(value))
-            .collect()
-    };
-    let powers = multiples(&[1.0]);
-    if powers.len() >= 3 {
-        return powers;
+    let is_inside = |value: &f64| (low * 0.999..=high * 1.001).contains(value);
+    for (count_min, times) in [
+        (3, &[1.0][..]),
+        (3, &[1.0, 2.0, 5.0]),
+        (2, &[1.0, 1.5, 2.0, 3.0, 5.0, 7.0]),
+    ] {
+        let multiples = |power: i32| times.iter().map(move |times| times * 10f64.powi(power));
+        let all = (first..=last.min(first + 50)).flat_map(multiples);
+        let ticks: Vec<f64> = all.filter(is_inside).collect();
+        if ticks.len() >= count_min {
+            return ticks;
+        }
     }
-    let few = multiples(&[1.0, 2.0, 5.0]);
-    if few.len() >= 3 {
-        return few;
-    }
-    let many = multiples(&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0]);
-    match many.len() {
-        0 | 1 => linear(low, high, 4),
-        _ => many,
-    }
+    linear(low, high, 4)
 }
 
 /// Labels of an axis are plain decimals if the largest tick is in this range, else they have powers of ten.
@@ -74,10 +69,8 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
 
 /// Returns the smallest and the largest number; `None` if there are no numbers.
 pub(super) fn bounds(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
-    values.fold(None, |bounds, value| {
-        let (low, high) = bounds.unwrap_or((value, value));
-        Some((low.min(value), high.max(value)))
-    })
+    let pairs = values.map(|value| (value, value));
+    pairs.reduce(|(low, high), (value, _)| (low.min(value), high.max(value)))
 }
 
 fn unit_of(size: f64) -> (f64, &'static str) {

@@ -165,14 +165,8 @@ impl Player {
         }
         let compute = Compute::cpu(self.config.actor.precision);
         let update = &self.config.learner.update;
-        let enlarge = self.enlarge()?;
-        Ok(Insight::new(
-            &model,
-            update,
-            &self.network,
-            compute,
-            enlarge,
-        )?)
+        let insight = Insight::new(&model, update, &self.network, compute, self.enlarge()?);
+        Ok(insight?)
     }
 
     fn enlarge(&self) -> anyhow::Result<Option<Resizer>> {

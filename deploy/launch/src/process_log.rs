@@ -111,10 +111,7 @@ impl LogState {
             self.tail.clear();
         } else if self.tail.len() == TAIL_LINES_MAX {
             // The error line stays.
-            let oldest = match self.tail.front().is_some_and(is_error) {
-                true => 1,
-                false => 0,
-            };
+            let oldest = usize::from(self.tail.front().is_some_and(is_error));
             self.tail.remove(oldest);
         }
         self.tail.push_back(line);
@@ -161,15 +158,12 @@ mod tests {
         for line in ["error: it failed. Its last words:", "no", "more"] {
             lock(&log.state).add(line.into());
         }
-        let said = ": it failed. Its last words:\n  no\n  more";
-        assert_eq!(log.last_lines(), said);
+        let error = ": it failed. Its last words:\n";
+        assert_eq!(log.last_lines(), format!("{error}  no\n  more"));
         for n in 0..10 {
             lock(&log.state).add(format!("line {n}"));
         }
         let said = log.last_lines();
-        assert!(
-            said.starts_with(": it failed. Its last words:\n  line 3\n"),
-            "{said}"
-        );
+        assert!(said.starts_with(&format!("{error}  line 3\n")), "{said}");
     }
 }

@@ -77,19 +77,11 @@ impl WeightDtype {
         if let Some(at) = values.iter().position(|value| value.abs() > largest) {
             return Err(at);
         }
+        let all = values.iter();
         Ok(match self {
-            Self::F32 => {
-                let scalars = values.iter();
-                scalars.flat_map(|value| value.to_le_bytes()).collect()
-            }
-            Self::F16 => {
-                let halves = values.iter().map(|&value| f16::from_f32(value));
-                halves.flat_map(f16::to_le_bytes).collect()
-            }
-            Self::Bf16 => {
-                let halves = values.iter().map(|&value| bf16::from_f32(value));
-                halves.flat_map(bf16::to_le_bytes).collect()
-            }
+            Self::F32 => all.flat_map(|x| x.to_le_bytes()).collect(),
+            Self::F16 => all.flat_map(|&x| f16::from_f32(x).to_le_bytes()).collect(),
+            Self::Bf16 => all.flat_map(|&x| bf16::from_f32(x).to_le_bytes()).collect(),
         })
     }
 }

@@ -374,10 +374,7 @@ impl Fetcher {
             }
             let status = client.fetch::<ReplayStatus>(REQUEST_TIMEOUT);
             let status = status.context("a shard's status")?;
-            let counts = ShardCounts {
-                inserted: status.transitions_inserted,
-                rows_sampled: status.rows_sampled,
-            };
+            let counts = ShardCounts::new(status.transitions_inserted, status.rows_sampled);
             state.record_counts(counts, status.transitions_held);
             all_stored |= status.finished;
         }

@@ -266,10 +266,7 @@ impl PartialBatch {
         let others = self.shards.iter().enumerate();
         let others = others.filter(|(shard, _)| *shard != this);
         others.fold(ShardCounts::default(), |sum, (_, state)| {
-            let pending = ShardCounts {
-                inserted: 0,
-                rows_sampled: state.pending_rows.into(),
-            };
+            let pending = ShardCounts::new(0, state.pending_rows.into());
             sum + state.counts + pending
         })
     }
@@ -284,10 +281,7 @@ mod tests {
 
     fn shard_state(held: u64, inserted: u64, rows_sampled: u64, pending_rows: u32) -> ShardState {
         ShardState {
-            counts: ShardCounts {
-                inserted,
-                rows_sampled,
-            },
+            counts: ShardCounts::new(inserted, rows_sampled),
             held,
             pending_rows,
             ..ShardState::default()

@@ -84,13 +84,9 @@ fn network_bytes(run: &LearnerState) -> [Vec<u8>; 2] {
 }
 
 pub(crate) fn run_counts() -> RunCounts {
-    let counts = |inserted, rows_sampled| ShardCounts {
-        inserted,
-        rows_sampled,
-    };
     RunCounts {
         run: u64::MAX,
-        shards: vec![counts(100, 200), counts(7, 0)],
+        shards: vec![ShardCounts::new(100, 200), ShardCounts::new(7, 0)],
     }
 }
 

@@ -82,6 +82,16 @@ pub struct ShardCounts {
     pub rows_sampled: u64,
 }
 
+impl ShardCounts {
+    /// The counts of a replay server that stored `inserted` transitions and sampled `rows_sampled` rows.
+    pub const fn new(inserted: u64, rows_sampled: u64) -> Self {
+        Self {
+            inserted,
+            rows_sampled,
+        }
+    }
+}
+
 impl std::ops::Add for ShardCounts {
     type Output = Self;
 

@@ -31,6 +31,13 @@ pub struct ActorJoin {
     pub incarnation: u64,
 }
 
+impl ActorJoin {
+    /// The join of this incarnation of an actor.
+    pub const fn new(actor: u32, incarnation: u64) -> Self {
+        Self { actor, incarnation }
+    }
+}
+
 /// A learner starts. From now on, the replay server serves it alone. The same message may be sent any number of times.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LearnerJoin {

@@ -6,13 +6,13 @@ use std::{
     net::IpAddr,
     os::unix::fs::PermissionsExt,
     path::{Path, PathBuf},
-    time::{Duration, SystemTime, UNIX_EPOCH},
+    time::Duration,
 };
 
 use rustls::{
     CertificateError, RootCertStore,
     client::verify_server_cert_signed_by_trust_anchor,
-    crypto::{CryptoProvider, ring},
+    crypto::ring,
     pki_types::{CertificateDer, PrivateKeyDer, UnixTime, pem::PemObject},
     server::{ParsedCertificate, WebPkiClientVerifier},
     sign::CertifiedKey,
@@ -110,7 +110,8 @@ impl Credentials {
                 authority.display()
             ))
         })?;
-        let signer = crypto_provider().key_provider.load_private_key(secret);
+        let provider = ring::default_provider();
+        let signer = provider.key_provider.load_private_key(secret);
         let signer = signer.map_err(|_| pem_error(&key))?;
         let pair = CertifiedKey::new(chain, signer);
         pair.keys_match().map_err(|_| {
@@ -140,7 +141,8 @@ impl Credentials {
 
     /// How long the certificate is still valid.
     pub fn expires_in(&self) -> Duration {
-        let left = self.expires_unix_s.saturating_sub(now().as_secs() as i64);
+        let now = UnixTime::now().as_secs() as i64;
+        let left = self.expires_unix_s.saturating_sub(now);
         Duration::from_secs(u64::try_from(left).unwrap_or(0))
     }
 
@@ -171,16 +173,6 @@ impl Credentials {
             paths.join(", ")
         )
     }
-}
-
-/// The provider of cryptographic algorithms, the same as zenoh's.
-fn crypto_provider() -> CryptoProvider {
-    ring::default_provider()
-}
-
-fn now() -> Duration {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    now.unwrap_or_default()
 }
 
 fn read(path: &Path, role: Role) -> Result<Vec<u8>, TlsError> {
@@ -233,7 +225,7 @@ fn parse<'a>(der: &'a CertificateDer<'_>, path: &Path) -> Result<X509Certificate
 }
 
 fn check_dates(certificate: &X509Certificate<'_>, path: &Path, role: Role) -> Result<(), TlsError> {
-    let (validity, now) = (certificate.validity(), now().as_secs() as i64);
+    let (validity, now) = (certificate.validity(), UnixTime::now().as_secs() as i64);
     let shown = path.display();
     if now > validity.not_after.timestamp() {
         return Err(TlsError(format!(
@@ -265,7 +257,8 @@ fn check_signed(
         e => e.to_string(),
     };
     let (own, others) = (&chain[0], &chain[1..]);
-    let (provider, now) = (crypto_provider(), UnixTime::now());
+    // zenoh uses the same provider of cryptographic algorithms.
+    let (provider, now) = (ring::default_provider(), UnixTime::now());
     if role == Role::ReplayServer {
         let algorithms = provider.signature_verification_algorithms.all;
         let own = ParsedCertificate::try_from(own).map_err(describe)?;

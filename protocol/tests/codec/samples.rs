@@ -134,10 +134,7 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
         state_bytes: 4,
         states_k: 2,
         states_n: 1,
-        counts: ShardCounts {
-            inserted: 99,
-            rows_sampled: 12,
-        },
+        counts: ShardCounts::new(99, 12),
         held: 9,
         mean_age: 12.5,
         weights_versions: (8, 2),
@@ -375,18 +372,12 @@ pub(crate) fn samples() -> Vec<Sample> {
         Sample::new(&learner),
         Sample::new(&run_info),
         Sample::new(&recovering),
-        Sample::new(&ActorJoin {
-            actor: 1,
-            incarnation: 2,
-        }),
+        Sample::new(&ActorJoin::new(1, 2)),
         Sample::new(&LearnerJoin {
             learner: 5,
             run: 1 << 60,
             updates: 9,
-            counts: ShardCounts {
-                inserted: 7,
-                rows_sampled: 8,
-            },
+            counts: ShardCounts::new(7, 8),
             other_shards: ShardCounts::default(),
             restart: true,
         }),

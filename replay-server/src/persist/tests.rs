@@ -29,15 +29,11 @@ fn open(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), Persist
     Ok((replay, recovery.warnings))
 }
 
-const fn join(actor: u32, incarnation: u64) -> ActorJoin {
-    ActorJoin { actor, incarnation }
-}
-
 /// Creates a replay in a new folder, with an actor that has joined.
 fn begin(sampling: Sampling) -> (TempDir, Replay) {
     let folder = tempfile::tempdir().unwrap();
     let (mut replay, _) = open(folder.path(), sampling).unwrap();
-    replay.join_actor(join(0, 1)).unwrap();
+    replay.join_actor(ActorJoin::new(0, 1)).unwrap();
     (folder, replay)
 }
 
@@ -101,7 +97,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     replay.journal.as_mut().unwrap().file = file;
     // The learner's checkpoint begins the first segment after the disk accepts writes again.
     save_checkpoint(&mut replay);
-    replay.join_actor(join(1, 1)).unwrap();
+    replay.join_actor(ActorJoin::new(1, 1)).unwrap();
     let bytes = |replay: &Replay| replay.journal.as_ref().unwrap().bytes();
     let before = bytes(&replay);
     replay.leave(&leave);
@@ -113,10 +109,10 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
 fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
     let (folder, mut replay) = begin(Sampling::default());
     for actor in 0..ACTORS_MAX as u32 {
-        replay.join_actor(join(actor, 1)).unwrap();
+        replay.join_actor(ActorJoin::new(actor, 1)).unwrap();
     }
     replay.forget_absent(|actor, _| actor > 0);
-    replay.join_actor(join(9_999, 1)).unwrap();
+    replay.join_actor(ActorJoin::new(9_999, 1)).unwrap();
     check_comes_back(replay, folder.path());
 }
 
@@ -141,7 +137,7 @@ fn what_cannot_be_read_is_rejected_until_it_is_removed() {
     fs::remove_file(&segment).unwrap();
     let (mut replay, warnings) = open().unwrap();
     assert_eq!((replay.inserted_total(), warnings), (0, vec![]));
-    replay.join_actor(join(0, 1)).unwrap();
+    replay.join_actor(ActorJoin::new(0, 1)).unwrap();
     store(&mut replay, 0);
     check_comes_back(replay, folder.path());
 }

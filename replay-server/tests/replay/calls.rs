@@ -62,12 +62,8 @@ impl Actor {
     }
 }
 
-pub(crate) const fn actor_join(actor: u32, incarnation: u64) -> ActorJoin {
-    ActorJoin { actor, incarnation }
-}
-
 pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
-    replay.join_actor(actor_join(actor, incarnation)).unwrap();
+    replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
 }
 
 pub(crate) const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
@@ -139,8 +135,5 @@ pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> L
 }
 
 pub(crate) const fn counts(inserted: u64, rows_sampled: u64) -> ShardCounts {
-    ShardCounts {
-        inserted,
-        rows_sampled,
-    }
+    ShardCounts::new(inserted, rows_sampled)
 }

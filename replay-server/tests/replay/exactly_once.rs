@@ -3,7 +3,7 @@
 //! It does not look at rows.
 
 use driml_protocol::{
-    Buffer, ChunkHeader, ChunkPoll, Horizon, InsertReply, LearnerJoin, RequestId,
+    ActorJoin, Buffer, ChunkHeader, ChunkPoll, Horizon, InsertReply, LearnerJoin, RequestId,
 };
 use driml_replay_server::{Config, NotReady, Replay};
 use proptest::prelude::*;
@@ -12,8 +12,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     calls::{
-        actor_join, affinity, header, insert, is_refused, join, learned, learner, leave,
-        small_replay, stored,
+        affinity, header, insert, is_refused, join, learned, learner, leave, small_replay, stored,
     },
     history::spec,
 };
@@ -206,9 +205,9 @@ fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
     assert_eq!(insert(&mut replay, header(0, 2, 0, 0)), stored(12));
     let past = insert(&mut replay, header(0, 1, 0, 0));
     assert!(is_refused(&past), "a past life");
-    let again = replay.join_actor(actor_join(0, 2));
+    let again = replay.join_actor(ActorJoin::new(0, 2));
     assert_eq!(again, Ok(1), "one life before it");
-    let back = replay.join_actor(actor_join(0, 1));
+    let back = replay.join_actor(ActorJoin::new(0, 1));
     assert!(back.is_err(), "and it does not come back");
     let status = replay.status();
     assert_eq!((status.chunks_retried, status.transitions_lost), (1, 0));

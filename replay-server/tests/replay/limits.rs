@@ -2,7 +2,7 @@
 //! Rows are checked only for the smallest replay. No message is lost or repeated.
 
 use driml_protocol::{
-    Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, ShardCounts, Waiting,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, ShardCounts, Waiting,
 };
 use driml_replay_server::{
     ACTORS_MAX, Config, NotReady, RateLimiter, RatioStart, Replay, STREAMS_MAX,
@@ -14,8 +14,8 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::check_rows,
     calls::{
-        Actor, actor_join, affinity, counts, header, insert, is_refused, is_stored, join, leave,
-        small_replay, small_spec, stored, wait,
+        Actor, affinity, counts, header, insert, is_refused, is_stored, join, leave, small_replay,
+        small_spec, stored, wait,
     },
     history::{History, spec},
 };
@@ -78,7 +78,7 @@ fn actors_and_streams_are_bounded() {
         assert!(is_stored(&reply), "{reply:?}");
     }
     let one_more = ACTORS_MAX as u32;
-    assert!(replay.join_actor(actor_join(one_more, 1)).is_err());
+    assert!(replay.join_actor(ActorJoin::new(one_more, 1)).is_err());
     let reply = replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)));
     assert!(is_refused(&reply), "{reply:?}");
     replay.leave(&leave(one_more, 1, 6));

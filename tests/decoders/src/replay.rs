@@ -154,16 +154,12 @@ fn send_message(replay: &mut Replay, numbers: &mut NumberReader<'_>) -> Option<(
         _ => {
             let byte = numbers.byte()?;
             if byte % 2 == 0 {
-                let counts = |inserted, rows_sampled| ShardCounts {
-                    inserted,
-                    rows_sampled,
-                };
                 let _ = replay.join_learner(LearnerJoin {
                     learner: numbers.count()?,
                     run: numbers.byte()?.into(),
                     updates: numbers.count()?,
-                    counts: counts(numbers.count()?, numbers.count()?),
-                    other_shards: counts(numbers.count()?, numbers.count()?),
+                    counts: ShardCounts::new(numbers.count()?, numbers.count()?),
+                    other_shards: ShardCounts::new(numbers.count()?, numbers.count()?),
                     restart: byte % 8 == 0,
                 });
                 let _ = replay.set_progress(LearnerProgress {
@@ -188,10 +184,7 @@ fn send_message(replay: &mut Replay, numbers: &mut NumberReader<'_>) -> Option<(
                 };
                 let _ = replay.set_priorities(&update);
             } else {
-                let counts = ShardCounts {
-                    inserted: numbers.count()?,
-                    rows_sampled: numbers.count()?,
-                };
+                let counts = ShardCounts::new(numbers.count()?, numbers.count()?);
                 let _ = replay.set_other_shards(counts);
             }
         }

@@ -103,11 +103,7 @@ pub(crate) fn segments(bytes: &[u8]) {
     assert_eq!(replay.stored_bytes().unwrap(), before);
     // The reopened replay still works.
     let actor = 1000;
-    let join = ActorJoin {
-        actor,
-        incarnation: 1,
-    };
-    if replay.join_actor(join).is_ok() {
+    if replay.join_actor(ActorJoin::new(actor, 1)).is_ok() {
         let mut chunk = Chunk::zeroed(header(actor, 0, 0));
         fill_chunk(&mut chunk, &mut 1);
         let reply = replay.insert(&chunk);
@@ -270,8 +266,7 @@ fn write_log(chunks: u64) -> Vec<u8> {
     let dir = temp_folder();
     let mut replay = open_replay(dir.path()).unwrap();
     for actor in 0..2 {
-        let incarnation = 1;
-        replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+        replay.join_actor(ActorJoin::new(actor, 1)).unwrap();
     }
     let join = LearnerJoin {
         learner: 7,

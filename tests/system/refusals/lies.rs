@@ -15,8 +15,8 @@ use driml_tests::{Client, Process, TestSystem, new_learner, wait_until};
 use zenoh::{Wait, query::Query};
 
 use super::{
-    NO_REPLY, Row, actor_join, affinity, batch_request, check_continues, check_refused,
-    check_replies, chunk_header, encoded, leave, upload,
+    NO_REPLY, Row, affinity, batch_request, check_continues, check_refused, check_replies,
+    chunk_header, encoded, leave, upload,
 };
 use crate::{PRIORITISED, start_run_with, system};
 
@@ -77,7 +77,7 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
         Row::of(client, &join, "Taken {")
     });
     run.check_lies(joins, 0);
-    let join = actor_join(0, INCARNATION);
+    let join = ActorJoin::new(0, INCARNATION);
     run.check_lies([Row::of(client, &join, "Taken {")], 0);
     // The number of the actor differs from that in the key.
     let key = keys.actor_key::<ActorJoin>(UNUSED_ACTOR);
@@ -124,10 +124,7 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
         7,
     );
 
-    let counts = ShardCounts {
-        inserted: u64::MAX,
-        rows_sampled: u64::MAX,
-    };
+    let counts = ShardCounts::new(u64::MAX, u64::MAX);
     let batches = [(16, None), (u32::MAX, None), (16, Some(counts)), (0, None)];
     let batches = batches.map(|(rows, other_shards)| {
         let request = BatchRequest {
@@ -206,7 +203,7 @@ fn forget_4096_strangers(run: &AttackedRun) {
     let tokens: Vec<_> = (0..300)
         .map(|number| stranger.declare_alive(Peer::learner(number)).unwrap())
         .collect();
-    let joins = (0..5_000).map(|number| actor_join(UNUSED_ACTOR + number, INCARNATION));
+    let joins = (0..5_000).map(|number| ActorJoin::new(UNUSED_ACTOR + number, INCARNATION));
     check_replies(
         client,
         joins.map(|it| Row::of(client, &it, "Welcome(Welcome {")),

@@ -11,9 +11,8 @@ mod wrong_place;
 use std::time::Duration;
 
 use driml_protocol::{
-    Ack, ActorJoin, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, InsertReply, JoinReply,
-    Keyed, Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload,
-    codec,
+    Ack, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, InsertReply, JoinReply, Keyed,
+    Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload, codec,
     session::{self, SessionError},
 };
 use driml_tests::{Client, check_nothing_lost};
@@ -62,10 +61,6 @@ const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
         incarnation,
         produced,
     }
-}
-
-pub(crate) const fn actor_join(actor: u32, incarnation: u64) -> ActorJoin {
-    ActorJoin { actor, incarnation }
 }
 
 pub(crate) fn batch_request(learner: u64, rows: u32) -> BatchRequest {

@@ -14,8 +14,8 @@ use driml_tests::{Client, Process, TestSystem, in_parallel, new_learner, wait_un
 use zenoh::{Wait, query::Query, sample::Locality};
 
 use super::{
-    NO_REPLY, Row, actor_join, affinity, batch_request, check_continues, check_replies,
-    chunk_header, encoded, leave, upload,
+    NO_REPLY, Row, affinity, batch_request, check_continues, check_replies, chunk_header, encoded,
+    leave, upload,
 };
 use crate::{LONG, system};
 
@@ -67,7 +67,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
     let leave = leave(other, incarnation, 0);
-    let join = actor_join(other, incarnation);
+    let join = ActorJoin::new(other, incarnation);
     let poll = ChunkPoll {
         actor: other,
         incarnation,
@@ -184,7 +184,7 @@ fn an_observer_only_reads(run: &TlsRun) {
         [
             Row::of(observer, &WeightsRequest::NewerThan(0), NO_REPLY),
             Row::of(observer, &new_learner(1), NO_REPLY),
-            Row::of(observer, &actor_join(1, 1), NO_REPLY),
+            Row::of(observer, &ActorJoin::new(1, 1), NO_REPLY),
             Row::new(keys.actor_key::<ChunkHeader>(1), [0; 100], NO_REPLY),
         ],
     );

@@ -86,18 +86,14 @@ impl Group<'_> {
         if column != "mean_k" || !has_spread {
             return Ok(mean);
         }
-        let (points, spread) = (
-            thin(&mean.points),
-            self.combine_seeds(SD_OF_K, args)?.points,
-        );
+        let points = thin(&mean.points);
+        let spread = self.combine_seeds(SD_OF_K, args)?.points;
         let band = points.iter().map(|&(x, k)| {
             let sd = interpolate(&spread, x);
             (x, (k - sd).max(K_MIN), k + sd)
         });
-        Ok(Curve {
-            band: band.collect(),
-            points,
-        })
+        let band = band.collect();
+        Ok(Curve { points, band })
     }
 
     fn combine_seeds(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
@@ -173,12 +169,10 @@ fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         ends
     };
     let inner = points[1..end].chunks(2 * points.len().div_ceil(POINTS_MAX));
-    let inner = inner.flat_map(extremes);
-    [points[0]]
-        .into_iter()
-        .chain(inner)
-        .chain([points[end]])
-        .collect()
+    let mut thinned = vec![points[0]];
+    thinned.extend(inner.flat_map(extremes));
+    thinned.push(points[end]);
+    thinned
 }
 
 /// Interpolates `points` linearly at `x`; beyond the ends, the value at the end. `points` must be sorted by x and not empty.

@@ -274,9 +274,8 @@ impl Queue {
     fn train_command(&self, plan: &PlannedRun, resumed: bool) -> Command {
         let folder = self.runs.folder(plan);
         let mut command = Command::new(process_env::program_path());
-        command
-            .args(["train", "--no-play"])
-            .args(exit_with_parent_flags());
+        command.args(["train", "--no-play"]);
+        command.args(exit_with_parent_flags());
         if resumed {
             command.arg("--resume").arg(folder.path());
         } else {
@@ -368,16 +367,15 @@ fn wait_for_log_lock(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use driml_protocol::GracefulShutdown;
 
     use super::*;
     use crate::sweep::{plan::TrainCall, runs::tests::write_finished_run};
 
-    /// Creates a queue in `root` with a single plan, whose run is finished.
-    fn queue(root: &Path) -> (Queue, PlannedRun) {
-        let runs = Runs::open(root).unwrap();
+    /// Creates a queue in a folder with a single plan, whose run is finished.
+    fn queue() -> (tempfile::TempDir, Queue, PlannedRun) {
+        let root = tempfile::tempdir().unwrap();
+        let runs = Runs::open(root.path()).unwrap();
         let plan = PlannedRun::new("run", TrainCall::default(), 10);
         write_finished_run(&runs.folder(&plan));
         runs.write_call(&plan, "abc", false).unwrap();
@@ -388,13 +386,12 @@ mod tests {
             waiting: [Job::new(plan.clone())].into(),
             running: Vec::new(),
         };
-        (queue, plan)
+        (root, queue, plan)
     }
 
     #[test]
     fn what_a_resumed_run_did_before_is_no_measure_of_speed() {
-        let root = tempfile::tempdir().unwrap();
-        let (queue, plan) = queue(root.path());
+        let (_root, queue, plan) = queue();
         let metrics = queue.runs.folder(&plan).metrics();
         std::fs::write(metrics, "seconds,frames,episodes\n60,9,0\n").unwrap();
         let mut progress = Progress::new(10, GracefulShutdown::default());
@@ -404,8 +401,7 @@ mod tests {
 
     #[test]
     fn a_run_is_told_its_part_of_the_memory_once() {
-        let root = tempfile::tempdir().unwrap();
-        let (queue, plan) = queue(root.path());
+        let (_root, queue, plan) = queue();
         let share = |resumed| {
             let command = queue.train_command(&plan, resumed);
             let mut shares = command.get_envs().filter(|it| it.0 == MEMORY_SHARE_ENV);
@@ -416,8 +412,7 @@ mod tests {
 
     #[test]
     fn a_checkpoint_is_resumed_from_once_and_kept_while_it_cannot_be() {
-        let root = tempfile::tempdir().unwrap();
-        let (queue, plan) = queue(root.path());
+        let (_root, queue, plan) = queue();
         let folder = queue.runs.folder(&plan);
         std::fs::write(folder.config(), "").unwrap();
         let checkpoint = folder.checkpoints().join("checkpoint-000000000005");
@@ -434,8 +429,7 @@ mod tests {
     /// This happens when a run saves while this call waits for the lock of its log.
     #[test]
     fn a_run_that_finished_meanwhile_is_not_made_again() {
-        let root = tempfile::tempdir().unwrap();
-        let (mut queue, plan) = queue(root.path());
+        let (_root, mut queue, plan) = queue();
         let mut progress = Progress::new(10, GracefulShutdown::default());
         queue.run_jobs(&mut progress).unwrap();
         assert_eq!(queue.runs.get_finished(&plan).unwrap().commit, "abc");

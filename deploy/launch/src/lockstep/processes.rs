@@ -190,10 +190,7 @@ impl Lockstep {
 
     fn join_actors(&mut self) -> anyhow::Result<()> {
         for actor in 0..self.actors.len() as u32 {
-            let join = ActorJoin {
-                actor,
-                incarnation: INCARNATION,
-            };
+            let join = ActorJoin::new(actor, INCARNATION);
             self.replay.join_actor(join).map_err(anyhow::Error::msg)?;
         }
         Ok(())

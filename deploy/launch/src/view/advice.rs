@@ -154,10 +154,8 @@ pub(super) fn notes(view: &RunView) -> Vec<String> {
     if view.is_all_learned() {
         return vec!["all frames and updates are done: the processes exit".into()];
     }
-    let recovering = view
-        .recovering()
-        .map(|(it, how)| describe_recovery(&it.name, how));
-    let recovering: Vec<_> = recovering.collect();
+    let describe = |(it, how): (&ServerAnswer, _)| describe_recovery(&it.name, how);
+    let recovering: Vec<_> = view.recovering().map(describe).collect();
     if !recovering.is_empty() {
         return recovering;
     }
@@ -194,11 +192,8 @@ fn silent_s(process: &ProcessStatus) -> Option<f64> {
     let silent = process.last_seen_s.unwrap_or(process.since_s);
     let doing = process.doing.as_ref();
     let says = doing.map_or(f64::INFINITY, |(_, _, said)| *said);
-    (process.connected
-        && silent > UNRESPONSIVE_S
-        && says > UNRESPONSIVE_S
-        && process.held_s.is_none())
-    .then_some(silent)
+    let is_silent = process.connected && silent > UNRESPONSIVE_S && says > UNRESPONSIVE_S;
+    (is_silent && process.held_s.is_none()).then_some(silent)
 }
 
 /// Notes on the actors that are disconnected or unresponsive: the first ones by name, the others as a count.
@@ -213,8 +208,7 @@ fn unresponsive_actors(view: &RunView) -> Vec<String> {
         Some(format!("{}: {how} for {}", process.who, format_s(since_s)))
     };
     let mut words: Vec<_> = processes(view).filter_map(|it| words(it.1)).collect();
-    let more = words.len().saturating_sub(NAMED_MAX);
-    if more > 0 {
+    if let more @ 1.. = words.len().saturating_sub(NAMED_MAX) {
         words.truncate(NAMED_MAX);
         words.push(format!("and {more} more actors"));
     }

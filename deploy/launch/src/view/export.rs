@@ -50,9 +50,10 @@ pub(crate) fn run_json(view: &RunView) -> serde_json::Result<String> {
     Ok(serde_json::to_string(&answer)? + "\n")
 }
 
-/// Writes the file for Prometheus, whole or not at all.
-pub(crate) fn write_prometheus(path: &Path, view: &RunView) -> Result<(), Usage> {
-    write_file("--prometheus", path, prometheus_text(view).as_bytes())
+/// Writes the file for Prometheus, whole or not at all; nothing without a path.
+pub(crate) fn write_prometheus(path: Option<&Path>, view: &RunView) -> Result<(), Usage> {
+    let write = |path| write_file("--prometheus", path, prometheus_text(view).as_bytes());
+    path.map_or(Ok(()), write)
 }
 
 /// The text of the file. Labels on each line distinguish the runs of one machine.

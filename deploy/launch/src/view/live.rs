@@ -68,17 +68,13 @@ impl Display {
 
     /// Shows the state of the run, and notes below it, such as which process does not answer.
     pub(crate) fn show(&mut self, view: &RunView) {
-        if view
-            .after_updates
-            .is_some_and(|it| view.learner.updates > it)
-        {
+        let has_learned = |before: u64| view.learner.updates > before;
+        if view.after_updates.is_some_and(has_learned) {
             self.learning_since.get_or_insert_with(Instant::now);
         }
         let mut texts = self.lines(view).to_vec();
         let notes = notes(view);
-        if !notes.is_empty() {
-            texts.push(notes.join("; "));
-        }
+        texts.extend((!notes.is_empty()).then(|| notes.join("; ")));
         let frames = view.replay.transitions_inserted;
         let position = frames.min(view.plan.frames_planned);
         self.screen.show(position, |is_bar| match is_bar {
@@ -155,17 +151,13 @@ mod tests {
         testing::{make, view},
     };
 
-    fn display() -> Display {
-        Display::new(8_000, Instant::now())
-    }
-
     fn plan(frames: u64, updates: u64) -> Plan {
         make(|it: &mut Plan| (it.frames_planned, it.updates_planned) = (frames, updates))
     }
 
     #[test]
     fn the_lines_say_what_a_person_wants_to_know() {
-        let mut display = display();
+        let mut display = Display::new(8_000, Instant::now());
         let replay = ReplayStatus {
             transitions_inserted: 33_000,
             rows_sampled: 256_000,
@@ -193,7 +185,7 @@ mod tests {
 
     #[test]
     fn before_the_first_update_there_is_no_loss_and_no_time_left() {
-        let mut display = display();
+        let mut display = Display::new(8_000, Instant::now());
         let mut shown = |frames, updates| {
             let replay = make(|it: &mut ReplayStatus| it.transitions_inserted = frames);
             let learner = make(|it: &mut LearnerStatus| it.updates = updates);

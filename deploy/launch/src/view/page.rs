@@ -150,27 +150,19 @@ fn server_row(server: &ServerAnswer, server_count: usize) -> Vec<String> {
         1 => "replay-server".to_owned(),
         _ => cut_name(&server.endpoint),
     };
-    let without_status = |state: &str, activity: String| {
-        let blank = String::new;
-        vec![
-            name.clone(),
-            state.into(),
-            blank(),
-            blank(),
-            blank(),
-            blank(),
-            activity,
-        ]
+    let without_status = |state: &str, activity: &str| {
+        let cells = [&*name, state, "", "", "", "", activity];
+        cells.map(str::to_owned).to_vec()
     };
     if let Some(progress) = server.recovering {
-        return without_status("recovering", format!("replay read: {progress}"));
+        return without_status("recovering", &format!("replay read: {progress}"));
     }
     let Some(status) = &server.processes else {
         let state = match server.is_gone {
             true => "exited",
             false => "no answer",
         };
-        return without_status(state, String::new());
+        return without_status(state, "");
     };
     let weights = status.weights_age_s.map_or(String::new(), |age| {
         format!("; weights {} old", rough_duration(age))
@@ -181,7 +173,7 @@ fn server_row(server: &ServerAnswer, server_count: usize) -> Vec<String> {
         status.chunk_bytes_waiting as f64 / f64::from(1 << 20),
         count(status.requests_waiting, "request")
     );
-    let mut row = without_status(&format!("up {}", rough_duration(status.up_s)), activity);
+    let mut row = without_status(&format!("up {}", rough_duration(status.up_s)), &activity);
     row[4] = status.weights_version.to_string();
     row
 }

@@ -117,9 +117,7 @@ pub fn run(found: anyhow::Result<Poller>, flags: &WatchFlags) -> anyhow::Result<
 fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     print_status(&mut poller, None, false, flags.json)?;
     poller.close();
-    if let Some(path) = &flags.prometheus {
-        write_prometheus(path, &poller.view)?;
-    }
+    write_prometheus(flags.prometheus.as_deref(), &poller.view)?;
     let needed = actions_needed(&poller.view).join("; ");
     ensure!(needed.is_empty(), "the run needs attention: {needed}");
     Ok(())
@@ -135,9 +133,7 @@ fn wait_until_known(
     let mut limiter = LogLimiter::default();
     loop {
         let view = poller.poll();
-        if let Some(path) = prometheus {
-            write_prometheus(path, view)?;
-        }
+        write_prometheus(prometheus, view)?;
         if view.servers_answered() && view.after_updates.is_some() {
             return Ok(());
         }
@@ -164,9 +160,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
     let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
     poller.poll();
-    if let Some(path) = &flags.prometheus {
-        write_prometheus(path, &poller.view)?;
-    }
+    write_prometheus(flags.prometheus.as_deref(), &poller.view)?;
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
     if is_unknown || poller.view.recovering().next().is_some() {
@@ -188,8 +182,7 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
             break Ok(Outcome::Interrupted);
         }
         poller.poll();
-        if let Some(path) = &flags.prometheus
-            && let Err(failed) = write_prometheus(path, &poller.view)
+        if let Err(failed) = write_prometheus(flags.prometheus.as_deref(), &poller.view)
             && !std::mem::replace(&mut has_warned, true)
         {
             watched.display.screen.print_line(&failed.0);

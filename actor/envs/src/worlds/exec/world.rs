@@ -13,7 +13,7 @@ use super::process::{Exchange, WorldProcess};
 use super::protocol::{
     Block, Declaration, ExecConfig, ExecState, VERSION, WORLD_STATE_BYTES_MAX, fd_path, state_file,
 };
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd, StepResult};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
 use crate::error::{EnvError, require};
 use crate::saved;
@@ -305,12 +305,7 @@ impl Environment for ExecWorld {
             .expect("it is memory of this process, whose size is sealed");
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
         check_step(self.num_envs, self.num_actions(), actions, rewards, ends)?;
         self.process.exchange = self.config.step_wait("in the middle of a step");
         let written = self.block.write_actions(actions);

@@ -35,7 +35,7 @@ mod visible_actions;
 
 use procgen_sys::{FRAME_BYTES, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, FrameShape, StepEnd, StepResult};
 use crate::envs::{check_frames, check_step};
 use crate::error::{EnvError, require};
 use crate::saved;
@@ -224,12 +224,7 @@ impl Environment for ProcgenWorld {
         }
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
+    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
         check_step(self.num_envs(), NUM_ACTIONS, actions, rewards, ends)?;
         let actions: Vec<_> = actions.iter().copied().map(i32::from).collect();
         self.game.act(&actions)?;

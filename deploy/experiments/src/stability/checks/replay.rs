@@ -40,10 +40,7 @@ pub(super) fn new_replay(
         ..Config::unlimited(4096)
     };
     let mut replay = Replay::new(spec, &config, rows)?;
-    let join = ActorJoin {
-        actor: 0,
-        incarnation: 1,
-    };
+    let join = ActorJoin::new(0, 1);
     replay.join_actor(join).map_err(anyhow::Error::msg)?;
     let mut chunk = Chunk::zeroed(ChunkHeader {
         incarnation: 1,

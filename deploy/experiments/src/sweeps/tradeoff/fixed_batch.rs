@@ -35,10 +35,7 @@ pub(super) fn sample(
     let mut actor = Collector::new(&settings, BufferPool::new(1), first, 0, weights)?;
     let held = Config::unlimited((ENVS * CHUNKS * CHUNK_STEPS).into());
     let mut replay = Replay::new(&settings.spec, &held, config.learner.batch_size)?;
-    let join = ActorJoin {
-        actor: first.actor,
-        incarnation: first.id,
-    };
+    let join = ActorJoin::new(first.actor, first.id);
     replay.join_actor(join).map_err(anyhow::Error::msg)?;
     for _ in 0..CHUNKS {
         let reply = replay.insert(&actor.collect(0, CHUNK_STEPS)?);
