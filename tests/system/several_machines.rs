@@ -169,7 +169,7 @@ fn a_narrow_link_stops_no_process() {
     run.check_end();
 }
 
-/// The learner receives 12 kbit/s, so that two batches take longer than a request waits at first.
+/// The learner receives 12 kbit/s, so that a batch takes seconds. Batches that take longer than a request waits at first are not tested.
 #[test]
 fn batches_come_over_a_slow_link() {
     let system = system();

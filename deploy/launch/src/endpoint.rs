@@ -83,7 +83,7 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
             Some(("tcp", address)) => TcpListener::bind(address).map(drop),
             Some(("quic", address)) => UdpSocket::bind(address).map(drop),
             _ if folder.is_some_and(|it| !it.is_dir()) => {
-                Err(Error::other("there is no such folder; make it"))
+                Err(Error::other("its folder does not exist, make it"))
             }
             _ => match reach::check_listening(endpoint) {
                 Ok(()) => Err(ErrorKind::AddrInUse.into()),
