@@ -91,7 +91,7 @@ fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
     }
 }
 
-/// The run draws rows by priority. After a restart, transitions since the last checkpoint have the highest priority, and losses of rows
+/// The run draws rows by priority. After a restart, transitions since the newest snapshot have the highest priority, and losses of rows
 /// that were drawn before the restart are not applied to other rows.
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
@@ -105,7 +105,7 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     let run = system.run_folder("run");
     run.check_finished();
     let log = run.log("replay-server");
-    check_has(&log, &["priorities are those of the last checkpoint"]);
+    check_has(&log, &["priorities are those of the newest snapshot"]);
     assert!(logged_counts::<3>(&log, ROWS_WERE_SET)[0] > 0, "{log}");
 }
 

@@ -52,7 +52,7 @@ pub struct QueueFlags {
     /// Only write figures, data and page of finished runs
     #[arg(long)]
     pub(crate) report: bool,
-    /// Change a setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
+    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) sets: Vec<String>,
 }

@@ -102,7 +102,7 @@ columns! {
         "Mean Q value of the last update's states.",
         Value::Gauge(|it| last_update(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
-        "Mean k of all rows served; of several positives the furthest.",
+        "Mean k of rows with a positive; of several the furthest.",
         Value::Gauge(|it| it.k.map(|it| it.mean));
     "sd_k", "environment steps", "k", "Standard deviation of k":
         "Standard deviation of k over the same rows.",

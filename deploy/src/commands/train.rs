@@ -47,7 +47,7 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     pub(crate) tensorboard: bool,
     /// Play a checkpoint every so many updates, in a separate process that takes a core, and keep the best; writes evaluations.csv.
-    /// Unless it is a multiple of 1,000, checkpoints are saved at this period, too. `driml evaluate RUN --checkpoint best` plays the best
+    /// Unless it is a multiple of 1,000, checkpoints are saved at this period instead. `driml evaluate RUN --checkpoint best` plays the best
     #[arg(long, alias = "evaluate-every", value_name = "UPDATES", value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) eval_interval: Option<u64>,
     /// Episodes per evaluation

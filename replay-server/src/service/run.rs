@@ -227,7 +227,7 @@ fn recover_replay(
         );
         if replay.priority_counts().is_some() {
             tracing::info!(
-                "priorities are those of the last checkpoint: each transition that came later has the highest one"
+                "priorities are those of the newest snapshot: each transition that came later has the highest one"
             );
         }
     } else {
