@@ -6,7 +6,8 @@ use std::{sync::Arc, time::Duration};
 use anyhow::Context;
 use driml_envs::WorldName;
 use driml_protocol::{
-    Activity, ActorJoin, Keys, Participant, RunClient, Shutdown, join, reporter,
+    Activity, ActorJoin, ChunkPoll, InsertReply, Keys, Participant, RunClient, Shutdown, join,
+    reporter,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -21,6 +22,8 @@ use crate::{
 
 /// How long an actor waits for the learner's first weights.
 const FIRST_WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
+/// Time-out of the question whether the run is over.
+const ASK_MAX: Duration = Duration::from_secs(2);
 
 /// The arguments of one actor process. All other settings come from the replay server.
 #[derive(Clone, Debug)]
@@ -103,15 +106,22 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         earlier_incarnations: welcome.earlier_incarnations,
     };
     let version = first.header.version;
-    // A world in its own process may take minutes to start.
+    let poll = ChunkPoll {
+        actor: join.actor,
+        incarnation: join.incarnation,
+        sequence: 0,
+        leaving: false,
+    };
+    let is_over = || matches!(client.ask(&poll, ASK_MAX), Ok(InsertReply::Finished { .. }));
+    // A world in its own process may take minutes to start. The replay server exits soon after the run.
     let built = {
         let (settings, pool) = (settings.clone(), pool.clone());
         let build =
             move || Collector::new(&settings, pool, incarnation, version, &first.safetensors);
-        shutdown.run_unless_set("environments", build)?
+        shutdown.run_unless_set("environments", build, is_over)?
     };
     let Some(collector) = built else {
-        return Ok(false);
+        return Ok(!shutdown.is_set());
     };
     let mut collector = collector?;
     let newest = weights::start_puller(client.clone(), version, shutdown.clone())?;
@@ -137,7 +147,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let is_finished = delivery.progress().is_finished;
     let produced = collector.transitions_recorded();
     activity.begin("delivers its last chunks");
-    let delivered = delivery.finish();
+    let delivered = delivery.finish(result.is_err());
     if let (Err(_), Err(e)) = (&result, &delivered) {
         tracing::warn!("some transitions from before the error were not delivered: {e}");
     }

@@ -130,7 +130,7 @@ pub(crate) fn wait_for_first(
         // A frozen replay server does not keep the actor from exiting.
         let send = move |request, timeout| send(&from, &buffers, request, timeout);
         let first = move || pull(0, send);
-        let Some(pulled) = shutdown.run_unless_set("first-weights", first)? else {
+        let Some(pulled) = shutdown.run_unless_set("first-weights", first, || false)? else {
             return Ok(None);
         };
         let error = pulled.as_ref().err().and_then(|e| e.downcast_ref());

@@ -99,7 +99,7 @@ impl Command {
             Self::Learner(args) => learner::run(args),
             Self::Status(args) => watch::status(&args),
             Self::Watch(args) => watch::run(&args),
-            Self::Evaluate(args) => evaluate::run(&args),
+            Self::Evaluate(args) => evaluate::run(args),
             Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),
             Self::Plot(args) => plot::run(&args),

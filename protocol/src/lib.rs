@@ -9,7 +9,7 @@
 //! use driml_protocol::{Leave, codec};
 //!
 //! let run = 0x0c6c_6069_564f_3984; // RunSpec::hash
-//! let leave = Leave { actor: 3, incarnation: 7, produced: 4096 };
+//! let leave = Leave::new(3, 7, 4096);
 //! let bytes = codec::encode(run, &leave, &[])?;
 //!
 //! let (back, payload) = codec::decode::<Leave>(&bytes, Some(run))?;

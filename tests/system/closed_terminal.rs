@@ -60,7 +60,8 @@ fn a_closed_window_saves_the_run() {
     let launcher = spawn(&system, &run, terminal.try_clone().unwrap(), terminal);
     system.connect().wait_for_updates(100);
     wait_until("the progress bar", || {
-        window.stdout().contains("replay ratio 7")
+        let shown = window.stdout();
+        shown.contains("replay ratio 7") && shown.ends_with('\r')
     });
     window.kill();
     check_ended_saved(&system, launcher);

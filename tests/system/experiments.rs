@@ -307,6 +307,8 @@ fn a_grid_makes_every_combination_once() {
     let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";
     let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
     let printed = system.run_ok(&format!("{call} --jobs 2")).stdout;
+    let is_narrow = |line: &str| line.len() <= 80;
+    assert!(printed.lines().take(5).all(is_narrow), "{printed}");
     let folder = system.path("experiments/sweep");
     assert!(printed.ends_with("sweep.svg\n"), "{printed}");
     let table = || system.run_folder("experiments/sweep").table("sweep.csv");

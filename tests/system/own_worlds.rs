@@ -27,7 +27,7 @@ fn numbered_world(fault: &str) -> String {
 #[test]
 fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let system = system();
-    let env = numbered_world("");
+    let env = numbered_world("hang $HANG_AT");
     let flags = format!("{SMALL_WORLD} --agent driml-ada --frames 1280 --env '{env}'");
     let limit = "--set world.step_timeout_ms=50000";
     let summary = system.train(&format!("{flags} {limit} --actors 2"), "run");
@@ -53,6 +53,10 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
     assert_eq!(system.running_processes(), []);
+    let mut hanging = system.start("env HANG_AT=2 DRIML evaluate --run run");
+    hanging.wait_for_stderr("sleeping");
+    hanging.stop(130);
+    system.wait_until_all_have_ended();
 }
 
 #[test]
@@ -115,7 +119,7 @@ fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored
 fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let system = system();
     let env = numbered_world("");
-    let flags = format!("{SMALL_WORLD} --agent c51 --frames 100000000 --env '{env}'");
+    let flags = format!("{SMALL_WORLD} --agent c51 --frames 1280 --env '{env}'");
     let server = system.start_replay_server(&flags);
     let learner = system.start_learner("run");
     system
@@ -127,14 +131,15 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let actor = |flags: &str| system.start_process(&system.connect_args(&format!("actor {flags}")));
     let rejected = actor("--env chain").wait().expect_code(64);
     rejected.expect_stderr("and not chain");
-    // An actor whose world takes long to start stops at once.
-    let mut starting = actor("--id 2 --env 'exec:echo starts >&2; exec sleep 100'");
-    starting.wait_for_stderr("starts");
-    starting.stop(130);
+    // An actor whose world takes long to start stops at once, and with the run.
+    let slow = "--env 'exec:echo starts >&2; exec sleep 1000'";
+    let [mut stopped, mut starting] = [2, 3].map(|id| actor(&format!("--id {id} {slow}")));
+    stopped.wait_for_stderr("starts");
+    stopped.stop(130);
     // The same world by another command, as another machine may have it. This world will hang.
     let mut hanging = actor(&format!("--id 1 --env '{}'", numbered_world("hang 50")));
     let client = system.connect();
-    client.wait_for_replay("the actor", |replay| replay.actors == 1);
+    client.wait_for_replay("the actor", |replay| replay.actors == 2);
     hanging.wait_for_stderr("sleeping");
     // A world's process that ignores its pipes does not outlive its actor, however the actor ends.
     let worlds = || {
@@ -145,9 +150,13 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     assert_eq!(worlds(), 1);
     hanging.kill();
     wait_until("the world's end", || worlds() == 0);
+    starting.wait_for_stderr("starts");
+    actor(&format!("--id 1 --env '{env}'")).wait_ok();
+    starting.wait_ok();
+    client.wait_for_the_last_update();
     drop(client);
-    learner.stop(130);
-    server.stop(130);
+    learner.stop(0);
+    server.stop(0);
     system.wait_until_all_have_ended();
 }
 

@@ -43,12 +43,19 @@ fn missing_processes_are_named_with_what_to_do() {
     learner.wait_for_stderr("waiting for a batch for 10 s: warm-up 0/");
     server.wait_for_stderr("no actor has joined yet; waiting for");
 
-    let actors = [system.start_actor(0), system.start_actor(5)];
+    let [_stays, leaves] = [0, 5].map(|id| system.start_actor(id));
     let words = ["actor-0 ", "actor-5 ", "learns (", "nothing is missing"];
-    let text = wait_for_status(&system, &words);
-    assert!(!text.contains("DOWN"), "{text}");
-
-    actors[1].signal(Signal::SIGKILL);
+    wait_for_status(&system, &words);
+    // An actor that is stopped is not missing, and one that is killed is.
+    client.wait_for_replay("both actors", |it| it.actors_acting == 2);
+    leaves.stop(130);
+    wait_until("a status without it", || {
+        let text = status_text(&system);
+        text.contains("nothing is missing") && !text.contains("actor-5")
+    });
+    let killed = system.start_actor(5);
+    wait_for_status(&system, &["actor-5 up "]);
+    killed.signal(Signal::SIGKILL);
     client.wait_for_replay("one actor", |it| it.actors == 1);
     let again = format!("`driml actor --connect {endpoint} --id 5`");
     wait_for_status(

@@ -79,7 +79,7 @@ impl SyntheticActor {
 
     /// Delivers the remaining chunks, and returns the number of transitions sent.
     pub(crate) fn finish(self) -> u64 {
-        assert_eq!(self.delivery.finish().unwrap(), 0);
+        assert_eq!(self.delivery.finish(false).unwrap(), 0);
         self.next.first_transition
     }
 }

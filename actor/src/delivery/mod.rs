@@ -97,11 +97,12 @@ impl Delivery {
         self.queue.send(chunk).is_ok()
     }
 
-    /// Waits until the last chunk is settled and `Leave` is sent. Returns the number of transitions that the run no longer wanted.
+    /// Waits until the last chunk is settled and `Leave` is sent, unless the actor `has_failed`. Returns the number of unwanted transitions.
     ///
     /// # Errors
     /// The replay server was unreachable for too long, rejected a chunk, or did not store it in time after a shutdown.
-    pub fn finish(self) -> anyhow::Result<u64> {
+    pub fn finish(self, has_failed: bool) -> anyhow::Result<u64> {
+        lock(&self.state.progress).has_failed = has_failed;
         drop(self.queue);
         let panicked = |_| anyhow::anyhow!("the delivery thread panicked");
         self.thread.join().map_err(panicked)?

@@ -131,12 +131,10 @@ impl DeliveryWorker {
             lock(&self.state.progress).in_flight -= 1;
             self.state.settled.notify_all();
         }
-        if let Some((actor, incarnation)) = sender {
-            self.send_leave(Leave {
-                actor,
-                incarnation,
-                produced: produced - unwanted,
-            });
+        // Lost transitions are counted in any case.
+        let is_missing = result.is_ok() && lock(&self.state.progress).has_failed;
+        if let Some((actor, incarnation)) = sender.filter(|_| !is_missing) {
+            self.send_leave(Leave::new(actor, incarnation, produced - unwanted));
         }
         result.map(|()| unwanted)
     }

@@ -9,6 +9,8 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::{managed_process::ManagedProcess, output};
+use driml_machine::error::usage;
+use driml_protocol::tls::{Credentials, Role};
 
 use crate::{
     flags::BenchReplayArgs,
@@ -28,6 +30,9 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     }
     let dir = args.replay_dir.as_deref();
     dir.map_or(Ok(()), |it| output::check_folder("--replay-dir", it))?;
+    if let Some(dir) = &args.tls_dir {
+        Credentials::read_quietly(dir, Role::ReplayServer).map_err(|e| usage!("{e}"))?;
+    }
     let recording = Recording::record()?;
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
     let socket = format!("unixsock-stream/{}/s", folder.path().display());

@@ -106,7 +106,7 @@ impl Server {
                 break;
             }
         }
-        let unwanted = delivery.finish()?;
+        let unwanted = delivery.finish(false)?;
         drop(alive);
         let seconds = started.elapsed().as_secs_f64();
         ensure!(

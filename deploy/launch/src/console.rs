@@ -14,9 +14,10 @@ use console::Term;
 use driml_machine::units::count;
 use driml_protocol::{LogLimiter, last_warning, lock};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use tracing::{Event, Level, Subscriber, field::Field};
+use tracing::{Event, Level, Metadata, Subscriber, field::Field};
 use tracing_subscriber::{
-    EnvFilter, Layer,
+    EnvFilter, Layer, Registry,
+    filter::{FilterExt, dynamic_filter_fn},
     layer::{Context as LayerContext, SubscriberExt},
     util::SubscriberInitExt,
 };
@@ -186,6 +187,11 @@ pub fn log_to_stderr() {
             default()
         })
     });
+    // A client without a certificate may try to connect ten times a second.
+    let rejections = Mutex::new(LogLimiter::default());
+    let rare = dynamic_filter_fn(move |it: &Metadata<'_>, _: &LayerContext<'_, Registry>| {
+        !it.target().starts_with("zenoh_link_commons::quic") || lock(&rejections).admit().is_some()
+    });
     let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)
         // It would report a stderr that cannot be written to with `eprintln!`, which panics then.
@@ -193,7 +199,7 @@ pub fn log_to_stderr() {
         .with_ansi(stderr().is_terminal())
         // Module paths are for debugging only.
         .with_target(is_debugged)
-        .with_filter(filter.clone());
+        .with_filter(filter.clone().and(rare.with_max_level_hint(Level::TRACE)));
     tracing_subscriber::registry()
         .with(log)
         .with(LastWarning.with_filter(filter))
@@ -282,6 +288,8 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.set_position(position);
             bar.set_message(text(true));
+            // The cursor is now behind the bar, where a terminal shows `^C` in a line that removing the bar does not count.
+            let _ = stderr().write_all(b"\r");
         } else if self.next_plain_line.is_none_or(|next| now >= next) {
             self.next_plain_line = Some(now + PLAIN_PERIOD);
             self.print_line(&text(false));

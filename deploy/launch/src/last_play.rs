@@ -4,6 +4,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::ensure;
+use driml_protocol::Shutdown;
 use driml_settings::config::RunConfig;
 
 use crate::{
@@ -20,12 +21,13 @@ const BATCHES_MAX: u32 = 5;
 const PLAY_MAX: Duration = Duration::from_secs(30);
 const FIRST_BATCH_MAX: Duration = Duration::from_secs(120);
 
-/// Plays the weights of a finished run and adds their returns to its summary, if the settings ask for it. Stops once `is_stopped`.
+/// Plays the weights of a finished run and adds their returns to its summary, if the settings ask for it. Ends at a `shutdown`, on a thread
+/// because the world may hang.
 pub(crate) fn play(
     summary: &mut Summary,
     config: &RunConfig,
     folder: &RunFolder,
-    is_stopped: &dyn Fn() -> bool,
+    shutdown: &Shutdown,
 ) {
     if !config.local.play {
         return;
@@ -33,8 +35,12 @@ pub(crate) fn play(
     console::eprintln(
         "playing the weights beside a random policy, for at most about 30 s (skip it with Ctrl-C or --no-play)",
     );
-    let noted = played(folder, is_stopped).and_then(|played| {
-        summary.played = played;
+    let (run, flag) = (folder.clone(), shutdown.clone());
+    let work = move || played(&run, &|| flag.is_set());
+    let played = shutdown.run_unless_set("last-play", work, || false);
+    let played = played.map_err(anyhow::Error::from);
+    let noted = played.and_then(|played| {
+        summary.played = played.transpose()?.flatten();
         summary.write(folder)
     });
     if let Err(e) = noted {
@@ -97,7 +103,7 @@ mod tests {
         let mut summary = Summary::new(Outcome::Finished, &view, 2.0, ResumePoint::default());
         let before = summary.clone();
         let folder = RunFolder::new("no-such-run");
-        play(&mut summary, &config, &folder, &|| false);
+        play(&mut summary, &config, &folder, &Shutdown::default());
         assert_eq!(summary, before);
     }
 }

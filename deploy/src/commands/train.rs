@@ -1,7 +1,7 @@
 //! `driml train`: prepares settings, plan, engine and run folder, and then runs as separate processes or in lockstep.
 //! `driml_launch::launcher` starts and ends the processes.
 
-use std::{iter, path::PathBuf};
+use std::{fs, io::ErrorKind, iter, path::PathBuf};
 
 use anyhow::bail;
 use clap::Args;
@@ -134,8 +134,8 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let run_dir = match args.resume {
         Some(folder) => RunFolder::new(folder),
         None => {
-            let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
-            let run_dir = RunFolder::new(run_dir);
+            let default = || default_run_dir("runs", &config.run);
+            let run_dir = RunFolder::new(args.run_dir.unwrap_or_else(default));
             run_dir.check_free().map(|()| run_dir)?
         }
     };
@@ -193,14 +193,17 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn default_run_dir(run: &RunSpec) -> PathBuf {
+/// Makes a run's folder, whose name is not that of another run. `check_free` reports a folder that cannot be made.
+fn default_run_dir(parent: &str, run: &RunSpec) -> PathBuf {
     let (world, agent, seed) = (file_name_of(&run.world), &run.agent, run.seed);
     let time = jiff::Timestamp::now().strftime("%Y%m%d-%H%M%S");
-    let name = format!("runs/{world}-{agent}-seed{seed}-{time}");
-    // Another run may have started in the same second.
+    let name = format!("{parent}/{world}-{agent}-seed{seed}-{time}");
+    // Another run may start in the same second, while this one installs the engine.
     let others = (2..).map(|number| format!("{name}-{number}"));
     let mut paths = iter::once(name.clone()).chain(others).map(PathBuf::from);
-    let unused = paths.find(|path| !path.exists());
+    let _ = fs::create_dir_all(parent);
+    let made = |path: &PathBuf| fs::create_dir(path).map_err(|e| e.kind());
+    let unused = paths.find(|path| made(path) != Err(ErrorKind::AlreadyExists));
     unused.expect("numbers do not end")
 }
 
@@ -214,6 +217,14 @@ fn file_name_of(world: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn runs_that_start_at_once_have_separate_folders() {
+        let root = tempfile::tempdir().unwrap();
+        let parent = root.path().to_str().unwrap();
+        let [one, other] = [(); 2].map(|()| default_run_dir(parent, &RunSpec::smallest()));
+        assert!(one != other && one.is_dir() && other.is_dir());
+    }
 
     #[test]
     fn the_folder_of_a_run_is_named_after_its_world() {

@@ -98,3 +98,14 @@ pub struct Leave {
     /// Transitions produced, without those to which the replay server replied `Finished`. Rejected ones count as lost.
     pub produced: u64,
 }
+
+impl Leave {
+    /// The last message of this incarnation of an actor.
+    pub const fn new(actor: u32, incarnation: u64, produced: u64) -> Self {
+        Self {
+            actor,
+            incarnation,
+            produced,
+        }
+    }
+}

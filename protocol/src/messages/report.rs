@@ -180,7 +180,7 @@ pub struct ProcessesStatus {
     pub log: Option<LogStatus>,
     /// The last warning in the replay server's own log.
     pub last_warning: Option<Warning>,
-    /// The learner, then the actors by number.
+    /// The learner, then the actors by number, without those that have left.
     pub processes: Vec<ProcessStatus>,
 }
 

@@ -52,11 +52,13 @@ impl Shutdown {
         while !self.wait_timeout(Duration::from_secs(3600)) {}
     }
 
-    /// Runs `work` on a thread of this `name` and returns its result; `None` if the flag is raised first. The thread then runs unattended.
+    /// Runs `work` on a thread of this `name` and returns its result. `None` if it has none soon after the flag is raised, or after
+    /// `is_over`, which is called once a second, returns true: the thread then runs unattended.
     pub fn run_unless_set<T: Send + 'static>(
         &self,
         name: &'static str,
         work: impl FnOnce() -> T + Send + 'static,
+        is_over: impl Fn() -> bool,
     ) -> std::io::Result<Option<T>> {
         let (sender, receiver) = mpsc::channel();
         let thread = std::thread::Builder::new().name(name.into());
@@ -65,14 +67,16 @@ impl Shutdown {
             // The receiver is gone if the flag was raised meanwhile.
             let _ = sender.send(work());
         })?;
-        loop {
+        for tick in 1_u64.. {
             match receiver.recv_timeout(TICK) {
                 Ok(result) => return Ok(Some(result)),
+                Err(_) if self.is_set() || tick.is_multiple_of(20) && is_over() => break,
                 // A thread that panics sends nothing; the panic ends the process.
-                Err(_) if self.is_set() => return Ok(None),
                 Err(_) => {}
             }
         }
+        // Work that checks the flag itself ends in order.
+        Ok(receiver.recv_timeout(10 * TICK).ok())
     }
 
     /// A flag that is raised at the first reason to exit: a signal, a closed terminal or stderr, or the death of the process `parent`.
@@ -159,15 +163,14 @@ mod tests {
     #[test]
     fn work_that_takes_too_long_is_left_when_the_flag_is_raised() {
         let shutdown = Shutdown::default();
-        assert_eq!(shutdown.run_unless_set("work", || 5).unwrap(), Some(5));
-        let (until, released) = mpsc::channel::<()>();
-        let raised = shutdown.clone();
-        let work = move || {
-            raised.set();
-            released.recv()
+        let run = |work: fn() -> u8, over: bool| shutdown.run_unless_set("work", work, || over);
+        let hang: fn() -> u8 = || loop {
+            std::thread::park();
         };
-        assert_eq!(shutdown.run_unless_set("work", work).unwrap(), None);
-        drop(until);
+        assert_eq!(run(|| 5, false).unwrap(), Some(5));
+        assert_eq!(run(hang, true).unwrap(), None);
+        shutdown.set();
+        assert_eq!(run(hang, false).unwrap(), None);
     }
 
     #[test]

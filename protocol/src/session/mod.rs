@@ -88,7 +88,7 @@ pub fn open_unless(
     let (keys, credentials) = (keys.clone(), credentials.cloned());
     let failed = endpoints.clone();
     let open = move || open_as(&endpoints, &keys, credentials.as_deref(), message_bytes_max);
-    match shutdown.run_unless_set("connecting", open) {
+    match shutdown.run_unless_set("connecting", open, || false) {
         Ok(opened) => opened.transpose(),
         Err(e) => Err(failed.open_error(&format!("starting a thread: {e}"))),
     }

@@ -328,11 +328,6 @@ pub(crate) fn samples() -> Vec<Sample> {
         },
         config_toml: "[run]\nseed = 1\n".into(),
     };
-    let leave = Leave {
-        actor: 1,
-        incarnation: 2,
-        produced: 3,
-    };
     let mut samples: Vec<Sample> = replies.iter().map(Sample::new).collect();
     let joined = [
         JoinReply::Welcome(Welcome {
@@ -366,7 +361,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         Sample::new(&affinity),
         Sample::new(&priority_update()),
         Sample::new(&WeightsVersion { version: 9 }),
-        Sample::new(&leave),
+        Sample::new(&Leave::new(1, 2, 3)),
         Sample::new(&ReplayStatus::default()),
         Sample::new(&replay),
         Sample::new(&learner),

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use driml_protocol::{ActorJoin, ChunkHeader, ChunkPoll, Leave, Totals};
+use driml_protocol::{ActorJoin, ChunkHeader, ChunkPoll, Leave, ProcessName, Totals};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
@@ -130,6 +130,12 @@ impl Actors {
     /// Returns the current incarnation of `actor`; `None` before the first.
     pub(crate) fn current_incarnation(&self, actor: u32) -> Option<u64> {
         self.actors.get(&actor).map(|it| it.current.incarnation)
+    }
+
+    /// Whether this is an actor whose current incarnation has sent its `Leave`.
+    pub(crate) fn has_left(&self, who: ProcessName) -> bool {
+        let has_left = |actor| self.actors.get(&actor).map(|it| it.current.has_left);
+        matches!(who, ProcessName::Actor(actor) if has_left(actor) == Some(true))
     }
 
     /// Returns the actor, if `incarnation` is its current one.

@@ -87,11 +87,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     };
     replay.join_learner(learner).unwrap();
     let file = refuse(&mut replay);
-    let leave = Leave {
-        actor: 0,
-        incarnation: 1,
-        produced: 0,
-    };
+    let leave = Leave::new(0, 1, 0);
     replay.leave(&leave);
     assert!(replay.is_disk_failing());
     replay.journal.as_mut().unwrap().file = file;

@@ -93,6 +93,9 @@ impl Service {
             ProcessName::Actor(actor) => state.chunks.arrival(actor),
             ProcessName::Learner => state.requests.iter().map(|it| it.arrived).min(),
         };
+        // An actor that has left is not missing.
+        let mut processes = state.participants.processes(now, held_since);
+        processes.retain(|it| it.connected || !state.replay.state.actors.has_left(it.who));
         let status = ProcessesStatus {
             up_s: state.participants.up_s(now),
             waiting,
@@ -105,7 +108,7 @@ impl Service {
             log: state.replay.journal.as_ref().map(Journal::status),
             last_warning: last_warning::get()
                 .map(|(text, age)| Warning::new(&text, age.as_secs_f64())),
-            processes: state.participants.processes(now, held_since),
+            processes,
         };
         drop(state);
         incoming.into_responder().reply(&status);

@@ -58,20 +58,12 @@ impl Actor {
 
     pub(crate) const fn leave(&self) -> Leave {
         let next = &self.next;
-        leave(next.actor, next.incarnation, next.first_transition)
+        Leave::new(next.actor, next.incarnation, next.first_transition)
     }
 }
 
 pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
     replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
-}
-
-pub(crate) const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
-    Leave {
-        actor,
-        incarnation,
-        produced,
-    }
 }
 
 pub(crate) const fn affinity(version: u64, matrix: Vec<f32>) -> AffinityUpdate {

@@ -3,7 +3,7 @@
 //! It does not look at rows.
 
 use driml_protocol::{
-    ActorJoin, Buffer, ChunkHeader, ChunkPoll, Horizon, InsertReply, LearnerJoin, RequestId,
+    ActorJoin, Buffer, ChunkHeader, ChunkPoll, Horizon, InsertReply, LearnerJoin, Leave, RequestId,
 };
 use driml_replay_server::{Config, NotReady, Replay};
 use proptest::prelude::*;
@@ -11,9 +11,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{
-        affinity, header, insert, is_refused, join, learned, learner, leave, small_replay, stored,
-    },
+    calls::{affinity, header, insert, is_refused, join, learned, learner, small_replay, stored},
     history::spec,
 };
 
@@ -61,7 +59,7 @@ proptest! {
         }
         let produced: Vec<u64> = (0..actors).map(|actor| first(actor, chunks)).collect();
         for (actor, &produced) in produced.iter().enumerate() {
-            replay.leave(&leave(actor as u32, 9, produced));
+            replay.leave(&Leave::new(actor as u32, 9, produced));
         }
         let status = replay.status();
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
@@ -171,7 +169,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
             match *message {
                 Joins(actor, incarnation) => join(&mut replay, actor, incarnation),
                 Leaves(actor, incarnation, produced) => {
-                    replay.leave(&leave(actor, incarnation, produced));
+                    replay.leave(&Leave::new(actor, incarnation, produced));
                 }
                 Sends(actor, incarnation, sequence, first) => {
                     insert(&mut replay, header(actor, incarnation, sequence, first));
@@ -192,13 +190,13 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
 fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
     let mut replay = small_replay(&Config::unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
-    replay.leave(&leave(0, 1, 6));
+    replay.leave(&Leave::new(0, 1, 6));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     let unknown = insert(&mut replay, header(0, 2, 0, 0));
     assert!(is_refused(&unknown), "a life that has not joined");
     // Nor does a `Leave` make the incarnation join.
-    replay.leave(&leave(0, 2, 6));
+    replay.leave(&Leave::new(0, 2, 6));
     join(&mut replay, 0, 2);
     let early = insert(&mut replay, header(0, 2, 1, 6));
     assert_eq!(early, InsertReply::OutOfOrder { expected: 0 });

@@ -2,7 +2,7 @@
 //! Rows are checked only for the smallest replay. No message is lost or repeated.
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, ShardCounts, Waiting,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, Leave, RunSpec, ShardCounts, Waiting,
 };
 use driml_replay_server::{
     ACTORS_MAX, Config, NotReady, RateLimiter, RatioStart, Replay, STREAMS_MAX,
@@ -14,7 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::check_rows,
     calls::{
-        Actor, affinity, counts, header, insert, is_refused, is_stored, join, leave, small_replay,
+        Actor, affinity, counts, header, insert, is_refused, is_stored, join, small_replay,
         small_spec, stored, wait,
     },
     history::{History, spec},
@@ -81,7 +81,7 @@ fn actors_and_streams_are_bounded() {
     assert!(replay.join_actor(ActorJoin::new(one_more, 1)).is_err());
     let reply = replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)));
     assert!(is_refused(&reply), "{reply:?}");
-    replay.leave(&leave(one_more, 1, 6));
+    replay.leave(&Leave::new(one_more, 1, 6));
     assert_eq!(replay.status().transitions_lost, 0);
     let last = insert(&mut replay, header(one_more - 1, 1, 1, 6));
     assert!(is_stored(&last), "the known ones continue");
@@ -128,7 +128,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     assert_eq!(replay.waiting(), Waiting::Finished);
     // 48 rows for 12 transitions after the warm-up.
     assert_eq!(replay.status().replay_ratio(), Some(4.0));
-    replay.leave(&leave(0, 1, 12));
+    replay.leave(&Leave::new(0, 1, 12));
     assert_eq!(replay.status().transitions_lost, 0);
 }
 

@@ -112,11 +112,7 @@ fn send_message(replay: &mut Replay, numbers: &mut NumberReader<'_>) -> Option<(
             }
         }
         3 => {
-            let leave = Leave {
-                actor: numbers.actor()?,
-                incarnation: numbers.count()?,
-                produced: numbers.count()?,
-            };
+            let leave = Leave::new(numbers.actor()?, numbers.count()?, numbers.count()?);
             replay.leave(&leave);
         }
         4 => {

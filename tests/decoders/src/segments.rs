@@ -292,12 +292,7 @@ fn write_log(chunks: u64) -> Vec<u8> {
             affinity.version += 1;
         }
     }
-    let refused = replay.leave(&Leave {
-        actor: 1,
-        incarnation: 1,
-        produced: 0,
-    });
-    assert_eq!(refused, None);
+    assert_eq!(replay.leave(&Leave::new(1, 1, 0)), None);
     drop(replay);
     let mut files: Vec<_> = fs::read_dir(dir.path())
         .unwrap()

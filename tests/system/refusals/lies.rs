@@ -16,7 +16,7 @@ use zenoh::{Wait, query::Query};
 
 use super::{
     NO_REPLY, Row, affinity, batch_request, check_continues, check_refused, check_replies,
-    chunk_header, encoded, leave, upload,
+    chunk_header, encoded, upload,
 };
 use crate::{PRIORITISED, start_run_with, system};
 
@@ -87,15 +87,15 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
     client.join_as_actor(UNUSED_ACTOR, INCARNATION);
     let row = |leave| Row::of(client, &leave, "Ack");
     let leaves = [
-        leave(0, INCARNATION, 0),
-        leave(0, INCARNATION, u64::MAX),
-        leave(0, u64::MAX, 1000),
-        leave(UNUSED_ACTOR, INCARNATION + 1, 1000),
-        leave(UNUSED_ACTOR, INCARNATION, 1 << 60),
-        leave(UNUSED_ACTOR + 1, INCARNATION, 1 << 60),
+        Leave::new(0, INCARNATION, 0),
+        Leave::new(0, INCARNATION, u64::MAX),
+        Leave::new(0, u64::MAX, 1000),
+        Leave::new(UNUSED_ACTOR, INCARNATION + 1, 1000),
+        Leave::new(UNUSED_ACTOR, INCARNATION, 1 << 60),
+        Leave::new(UNUSED_ACTOR + 1, INCARNATION, 1 << 60),
     ];
     run.check_lies(leaves.map(row), 6);
-    run.check_lies((0..1000).map(|_| row(leave(0, INCARNATION, 1))), 1000);
+    run.check_lies((0..1000).map(|_| row(Leave::new(0, INCARNATION, 1))), 1000);
 
     let chunk = |change: &dyn Fn(&mut ChunkHeader), expected| {
         let mut header = chunk_header(client, UNUSED_ACTOR, INCARNATION);
@@ -216,7 +216,7 @@ fn forget_4096_strangers(run: &AttackedRun) {
     actor.stop(130).expect_stderr("leaves: ");
     client.wait_for_replay("one actor", |replay| replay.actors == 1);
     // A forgotten actor leaves with a count that no run reaches.
-    let leave = leave(UNUSED_ACTOR, INCARNATION, 1 << 60);
+    let leave = Leave::new(UNUSED_ACTOR, INCARNATION, 1 << 60);
     run.check_lies([Row::of(client, &leave, "Ack")], 1);
 }
 
@@ -276,7 +276,7 @@ fn reject_public_marks(run: &AttackedRun) {
         let Peer { process, hash } = client.keys.peer(token.key_expr().as_str()).unwrap();
         // The public hash does not work in place of the secret number.
         rows.push(match process {
-            ProcessName::Actor(actor) => Row::of(client, &leave(actor, hash, 0), "Ack"),
+            ProcessName::Actor(actor) => Row::of(client, &Leave::new(actor, hash, 0), "Ack"),
             ProcessName::Learner => {
                 let bytes = upload(client.spec.hash(), hash, 1 << 19, b"w");
                 Row::new(client.keys.key::<WeightsUpload>(), bytes, NO_REPLY)

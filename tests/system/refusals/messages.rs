@@ -6,9 +6,7 @@ use driml_protocol::{
 };
 use driml_tests::Client;
 
-use super::{
-    NO_REPLY, Row, affinity, batch_request, check_refused, chunk_header, encoded, leave, newer,
-};
+use super::{NO_REPLY, Row, affinity, batch_request, check_refused, chunk_header, encoded, newer};
 use crate::{LONG, system};
 
 /// The incarnation of actor 0, which sends the chunks here, and the number of the learner.
@@ -71,7 +69,7 @@ fn invalid_chunks(client: &Client) -> Vec<(Vec<u8>, &'static str)> {
             "run the same build of driml everywhere",
         ),
         (
-            encoded(client, &leave(0, INCARNATION, 0)),
+            encoded(client, &Leave::new(0, INCARNATION, 0)),
             "a message of kind 8 came where kind 1 is expected",
         ),
         (
@@ -114,7 +112,7 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
     let garbage = b"DRML and then nothing that makes sense";
     let batch = |rows| batch_request(LEARNER, rows);
     let (batches, leaves) = (keys.key::<BatchRequest>(), keys.actor_key::<Leave>(0));
-    let leave = leave(0, INCARNATION, 1000);
+    let leave = Leave::new(0, INCARNATION, 1000);
     let others = [
         // The replies to requests contain the reason.
         Row::new(&batches, garbage, "Refused {"),

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use driml_protocol::{
     Ack, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, InsertReply, JoinReply, Keyed,
-    Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload, codec,
+    Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload, codec,
     session::{self, SessionError},
 };
 use driml_tests::{Client, check_nothing_lost};
@@ -52,14 +52,6 @@ impl Row {
         let actor = message.actor().unwrap_or_default();
         let key = client.keys.actor_key::<M>(actor);
         Self::new(key, encoded(client, message), expected)
-    }
-}
-
-const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
-    Leave {
-        actor,
-        incarnation,
-        produced,
     }
 }
 

@@ -15,7 +15,7 @@ use zenoh::{Wait, query::Query, sample::Locality};
 
 use super::{
     NO_REPLY, Row, affinity, batch_request, check_continues, check_replies, chunk_header, encoded,
-    leave, upload,
+    upload,
 };
 use crate::{LONG, system};
 
@@ -66,7 +66,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
     let one = &run.system.connect_as(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
-    let leave = leave(other, incarnation, 0);
+    let leave = Leave::new(other, incarnation, 0);
     let join = ActorJoin::new(other, incarnation);
     let poll = ChunkPoll {
         actor: other,

@@ -1,7 +1,7 @@
 //! `driml sweep`: makes a run for each combination of settings and each seed, then a table and a plot of all runs.
 //! `axes` decides which runs there are, and `queue` makes them.
 
-use driml_launch::console::{align_columns, print};
+use driml_launch::console::{align_columns, print_wrapped};
 use driml_machine::error::usage;
 use driml_settings::presets;
 use serde::{Deserialize, Serialize};
@@ -73,8 +73,13 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let names = axes.iter().map(|axis| axis.name.as_str());
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
     session.write_csv(NAME, &header.join(","), &rows)?;
-    let lines = [vec![header], rows].concat();
-    print(&format!("{}{LEGEND}", align_columns(&lines, &[])))?;
+    let short = |it: &String| it.rsplit('.').next().unwrap_or(it).to_owned();
+    let mut lines = [vec![header.iter().map(short).collect()], rows].concat();
+    // The columns from `lowest` to `updates_per_second` are in the file alone, as a terminal is narrow.
+    for line in &mut lines {
+        line.drain(axes.len() + 5..axes.len() + 8);
+    }
+    print_wrapped(&(align_columns(&lines, &[]) + LEGEND), 4)?;
     session.check_has_runs(&finished)?;
     let runs = finished.iter().map(|it| it.run.folder.path().to_owned());
     let varied = axes.iter().filter(|axis| axis.values.len() > 1);

@@ -79,9 +79,9 @@ impl Inspection {
     }
 }
 
-/// A table with one line per world: the sums of an agent's tables, and in brackets the sums with everything on.
+/// A table with one line per world: the sums of an agent's tables.
 pub fn describe_worlds(inspections: &[Inspection]) -> String {
-    let headings = "world,parameters,FLOPs per update,FLOPs per decision,bytes per batch";
+    let headings = "world,parameters,FLOPs/update,FLOPs/decision,bytes/batch";
     let mut rows = vec![headings.split(',').map(String::from).collect()];
     for it in inspections {
         let batch = it.bytes.iter().find(|it| it.what == count::BATCH_NAME);
@@ -92,12 +92,10 @@ pub fn describe_worlds(inspections: &[Inspection]) -> String {
             &it.decision_flops,
             batch,
         ];
-        let sums = counts.map(|lines| sum_line("", lines));
-        let cells = sums.map(|it| format!("{} ({})", HumanCount(it.is), HumanCount(it.everything)));
-        rows.push([vec![it.world.clone()], cells.into()].concat());
+        let sums = counts.map(|lines| HumanCount(sum_line("", lines).is).to_string());
+        rows.push([vec![it.world.clone()], sums.into()].concat());
     }
-    let table = align_columns(&rows, &[1, 2, 3, 4]);
-    format!("{table}\nin brackets: {EVERYTHING}\n")
+    align_columns(&rows, &[1, 2, 3, 4])
 }
 
 fn sum_line(what: &str, lines: &[Line]) -> Line {

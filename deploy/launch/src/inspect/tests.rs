@@ -22,12 +22,8 @@ fn the_paper_s_agent_is_described_in_a_table_and_in_a_line_of_sums() {
 
     let text = describe_worlds(&[inspection.clone(), inspection]);
     assert_eq!(text.matches("\nprocgen:bigfish ").count(), 2, "{text}");
-    for sum in [
-        "3,633,018 (6,699,232)",
-        "14,270,464,000 (130,316,107,776)",
-        "7,779,328 (8,135,680)",
-        "8,297,472 (22,025,216)",
-    ] {
+    assert!(text.lines().all(|line| line.len() <= 80), "{text}");
+    for sum in ["3,633,018", "14,270,464,000", "7,779,328", "8,297,472"] {
         assert_eq!(text.matches(sum).count(), 2, "{sum} in {text}");
     }
 }

@@ -124,8 +124,7 @@ pub fn run(
     }
     resume::report_end(result, written, &summary, resumed, &config.world, run_dir)?;
     if outcome == Outcome::Finished {
-        let is_stopped = || launch.shutdown.drain.is_set();
-        last_play::play(&mut summary, config, run_dir, &is_stopped);
+        last_play::play(&mut summary, config, run_dir, &launch.shutdown.drain);
     }
     resume::print_next_steps(&summary, &config.world, run_dir)
 }

@@ -307,11 +307,8 @@ impl Lockstep {
         }
         for (id, (actor, surplus)) in self.actors.iter().zip(&self.turn.unwanted).enumerate() {
             let produced = actor.transitions_recorded() - surplus;
-            self.replay.leave(&Leave {
-                actor: id as u32,
-                incarnation: INCARNATION,
-                produced,
-            });
+            let leave = Leave::new(id as u32, INCARNATION, produced);
+            self.replay.leave(&leave);
         }
         self.turn.status.finished = true;
         Ok(())

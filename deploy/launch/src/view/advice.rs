@@ -115,7 +115,7 @@ fn actor_actions(view: &RunView) -> Vec<String> {
     let actors: Vec<_> = processes(view).filter(is_actor).collect();
     if !actors.iter().any(|(_, process)| process.connected) {
         let endpoint = &view.servers[0].endpoint;
-        let what = match actors.is_empty() {
+        let what = match actors.is_empty() && view.replay.actors_acting == 0 {
             true => "no actor has joined",
             false => "all actors have disconnected",
         };
@@ -171,7 +171,8 @@ pub(super) fn notes(view: &RunView) -> Vec<String> {
         false if is_known && !has_joined(true) => Some("no learner has joined yet".to_owned()),
         false => silence_note("learner", view.learner_silence),
     };
-    let actor = (is_known && !has_joined(false)).then(|| "no actor has joined yet".to_owned());
+    let no_actor = is_known && !has_joined(false) && view.replay.actors_acting == 0;
+    let actor = no_actor.then(|| "no actor has joined yet".to_owned());
     let mut notes: Vec<_> = learner.into_iter().chain(actor).collect();
     notes.extend(unresponsive_actors(view));
     notes

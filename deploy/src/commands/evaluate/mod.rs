@@ -85,7 +85,17 @@ fn probability(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give a number from 0 to 1".into())
 }
 
-pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
+/// Evaluates on a thread, so that the first Ctrl-C also ends the wait for a world that hangs.
+pub(crate) fn run(args: EvaluateArgs) -> anyhow::Result<()> {
+    let shutdown = Shutdown::on_signals(args.exit_with_parent);
+    let shutdown = shutdown.context("listening for signals")?;
+    let flag = shutdown.clone();
+    let work = move || evaluate(&args, &flag);
+    let ended = shutdown.run_unless_set("evaluation", work, || false);
+    ended.context("starting a thread")?.ok_or(Interrupted)?
+}
+
+fn evaluate(args: &EvaluateArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if let Some(path) = &args.film.record
         && path.extension().is_none_or(|it| it != "gif")
     {
@@ -106,12 +116,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         ));
     }
     if args.keep {
-        let shutdown = Shutdown::on_signals(args.exit_with_parent);
-        let shutdown = shutdown.context("listening for signals")?;
-        let episodes = args.episodes;
-        let play = move || evaluate_and_keep(&folder, choice, episodes, &|| false);
-        let ranked = shutdown.run_unless_set("evaluation", play);
-        let ranked = ranked.context("starting a thread")?.ok_or(Interrupted)??;
+        let ranked = evaluate_and_keep(&folder, choice, args.episodes, &|| shutdown.is_set())?;
         let evaluation = ranked.evaluation.describe();
         return print(&format!("{evaluation}{}\n", compare_with_best(&ranked)));
     }
@@ -132,7 +137,6 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         output::check_file("--returns", path)?;
     }
     let world = world_with_levels(&player.config.world, args.levels)?;
-    let shutdown = Shutdown::on_signals(None).context("listening for signals")?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
     let on = match args.levels {
@@ -181,7 +185,9 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         if let Some(film) = film.take() {
             print_text(&film.finish()?)?;
         }
-        print_text(&describe_returns(name, &returns))?;
+        let (mean, deviation) = mean_and_deviation(&returns);
+        let deviation = describe_deviation(deviation);
+        print_text(&format!("{name:12} mean return {mean:8.3}{deviation}\n"))?;
         played.push((name, returns));
     }
     if let Some(path) = &args.returns {
@@ -222,12 +228,6 @@ fn compare_with_best(ranked: &RankedEvaluation) -> String {
         ),
         _ => String::new(),
     }
-}
-
-fn describe_returns(name: &str, returns: &[f64]) -> String {
-    let (mean, deviation) = mean_and_deviation(returns);
-    let deviation = describe_deviation(deviation);
-    format!("{name:12} mean return {mean:8.3}{deviation}\n")
 }
 
 /// The name of a policy, and the returns of its episodes.
