@@ -17,6 +17,7 @@ use crate::config::Config;
 pub struct RateLimiter {
     config: Config,
     pub(crate) counts: LimiterCounts,
+    pub(crate) is_run_over: bool,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,6 +37,7 @@ impl RateLimiter {
         Self {
             config: config.clone(),
             counts: LimiterCounts::default(),
+            is_run_over: false,
         }
     }
 
@@ -112,11 +114,12 @@ impl RateLimiter {
             && f64::from(rows) <= self.credit()
     }
 
-    /// Whether all transitions of the run are stored, by the last counts of the other shards. N shards store less than N * (slack +
-    /// 2 * batch size / replay ratio + a chunk) too many, as `may_insert` bounds what each stores between reports after the warm-up.
+    /// Whether the run is over, or all its transitions are stored by the last counts of the other shards. N shards store less than N *
+    /// (slack + 2 * batch size / replay ratio + a chunk) too many: `may_insert` bounds what each stores between reports after the warm-up.
     pub fn all_stored(&self) -> bool {
         let max = self.config.transitions_max;
-        self.counts.refill_left == 0 && max.is_some_and(|max| self.inserted_total() >= max)
+        let are_stored = max.is_some_and(|max| self.inserted_total() >= max);
+        self.is_run_over || self.counts.refill_left == 0 && are_stored
     }
 
     /// Whether all transitions are stored and no further batch of `rows` rows is allowed.

@@ -270,8 +270,9 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
     let has_pace_changed = before.learner.batch_size != config.learner.batch_size
         || before.replay.replay_ratio != config.replay.replay_ratio
         || before.replay.warmup_transitions != config.replay.warmup_transitions;
-    if has_pace_changed && updates > 0 {
-        config.replay.since = Some(RatioStart {
+    // Checkpoints after an earlier change may have been removed.
+    if has_pace_changed || config.replay.since.is_some_and(|it| it.updates > updates) {
+        config.replay.since = (updates > 0).then_some(RatioStart {
             transitions: frames,
             rows,
             updates,

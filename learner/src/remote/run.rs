@@ -102,6 +102,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let spec_hash = learner.spec_hash();
     let clients = shards.clients(&keys, spec_hash);
     let counts = learner.run_counts_mut();
+    if updates == 0 {
+        // Without a kept replay, the run starts again; the servers report what a kept one has.
+        counts.shards.clear();
+    }
     counts.spread_over(clients.len());
     if counts.run == 0 {
         counts.run = rand::random();

@@ -162,16 +162,18 @@ impl ReplayFolder {
         segment_numbers(&self.path)
     }
 
+    /// Reads a segment and flushes it, as the process that wrote it may have died before it did.
     pub(super) fn read_segment(&self, number: u64) -> Result<Vec<u8>, PersistError> {
         let path = self.segment_path(number);
-        fs::read(&path).map_err(io_error("reading", &path))
+        let read = File::open(&path).and_then(|it| it.sync_data().and(fs::read(&path)));
+        read.map_err(io_error("reading", &path))
     }
 
     pub(super) fn truncate_segment(&self, number: u64, at: usize) -> Result<(), PersistError> {
         let path = self.segment_path(number);
         let opened = File::options().write(true).open(&path);
         opened
-            .and_then(|opened| opened.set_len(at as u64))
+            .and_then(|opened| opened.set_len(at as u64).and(opened.sync_all()))
             .map_err(io_error("cutting off the end of", &path))
     }
 

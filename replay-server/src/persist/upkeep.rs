@@ -51,7 +51,7 @@ impl ReplayFolder {
         }
         let snapshot = replay.snapshot();
         replay.journal = Some(Journal::begin(self, position, &snapshot)?);
-        replay.rotate_and_prune();
+        replay.keep_within_disk_budget();
         Ok((replay, recovery))
     }
 }
@@ -100,13 +100,18 @@ impl Replay {
         self.prune();
     }
 
-    /// Begins a new segment. If the disk budget has no room for it, drops the oldest transitions first.
-    pub(crate) fn begin_segment(&mut self) {
+    /// Drops the oldest transitions, if the disk budget has no room for a whole segment more. Removes segments that are no longer needed.
+    fn keep_within_disk_budget(&mut self) {
         let journal = self.journal.as_ref();
         if let Some(oldest) = journal.and_then(|it| it.oldest_within_budget(|| self.snapshot())) {
             self.forget_before(oldest);
-            self.prune();
         }
+        self.prune();
+    }
+
+    /// Begins a new segment, for which the disk budget makes room.
+    pub(crate) fn begin_segment(&mut self) {
+        self.keep_within_disk_budget();
         let snapshot = self.journal.is_some().then(|| self.snapshot());
         if let (Some(journal), Some(snapshot)) = (&mut self.journal, snapshot) {
             journal.rotate(&snapshot);

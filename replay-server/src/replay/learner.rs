@@ -124,9 +124,11 @@ impl Replay {
         Ok(())
     }
 
-    pub(crate) fn raise_updates(&mut self, updates: u64) {
+    /// Notes that the learner has finished the run after `updates` updates: no transition is wanted any more.
+    pub(crate) fn end_run(&mut self, updates: u64) {
         let done = &mut self.state.learned.updates;
         *done = updates.min(COUNT_MAX).max(*done);
+        self.limiter.is_run_over = true;
     }
 
     /// Takes a newer affinity matrix; one that is not newer than this learner's last is ignored.

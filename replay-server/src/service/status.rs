@@ -76,10 +76,9 @@ impl Service {
             let finished = report.finished;
             // If not, the process was replaced or is about to join. It repeats a report of the end of the run until it gets an `Ack`.
             let has_joined = state.participants.store_report(report, Instant::now());
-            if has_joined {
-                state.replay.raise_updates(finished.unwrap_or(0));
-            } else {
-                tracing::debug!("a report of a process that has not joined");
+            if state.participants.is_run_over() {
+                state.replay.end_run(finished.unwrap_or(0));
+                self.changed.notify_all();
             }
             (has_joined || finished.is_none()).then_some(Ack)
         });

@@ -2,7 +2,8 @@
 //! Each is counted once and stores nothing, and the server continues to store. The codec's tests check that no cut and no flip is missed.
 
 use driml_protocol::{
-    AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Leave, Message, codec,
+    AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Leave, Message,
+    Participant, Shutdown, codec, reporter,
 };
 use driml_tests::Client;
 
@@ -147,5 +148,20 @@ fn what_is_refused_is_counted_stores_nothing_and_stops_nothing() {
     assert_eq!(client.insert(&second_life), stored(12));
     let late = client.encode_chunk(&chunk(client, 1));
     check_chunk((late, "give each actor another number (--id)"));
+    // Once the learner has finished, no transition is wanted.
+    let clients = [client.run_client()];
+    reporter::report_finished(
+        &clients,
+        Participant::Learner(LEARNER),
+        0,
+        &Shutdown::default(),
+    );
+    let mut next = chunk(client, 1);
+    next.header.incarnation = 10;
+    let inserted_total = 12;
+    assert_eq!(
+        client.insert(&next),
+        InsertReply::Finished { inserted_total }
+    );
     assert_eq!(system.running_processes().len(), 1, "the server");
 }
