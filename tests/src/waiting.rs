@@ -19,10 +19,7 @@ pub fn wait_for<T>(what: &str, mut poll: impl FnMut() -> Option<T>) -> T {
         if let Some(value) = poll() {
             return value;
         }
-        assert!(
-            started.elapsed() < TIMEOUT,
-            "waited {TIMEOUT:?} for: {what}"
-        );
+        assert!(started.elapsed() < TIMEOUT, "waited {TIMEOUT:?} for {what}");
         let [shortest, longest] = POLL_INTERVAL;
         thread::sleep(polled_at.elapsed().clamp(shortest, longest));
     }

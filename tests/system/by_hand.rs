@@ -131,10 +131,8 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         }
         let replay = client.wait_for_replay("the actors' absence", |replay| replay.actors == 0);
         check_nothing_lost(&replay);
-        assert!(
-            learner.is_running() && server.is_running(),
-            "they do not depend on actors"
-        );
+        let continue_alone = learner.is_running() && server.is_running();
+        assert!(continue_alone, "they do not depend on actors");
         // The learner makes the updates that the replay ratio allows, then waits. On a signal it saves a checkpoint.
         client.wait_for_replay("a waiting learner", |replay| {
             replay.waiting == Waiting::LearnerWaitsForActors

@@ -5,6 +5,9 @@ use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
 use driml_tests::{Outcome, TestSystem, check_has, checkpoint_updates, wait_until};
+use nix::sys::signal::Signal;
+use safetensors::{Dtype, SafeTensors};
+use serde_json::Value;
 
 use crate::{SHORT, system};
 
@@ -30,18 +33,12 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
     let stdout = system.run_ok(flags).stdout;
     let lines: Vec<_> = stdout.lines().collect();
     assert_eq!(lines.len(), 3, "{lines:?}");
-    assert_eq!(
-        lines[0],
-        "chain as trained on, 7 episodes each, online f32 weights after 540 updates played in f32, seed 2"
-    );
+    let head = "chain as trained on, 7 episodes each, online f32 weights after 540 updates played in f32, seed 2";
+    assert_eq!(lines[0], head);
     for (line, policy) in lines[1..].iter().zip(["driml-fix", "random"]) {
-        assert!(
-            line.starts_with(policy) && line.contains("standard deviation"),
-            "{line}"
-        );
+        let is_told = line.starts_with(policy) && line.contains("standard deviation");
+        assert!(is_told, "{line}");
     }
-    // The chain world has no levels to hold out.
-    system.rejects("evaluate --run run --levels unseen", "use --levels train");
 
     // The same seed plays the same episodes.
     let json = system.run_json(&format!("{flags} --json --returns returns.csv"));
@@ -61,11 +58,9 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
         // The table has six decimals.
         assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-6);
     }
-    // A call that fails leaves existing files unchanged.
-    system.rejects(
-        "evaluate run --levels unseen --returns returns.csv",
-        "use --levels train",
-    );
+    // The chain world has no levels to hold out. A call that fails leaves existing files unchanged.
+    let call = "evaluate --run run --levels unseen --returns returns.csv";
+    system.rejects(call, "use --levels train");
     assert_eq!(system.read("returns.csv"), table);
 
     // Any existing checkpoint can be played.
@@ -75,10 +70,27 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
     system
         .run_ok(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
         .expect_stdout(&format!("weights after {oldest} updates"));
-    system.rejects(
-        "evaluate run --checkpoint 7",
-        "no checkpoint after 7 updates; it has those after",
-    );
+}
+
+/// Checks that an exported file has the tensors of a checkpoint's file, rounded to f16, and no others.
+fn check_rounded(exported: &[u8], exact: &[u8]) {
+    let [exported, exact] = [exported, exact].map(|it| SafeTensors::deserialize(it).unwrap());
+    assert_eq!(exported.len(), exact.len());
+    for (name, exact) in exact.iter() {
+        let rounded = exported.tensor(name).unwrap();
+        let (halves, _) = rounded.data().as_chunks::<2>();
+        let (floats, _) = exact.data().as_chunks::<4>();
+        let found = (rounded.dtype(), halves.len());
+        assert_eq!(found, (Dtype::F16, floats.len()), "{name}");
+        for (half, float) in halves.iter().zip(floats) {
+            let (half, float) = (u16::from_le_bytes(*half), f32::from_le_bytes(*float));
+            // The exponent of an f32 is 112 more than that of an f16.
+            let size = f32::from_bits(u32::from(half & 0x7fff) << 13) * 2f32.powi(112);
+            let value = if half >> 15 == 0 { size } else { -size };
+            let error_max = float.abs() / 2048.0 + 1e-7;
+            assert!((value - float).abs() <= error_max, "{name}: {float}");
+        }
+    }
 }
 
 #[test]
@@ -95,11 +107,6 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
         let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
         assert_eq!(json["averaged"], weights == "averaged", "{flags}");
     }
-    system.rejects(
-        "evaluate run --checkpoint average",
-        "leave --checkpoint out",
-    );
-
     system
         .run_ok("evaluate run --export net.safetensors")
         .expect_stdout("averaged weights after 540 updates as f16");
@@ -108,9 +115,13 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
     let net = system.run_ok("evaluate net.safetensors --episodes 3 --record play.gif --overlay");
     let lines: Vec<_> = net.stdout.lines().collect();
     check_has(lines[0], &["averaged f16 weights after 540 updates"]);
+    // The last line is of the random policy.
     assert_eq!(lines.last(), run.stdout.lines().last().as_ref());
-    let online = system.run_folder("moved").newest_checkpoint();
-    let online = online.join("online.safetensors").display().to_string();
+    let newest = system.run_folder("moved").newest_checkpoint();
+    let average = newest.join("average.safetensors");
+    let [exported, average] = [system.path("net.safetensors"), average].map(fs::read);
+    check_rounded(&exported.unwrap(), &average.unwrap());
+    let online = newest.join("online.safetensors").display().to_string();
     system.rejects_each(&format!(
         "
         evaluate net.safetensors --keep => is a single network
@@ -120,6 +131,8 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
         evaluate {online} => is not an exported network
         evaluate pretrained:pong => no pretrained weights of \"pong\"
         evaluate moved --export net => ends in .safetensors
+        evaluate moved --checkpoint average => leave --checkpoint out
+        evaluate moved --checkpoint 7 => no checkpoint after 7 updates; it has those after
         "
     ));
 }
@@ -127,23 +140,42 @@ fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
 #[test]
 fn a_finished_run_says_what_its_weights_earn() {
     let system = system();
-    for (flags, is_played) in [("--set local.play=true", true), ("--no-play", false)] {
-        let name = if is_played { "played" } else { "left-out" };
-        let ended = system.run_ok(&format!(
-            "local --agent c51 {SHORT} {flags} --run-dir {name}"
-        ));
-        let line = "Greedy return (online weights): ";
-        assert_eq!(ended.stdout.contains(line), is_played, "{}", ended.stdout);
-        let text = system.read(&format!("{name}/summary.json"));
-        let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
-        let played = &summary["played"];
-        assert_eq!(played.is_object(), is_played);
-        if is_played {
-            let number = |name: &str| played[name].as_f64().unwrap();
-            assert!(number("low") <= number("mean") && number("mean") <= number("high"));
-            let episodes = played["episodes"].as_u64().unwrap();
-            assert!((20..=100).contains(&episodes), "{episodes}");
+    let summary_of = |name| serde_json::to_value(system.run_folder(name).summary()).unwrap();
+    // In the last of these worlds no episode ends before the interrupt.
+    let endless = "--env ising --preset smoke --frames 320 --set world.episode_steps=100000000";
+    for (name, flags, play) in [
+        ("played", SHORT, "--set local.play=true"),
+        ("left-out", SHORT, "--no-play"),
+        ("skipped", endless, "--set local.play=true"),
+    ] {
+        let call = format!("local --agent c51 {flags} {play} --run-dir {name}");
+        let mut process = system.start(&call);
+        if name == "skipped" {
+            process.wait_for_stderr("playing the weights beside a random policy");
+            process.signal(Signal::SIGINT);
         }
+        let ended = process.wait_ok();
+        assert!(!ended.stderr.contains("its weights failed"), "{ended:#?}");
+        let is_said = ended.stdout.contains("Greedy return (online weights): ");
+        let summary = summary_of(name);
+        let found = (is_said, summary["played"].is_object());
+        let is_played = name == "played";
+        assert_eq!(found, (is_played, is_played), "{ended:#?}");
+        assert_eq!(summary["outcome"], "finished");
+    }
+    let played = &summary_of("played")["played"];
+    // Each batch of 20 episodes has its number as its seed.
+    let batches = played["episodes"].as_u64().unwrap() / 20;
+    assert!((1..=5).contains(&batches), "{played}");
+    let evaluate = "evaluate played --episodes 20 --json --seed";
+    let play = |seed| system.run_json(&format!("{evaluate} {seed}"));
+    let again: Vec<_> = (0..batches).map(play).collect();
+    for (policy, found) in [("c51", played), ("random", &played["random"])] {
+        let [mean, low, high] = ["mean", "low", "high"].map(|it| found[it].as_f64().unwrap());
+        let mean_of = |it: &Value| it["policies"][policy]["mean_return"].as_f64().unwrap();
+        let wanted = again.iter().map(mean_of).sum::<f64>() / batches as f64;
+        let is_mean = (mean - wanted).abs() < 1e-9 && low <= mean && mean <= high;
+        assert!(is_mean, "{policy}: {wanted}, {played}");
     }
 }
 
@@ -159,10 +191,8 @@ fn it_plays_checkpoints_while_the_run_continues() {
         assert!(ended.stderr.contains("evaluated after"), "{}", ended.stderr);
         let folder = system.run_folder(name);
         let table = folder.table("evaluations.csv");
-        assert_eq!(
-            table.header.join(","),
-            "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd"
-        );
+        let header = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
+        assert_eq!(table.header.join(","), header);
         // Before the first row of metrics the frames of the run are unknown.
         let rows = table.rows.iter().map(|row| {
             ["updates", "frames", "evaluated_return"]
@@ -172,10 +202,8 @@ fn it_plays_checkpoints_while_the_run_continues() {
         assert!(rows.len() >= rows_min, "{table:?}");
         let last = rows.last().unwrap();
         assert_eq!(last[0], 540.0, "the last checkpoint is played: {table:?}");
-        assert!(
-            rows.is_sorted_by(|a, b| a[0] < b[0] && a[1] <= b[1]),
-            "{table:?}"
-        );
+        let is_sorted = rows.is_sorted_by(|a, b| a[0] < b[0] && a[1] <= b[1]);
+        assert!(is_sorted, "{table:?}");
         let most = rows.iter().map(|row| row[2]).fold(f64::MIN, f64::max);
         let best = rows.iter().find(|row| row[2] == most).unwrap();
         // Played again with the same seed, the best checkpoint gets the same return.
@@ -218,10 +246,8 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
 
 /// A checkpoint is compared with the best one over at least as many episodes as the best was played for.
 fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &TestSystem) {
-    system.rejects(
-        "evaluate run --checkpoint best",
-        "run has no best checkpoint",
-    );
+    let best = "evaluate run --checkpoint best";
+    system.rejects(best, "run has no best checkpoint");
     let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
     keep("--episodes 3").expect_stdout("over 3 episodes, the best so far\n");
     system.run_ok("evaluate run --checkpoint best --episodes 1");

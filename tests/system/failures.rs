@@ -61,6 +61,16 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     let ended = process.fails("missing: run/config.toml, run/metrics.csv, run/episodes.csv");
     assert!(!ended.stderr.contains("resumes it"), "{}", ended.stderr);
     assert_eq!(system.running_processes(), []);
+
+    // A run in lockstep looks at its files, too.
+    let system = crate::system();
+    system.pause_learners_at(100);
+    let process = system.start(&format!("local --lockstep {SHORT} --run-dir run"));
+    system.run_folder("run").wait_for_updates(10);
+    fs::remove_file(system.path("run/metrics.csv")).unwrap();
+    system.release_learners();
+    let ended = process.fails("missing: run/metrics.csv");
+    assert!(!ended.stderr.contains("episodes.csv"), "{}", ended.stderr);
 }
 
 #[test]

@@ -13,10 +13,8 @@ use crate::{LONG, chain, synthetic::SyntheticActor, system, tiny_replay};
 #[test]
 fn twenty_four_actors_wait_for_one_learner() {
     let system = system();
-    let flags = format!(
-        "--agent c51 {} --actors 24 --set replay.replay_ratio=64",
-        chain(2_400)
-    );
+    let chain = chain(2_400);
+    let flags = format!("--agent c51 {chain} --actors 24 --set replay.replay_ratio=64");
     // Pause the learner, so that even on a fast machine the run does not end before the last actor waits.
     system.pause_learners_at(100);
     let process = system.start(&system.local_args(&flags));

@@ -34,19 +34,16 @@ static FAIL_POINTS: [(&str, &str, &str); 8] = [
 /// Checks that a panic at `point` ends a run.
 fn check_panic_ends_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
-    let ended = system.run(&format!(
-        "env '{}={point}' DRIML local --agent driml-ada {LONG} {flags} --run-dir run",
-        fail_point::PANIC_VAR
-    ));
+    let variable = format!("{}={point}", fail_point::PANIC_VAR);
+    let run = format!("local --agent driml-ada {LONG} {flags} --run-dir run");
+    let ended = system.run(&format!("env '{variable}' DRIML {run}"));
     let contains = |line: &str, words: &str| {
         assert!(line.contains(words), "{point}: {words:?} in {ended:#?}");
     };
     if process == LAUNCHER {
         assert_eq!((ended.code, ended.signal), (None, Some(6)), "{point}");
-        contains(
-            &ended.stderr,
-            &format!("error: the thread {point} panicked"),
-        );
+        let said = format!("error: the thread {point} panicked");
+        contains(&ended.stderr, &said);
         return system.wait_until_all_have_ended();
     }
     assert_eq!(system.running_processes(), [], "{point}");
@@ -55,13 +52,8 @@ fn check_panic_ends_run((process, point, flags): (&str, &str, &str)) {
     let line = ended.stderr.lines().find(|line| line.contains(&thread));
     let line = line.unwrap_or_else(|| panic!("{point}: {ended:#?}"));
     contains(line, " panicked at ");
-    contains(
-        line,
-        &format!(
-            ": {}={point}; this is a bug in the program",
-            fail_point::PANIC_VAR
-        ),
-    );
+    let said = format!(": {variable}; this is a bug in the program");
+    contains(line, &said);
     let killed = "was killed by signal 6 SIGABRT";
     if process.is_empty() {
         return contains(&ended.stderr, killed);

@@ -26,10 +26,8 @@ fn a_case_with_another_expectation_fails() {
         call += &format!(" {tensor}");
     }
     let ended = system.fails(&call, "error: files out of tolerance: 5 of 6");
-    system.fails(
-        "parity none",
-        "error: cannot read none: No such file or directory (os error 2)\n",
-    );
+    let absent = "error: cannot read none: No such file or directory (os error 2)\n";
+    system.fails("parity none", absent);
     let stdout = &ended.stdout;
     let failed: Vec<_> = stdout.lines().filter(|it| it.ends_with("FAILED")).collect();
     assert_eq!(failed.len(), CHANGED.len(), "{stdout}");

@@ -126,10 +126,8 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
             let output = run_script(&python, &[&script], &[&path("run"), "--onnx", &net]);
             assert!(output.contains("wrote"), "{output}");
             let model = agent.model();
-            let shape = format!(
-                "-1,{},{},{}",
-                model.height, model.width, model.input_channels
-            );
+            let [height, width] = [model.height, model.width];
+            let shape = format!("-1,{height},{width},{}", model.input_channels);
             let answer = run_script(&python, &["-c", ONNX_PY], &[&net, &path("states"), &shape]);
             let off = largest_difference(&ours.q_values, &serde_json::from_str(&answer).unwrap());
             print_line(&format!("{flags}: ONNX values {off:.1e}"));
@@ -207,9 +205,7 @@ fn a_helper_without_its_package_says_which() {
         let stderr = process.wait().expect_code(1).stderr;
         let names = format!("{script} needs the package {package}: ");
         let install = format!("-m pip install {package}\n");
-        assert!(
-            stderr.starts_with(&names) && stderr.ends_with(&install),
-            "{stderr}"
-        );
+        let is_told = stderr.starts_with(&names) && stderr.ends_with(&install);
+        assert!(is_told, "{stderr}");
     }
 }

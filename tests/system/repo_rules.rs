@@ -207,10 +207,8 @@ fn identifiers(text: &str) -> BTreeSet<&str> {
 fn every_source_file_says_what_it_is_for() {
     for Source { name, text } in sources(&[".rs"]) {
         let first = text.lines().next().unwrap_or_default();
-        assert!(
-            first.starts_with("//! ") && first.len() > 12,
-            "{name} starts with {first:?}"
-        );
+        let is_text = first.starts_with("//! ") && first.len() > 12;
+        assert!(is_text, "{name} starts with {first:?}");
     }
 }
 
@@ -222,17 +220,12 @@ fn the_code_stays_within_its_budget() {
             .iter()
             .filter(|it| Path::new(&it.name).starts_with(folder));
         let lines: usize = inside.map(|it| it.text.lines().count()).sum();
-        assert!(
-            (1..=lines_max).contains(&lines),
-            "{folder} has {lines} lines of Rust; at most {lines_max}"
-        );
+        let range = 1..=lines_max;
+        assert!(range.contains(&lines), "{folder}: {lines} of {range:?}");
     }
     for Source { name, text } in &files {
         let lines = text.lines().count();
-        assert!(
-            lines <= FILE_LINES_MAX,
-            "{name} has {lines} lines; at most {FILE_LINES_MAX}: split it"
-        );
+        assert!(lines <= FILE_LINES_MAX, "split {name}: {lines} lines");
     }
 }
 
@@ -253,17 +246,12 @@ fn dangerous_words_stay_where_they_are_needed() {
         for Source { name, text } in sources(&[".rs"]) {
             // This file has to name them.
             if name != "tests/system/repo_rules.rs" && identifiers(&text).contains(word) {
-                assert!(
-                    places.iter().any(|place| name.starts_with(place)),
-                    "{name} uses `{word}`"
-                );
+                let is_place = places.iter().any(|place| name.starts_with(place));
+                assert!(is_place, "{name} uses `{word}`");
                 uses += 1;
             }
         }
-        assert!(
-            uses > 0,
-            "no file uses `{word}`: is this rule still needed?"
-        );
+        assert!(uses > 0, "no file uses `{word}`: is it needed?");
     }
 }
 
@@ -315,11 +303,7 @@ fn every_package_takes_the_workspace_s_lints_and_versions() {
             };
             for (name, dependency) in table {
                 let taken = dependency.get("workspace").and_then(toml::Value::as_bool);
-                assert_eq!(
-                    taken,
-                    Some(true),
-                    "{folder}: {name} takes its version from the workspace"
-                );
+                assert_eq!(taken, Some(true), "{folder}: version of {name}");
             }
         }
     }

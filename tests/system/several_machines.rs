@@ -259,13 +259,10 @@ fn random_faults_lose_nothing() {
         }
         sleep(Duration::from_millis(rng.random_range(0..1_500)));
     }
-    print_line(&format!(
-        "seed {seed}: kills, freezes, cuts, restarts {tried:?}"
-    ));
+    let faults = "kills, freezes, cuts, restarts";
+    print_line(&format!("seed {seed}: {faults} {tried:?}"));
     let status = wait_for("an answer", || run.status());
-    assert_eq!(
-        status["replay"]["finished"], false,
-        "faults after the end prove nothing"
-    );
+    let is_over = &status["replay"]["finished"];
+    assert_eq!(is_over, false, "faults after the end prove nothing");
     run.check_end();
 }

@@ -35,10 +35,8 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
         ("9m", 8, false),
         ("64m", 2, true),
     ] {
-        let run = format!(
-            "local --agent c51 {} --actors {actors} --run-dir run",
-            chain(640)
-        );
+        let chain = chain(640);
+        let run = format!("local --agent c51 {chain} --actors {actors} --run-dir run");
         let Some(run) = with_shared_memory(size, &run) else {
             return;
         };

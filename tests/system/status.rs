@@ -58,10 +58,8 @@ fn missing_processes_are_named_with_what_to_do() {
     killed.signal(Signal::SIGKILL);
     client.wait_for_replay("one actor", |it| it.actors == 1);
     let again = format!("`driml actor --connect {endpoint} --id 5`");
-    wait_for_status(
-        &system,
-        &["actor-5 DOWN ", "the run continues without it", &again],
-    );
+    let words = ["actor-5 DOWN ", "the run continues without it", &again];
+    wait_for_status(&system, &words);
     learner.signal(Signal::SIGKILL);
     let words = ["learner DOWN ", "from its newest checkpoint"];
     wait_for_status(&system, &words);

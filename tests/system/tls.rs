@@ -106,6 +106,8 @@ fn strangers_at_a_replay_server() {
     };
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let observer = system.connect();
+    let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
+    observer.wait_for_updates(10);
     let foreign = Certificates::make(system.path("foreign"), "");
     std::fs::copy(system.path("tls/ca.pem"), foreign.path("ca.pem")).unwrap();
     let good = system.certificates();
@@ -137,9 +139,10 @@ fn strangers_at_a_replay_server() {
     system.fails(&format!("actor --connect {plain}"), why);
     assert!(started.elapsed() < REPORT_MAX);
 
-    // The strangers do not disturb admitted processes.
-    let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
-    observer.wait_for_updates(10);
+    // The strangers have not disturbed admitted processes.
+    let updates = observer.learner_status().unwrap().updates;
+    observer.wait_for_updates(updates + 100);
+    assert_eq!(observer.check_nothing_lost().chunks_retried, 0);
     actor.stop(130);
     learner.stop(130);
 }

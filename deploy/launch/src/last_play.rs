@@ -104,6 +104,7 @@ mod tests {
         let before = summary.clone();
         let folder = RunFolder::new("no-such-run");
         play(&mut summary, &config, &folder, &Shutdown::default());
+        assert!(played(&folder, &|| false).is_err());
         assert_eq!(summary, before);
     }
 }

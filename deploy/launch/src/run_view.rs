@@ -390,9 +390,7 @@ mod tests {
         assert_eq!(lump.speed(), Speed::default(), "too soon to tell");
         let paused = [(0, 0, 0), (1, 10, 1), (5_000, 20, 2), (5_001, 50, 8)];
         let [at_once, later] = [3, 4].map(|samples| rates(paused[..samples].to_vec()).speed());
-        assert_eq!(
-            (at_once.frames, later.frames, later.updates),
-            (0.0, 30.0, 6.0)
-        );
+        let speeds = (at_once.frames, later.frames, later.updates);
+        assert_eq!(speeds, (0.0, 30.0, 6.0));
     }
 }

@@ -248,9 +248,7 @@ mod tests {
     fn a_program_without_cuda_says_so() {
         let error = DeviceName::Cuda(0).open(Precision::F32).unwrap_err();
         let error = error.to_string();
-        assert!(
-            error.contains("cuda:0 cannot be used") && error.contains("driml doctor"),
-            "{error}"
-        );
+        let is_told = error.contains("cuda:0 cannot be used") && error.contains("driml doctor");
+        assert!(is_told, "{error}");
     }
 }

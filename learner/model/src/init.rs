@@ -148,10 +148,8 @@ mod tests {
                 let error = (0.01f64 / 3.0 / len).sqrt();
                 assert!(moment(1).abs() < 5.0 * error, "mean {}", moment(1));
                 let spread = moment(2) / (0.01 / 3.0);
-                assert!(
-                    (spread - 1.0).abs() < 5.0 * (0.8 / len).sqrt(),
-                    "variance off by {spread}"
-                );
+                let error = (0.8 / len).sqrt();
+                assert!((spread - 1.0).abs() < 5.0 * error, "variance {spread}");
             }
         }
     }

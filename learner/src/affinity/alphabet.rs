@@ -106,10 +106,8 @@ mod tests {
     fn the_visible_actions_are_numbered_without_gaps() {
         let alphabet = Alphabet::new(&[1, 1, 2, 4, 4]).unwrap();
         assert_eq!((alphabet.len(), alphabet.num_actions()), (3, 5));
-        assert_eq!(
-            alphabet.index_pairs(&[(0, 2), (3, 1)]).unwrap(),
-            [(0, 1), (2, 0)]
-        );
+        let pairs = alphabet.index_pairs(&[(0, 2), (3, 1)]).unwrap();
+        assert_eq!(pairs, [(0, 1), (2, 0)]);
         let expanded = alphabet.expand_matrix(&[0.0, 1.0, 2.0, 10.0, 11.0, 12.0, 20.0, 21.0, 22.0]);
         assert_eq!(expanded[..5], [0.0, 0.0, 1.0, 2.0, 2.0]);
         assert_eq!(expanded[20..], [20.0, 20.0, 21.0, 22.0, 22.0]);

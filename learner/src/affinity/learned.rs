@@ -280,10 +280,8 @@ mod tests {
                 moved.q().iter().zip(&by_q).map(|(q, g)| q * g).sum::<f64>()
             };
             let measured = (value(1e-6) - value(-1e-6)) / 2e-6;
-            assert!(
-                (measured - slope).abs() < 1e-6,
-                "parameter {at}: {measured} and {slope}"
-            );
+            let error = (measured - slope).abs();
+            assert!(error < 1e-6, "parameter {at}: {measured} and {slope}");
         }
     }
 

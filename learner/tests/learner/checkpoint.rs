@@ -139,10 +139,8 @@ fn a_checkpoint_of_another_network_says_which_setting_differs() {
         "was saved with model.hidden = {}, this run has model.hidden = {}",
         ours.hidden, other.hidden
     );
-    assert!(
-        said.contains(&differs) && !said.contains("damaged"),
-        "{said}"
-    );
+    let is_told = said.contains(&differs) && !said.contains("damaged");
+    assert!(is_told, "{said}");
     let other = ModelConfig {
         torso: TorsoName::Impala,
         conv: vec![],

@@ -91,10 +91,8 @@ fn a_state_that_is_not_finite_is_not_saved() {
             run.agent = diverged_agent(compute, name).0;
             let said = try_save(&run, folder.path(), 1, DESCRIPTION);
             let said = said.unwrap_err().to_string();
-            assert!(
-                said.starts_with("the checkpoint was not saved") && said.contains(name),
-                "{said}"
-            );
+            let is_told = said.starts_with("the checkpoint was not saved") && said.contains(name);
+            assert!(is_told, "{said}");
             let left: Vec<_> = fs::read_dir(folder.path()).unwrap().collect();
             assert_eq!(left.len(), 1, "{left:?}");
             assert_eq!(load(folder.path()).unwrap().unwrap().agent.updates(), 0);

@@ -91,10 +91,8 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
             }
         });
         let error = failure(&mut agent, &rows.batch());
-        assert!(
-            matches!(error, UpdateError::NonFinite { .. }),
-            "{poisoned}: {error}"
-        );
+        let is_named = matches!(error, UpdateError::NonFinite { .. });
+        assert!(is_named, "{poisoned}: {error}");
     }
 }
 

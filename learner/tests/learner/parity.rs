@@ -75,10 +75,8 @@ fn a_broken_file_is_a_clear_error() {
         error
     };
     for length in [0, 5, 8, 1000, whole.len() / 2, whole.len() - 1] {
-        assert!(
-            error_of(&whole[..length]).contains("not a whole safetensors file"),
-            "{length} bytes"
-        );
+        let error = error_of(&whole[..length]);
+        assert!(error.contains("not a whole safetensors file"), "{error}");
     }
     for line in BROKEN.trim().lines() {
         let [from, to, said] = line.split(" => ").collect::<Vec<_>>()[..] else {

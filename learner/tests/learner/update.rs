@@ -14,10 +14,8 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
     let agent = agent_on(&CANDLE, NO_DIM, 1);
     let evaluation = agent.evaluate(&random_batch(4, 1).batch()).unwrap();
     for (name, _) in agent.online().iter() {
-        assert!(
-            !evaluation.gradients.get(name).unwrap().track_op(),
-            "{name}"
-        );
+        let gradient = evaluation.gradients.get(name).unwrap();
+        assert!(!gradient.track_op(), "{name}");
     }
 }
 

@@ -161,10 +161,7 @@ fn every_decoder_has_a_target_and_seeds() {
         let file = seeds_folder("messages").join(sample.file_name().unwrap());
         let is_current = stored_seed(&file, &bytes) == bytes;
         let file = file.display();
-        assert!(
-            is_current,
-            "{file} is not today's: UPDATE_CORPUS=1 writes it"
-        );
+        assert!(is_current, "{file}: UPDATE_CORPUS=1 writes it anew");
     }
 }
 
@@ -186,10 +183,7 @@ fn the_logs_among_the_seeds_can_be_read() {
         assert!(log.len() < BYTES_MAX, "{file}: too long");
         let held = transitions_held(&log);
         let is_read = !stored.is_empty() && transitions_held(&stored) == held && held > Ok(0);
-        assert!(
-            is_read,
-            "{file} cannot be read any more: UPDATE_CORPUS=1 writes it"
-        );
+        assert!(is_read, "{file}: UPDATE_CORPUS=1 writes it anew");
     }
 }
 

@@ -47,9 +47,11 @@ impl AttackedRun {
         check_refused(&self.client, "all lies", rows, lies);
     }
 
-    /// Checks that the run continues, and that its log is short; then stops it.
-    fn check_and_stop(self) {
+    /// Checks that the run continues, that its log is short, and that it counted `lies` in all; then stops it.
+    fn check_and_stop(self, lies: u64) {
         check_continues(&self.client);
+        let status = self.client.replay_status().unwrap();
+        assert_eq!(status.messages_refused, lies, "none is counted later");
         let log = self.system.read("run/logs/replay-server.log");
         let lines = log.lines().filter(|line| line.contains("rejected")).count();
         assert!((1..60).contains(&lines), "{lines} lines: {log}");
@@ -66,7 +68,7 @@ fn lies_are_counted_and_change_nothing() {
     reject_each_kind_of_message(&run);
     reject_public_marks(&run);
     forget_4096_strangers(&run);
-    run.check_and_stop();
+    run.check_and_stop(3 + 1028 + 2 + 1);
 }
 
 fn reject_each_kind_of_message(run: &AttackedRun) {
@@ -204,10 +206,8 @@ fn forget_4096_strangers(run: &AttackedRun) {
         .map(|number| stranger.declare_alive(Peer::learner(number)).unwrap())
         .collect();
     let joins = (0..5_000).map(|number| ActorJoin::new(UNUSED_ACTOR + number, INCARNATION));
-    check_replies(
-        client,
-        joins.map(|it| Row::of(client, &it, "Welcome(Welcome {")),
-    );
+    let joins = joins.map(|it| Row::of(client, &it, "Welcome(Welcome {"));
+    check_replies(client, joins);
     drop(tokens);
     assert_eq!(client.replay_status().unwrap().actors, 1);
     let mut actor = run.system.start_actor(7);
@@ -237,7 +237,7 @@ fn lies_of_priorities_change_nothing() {
     long.parts[0].priorities.resize(100_000, 1.0);
     let others = [priority(u64::MAX, 1.0), priority(1, f32::MAX), long];
     run.check_lies(others.map(|it| row(&it)), 3);
-    run.check_and_stop();
+    run.check_and_stop(4 + 3);
 }
 
 /// A message of 512 MB is never held in memory. Shorter messages that are still too long are rejected and counted before they are copied.
@@ -255,10 +255,7 @@ fn reject_half_a_gigabyte(run: &AttackedRun) {
     run.check_lies(long.map(|key| zeros(key, 600_000)), 3);
     check_replies(client, [zeros(keys.actor_key::<ChunkHeader>(0), 1 << 29)]);
     let peak = peak_mib();
-    assert!(
-        peak < peak_before + 100,
-        "{peak_before} MiB before, then {peak}"
-    );
+    assert!(peak < peak_before + 100, "{peak_before}, {peak} MiB");
 }
 
 /// The public liveliness tokens do not show the secret numbers by which the replay server knows its learner and its actors.

@@ -113,10 +113,8 @@ pub(crate) fn check_replies(client: &Client, rows: impl IntoIterator<Item = Row>
             Err(e @ SessionError::Recovering(_)) => e.to_string(),
             Err(_) => NO_REPLY.to_owned(),
         };
-        assert!(
-            reply.contains(expected),
-            "{key}, row {i}: wanted {expected:?}, got {reply}"
-        );
+        let is_right = reply.contains(expected);
+        assert!(is_right, "{key}, row {i}: wanted {expected:?}, got {reply}");
     }
 }
 

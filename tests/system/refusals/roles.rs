@@ -98,10 +98,8 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
     // At the actor's own keys, send messages that speak for another actor.
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
     let chunks = keys.actor_key::<ChunkHeader>(1);
-    let (joins, polls) = (
-        keys.actor_key::<ActorJoin>(1),
-        keys.actor_key::<ChunkPoll>(1),
-    );
+    let joins = keys.actor_key::<ActorJoin>(1);
+    let polls = keys.actor_key::<ChunkPoll>(1);
     let reason = "in the name of actor 0, but came at the key";
     send_in_parallel(
         one,
@@ -167,11 +165,8 @@ fn an_actor_declares_nothing_but_its_own(run: &TlsRun) {
     run.observer.wait_for_replay("one", |it| it.actors == 1);
     check_continues(&run.observer);
     assert_eq!(queries.load(Ordering::Relaxed), 0, "queries to an actor");
-    assert_eq!(
-        received.load(Ordering::Relaxed),
-        0,
-        "it receives nothing that is not for it"
-    );
+    let received = received.load(Ordering::Relaxed);
+    assert_eq!(received, 0, "messages that are not for it");
     drop((declared, everything, tokens));
 }
 

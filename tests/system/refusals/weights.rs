@@ -56,10 +56,8 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     actor.wait_for_stderr("waiting for the learner's first weights");
     check_rejected(&client, [("it has not joined", pack(1, &good, LEARNER))]);
     client.join_as_learner(LEARNER);
-    check_rejected(
-        &client,
-        [("of another run", upload(hash ^ 1, LEARNER, 1, &good))],
-    );
+    let foreign = upload(hash ^ 1, LEARNER, 1, &good);
+    check_rejected(&client, [("of another run", foreign)]);
     assert_eq!(client.replay_status().unwrap().transitions_inserted, 0);
     accept(1, &good);
     client.wait_for_transitions(0);
@@ -131,9 +129,7 @@ fn processes_of_another_protocol_version_do_not_join() {
         }
         queryable.undeclare().wait().unwrap();
     }
-    assert!(
-        !system.path("run").exists(),
-        "a learner that did not join writes nothing"
-    );
+    let has_begun = system.path("run").exists();
+    assert!(!has_begun, "a learner that did not join writes nothing");
     server.close().wait().unwrap();
 }

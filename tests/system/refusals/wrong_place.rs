@@ -3,6 +3,7 @@
 
 use std::{
     io::{Read, Write},
+    ops::Range,
     thread,
     time::{Duration, Instant},
 };
@@ -20,16 +21,13 @@ const COMMANDS: [&str; 4] = [
     "watch --connect",
 ];
 
-/// Runs a command that must exit within `seconds` seconds, and checks that its output names no file of the build machine.
-fn fails_within(system: &TestSystem, command: &str, seconds: u64) -> Exit {
+/// Runs a command that must exit within this range of seconds, and checks that its output names no file of the build machine.
+fn fails_within(system: &TestSystem, command: &str, seconds: Range<u64>) -> Exit {
     let started = Instant::now();
     let ended = system.run(command).expect_code(1);
     // Allow more time on a busy machine.
-    let took = started.elapsed();
-    assert!(
-        took < Duration::from_secs(seconds + 10),
-        "{command}: {took:?}"
-    );
+    let (took, seconds) = (started.elapsed(), seconds.start..seconds.end + 10);
+    assert!(seconds.contains(&took.as_secs()), "{command}: {took:?}");
     for own in [".rs:", "registry", "Timeout!"] {
         assert!(!ended.stderr.contains(own), "{}", ended.stderr);
     }
@@ -41,24 +39,20 @@ fn a_closed_port_differs_from_an_unknown_host() {
     let system = system();
     let (endpoint, _) = listen_on_free_port();
     let unknown = "tcp/no-such-host.invalid:7447";
-    for (endpoint, said) in [
-        // Processes give the replay server some seconds to start, `driml status` does not.
-        (
-            &*endpoint,
-            format!("nothing listens on {endpoint}: start the replay server first"),
-        ),
-        (unknown, format!("the host of {unknown} is unknown: ")),
-    ] {
-        in_parallel(COMMANDS, |command| {
-            fails_within(&system, &format!("{command} {endpoint}"), 30).expect_stderr(&said);
-        });
-    }
-    let started = Instant::now();
-    fails_within(&system, &format!("status --connect {endpoint}"), 0);
-    fails_within(&system, &system.connect_args("watch"), 0)
+    in_parallel(COMMANDS, |command| {
+        // Actors and learners give the replay server 30 s to start.
+        let waits = COMMANDS[..2].contains(&command);
+        let seconds = if waits { 25..30 } else { 0..5 };
+        fails_within(&system, &format!("{command} {endpoint}"), seconds).expect_stderr(&format!(
+            "nothing listens on {endpoint}: start the replay server first"
+        ));
+        // That a host is unknown may be temporary.
+        fails_within(&system, &format!("{command} {unknown}"), 0..30)
+            .expect_stderr(&format!("the host of {unknown} is unknown: "));
+    });
+    fails_within(&system, &system.connect_args("watch"), 0..5)
         .expect_stderr("there is no such socket. Start the replay server first");
     system.run("status").expect_code(64);
-    assert!(started.elapsed() < Duration::from_secs(10));
 }
 
 #[test]
@@ -79,7 +73,7 @@ fn a_web_server_is_no_replay_server() {
         }
     });
     in_parallel(COMMANDS, |command| {
-        fails_within(&system, &format!("{command} {endpoint}"), 5)
+        fails_within(&system, &format!("{command} {endpoint}"), 0..5)
             .expect_stderr(&format!(
                 "something listens on {endpoint} that is not driml"
             ))

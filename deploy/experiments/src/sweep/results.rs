@@ -96,10 +96,8 @@ mod tests {
     fn the_average_plays_before_the_newest_checkpoints() {
         let folder = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(folder.path());
-        assert_eq!(
-            choose_checkpoints(&folder, 3).unwrap(),
-            [CheckpointChoice::Newest]
-        );
+        let chosen = choose_checkpoints(&folder, 3).unwrap();
+        assert_eq!(chosen, [CheckpointChoice::Newest]);
         for updates in [1, 2, 3, 4] {
             let name = format!("checkpoint-{updates:012}");
             let path = folder.checkpoints().join(name);
@@ -109,9 +107,7 @@ mod tests {
         assert_eq!(choose_checkpoints(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
-        assert_eq!(
-            choose_checkpoints(&folder, 3).unwrap(),
-            [CheckpointChoice::Newest]
-        );
+        let chosen = choose_checkpoints(&folder, 3).unwrap();
+        assert_eq!(chosen, [CheckpointChoice::Newest]);
     }
 }

@@ -110,10 +110,8 @@ mod tests {
         }
         let [mean, square_v, square_a, together] = moments.map(|sum| sum / count);
         let square = 2.0 / std::f64::consts::PI;
-        assert!(
-            mean.abs() < 0.06 && together.abs() < 0.06,
-            "{mean}, {together}"
-        );
+        let is_even = mean.abs() < 0.06 && together.abs() < 0.06;
+        assert!(is_even, "{mean}, {together}");
         for found in [square_v, square_a] {
             assert!((found - square).abs() < 0.1, "{found}, not {square}");
         }

@@ -165,6 +165,11 @@ fn inputs_that_do_not_fit_are_errors() {
     assert!(network.logits(&narrow, None).is_err());
     let [psi, phi] = [[5, 3, 7], [5, 2, 7]].map(|shape| floats(&shape, &mut rng(7)));
     assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());
+    let config = residual(TorsoName::Impala);
+    let network = Network::new(&config, &parameters(&config, 1), Kernels::FUSED).unwrap();
+    let none = network.features(&frames(&config, 0, &mut rng(6)));
+    let said = none.unwrap_err().to_string();
+    assert!(said.contains("stages on images"), "{said}");
 }
 
 /// The settings' snapshot of refusals has the answers to configurations that can be set.

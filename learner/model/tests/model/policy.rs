@@ -30,10 +30,8 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
                     policy.greedy_actions(&states, &mut actions).unwrap();
                 });
                 for (value, wanted) in values.iter().zip(&wanted) {
-                    assert!(
-                        (f64::from(*value) - wanted).abs() < 1e-5,
-                        "batch {batch}, {threads} threads: {value}, {wanted}"
-                    );
+                    let error = (f64::from(*value) - wanted).abs();
+                    assert!(error < 1e-5, "batch {batch}, {threads} threads: {error}");
                 }
                 for (action, values) in actions.iter().zip(values.chunks(5)) {
                     let chosen = values[usize::from(*action)];

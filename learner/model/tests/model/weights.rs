@@ -65,10 +65,8 @@ fn every_layer_starts_as_its_law_says() {
             let side = rows.min(fan_in);
             for (at, value) in values(&gram.unwrap()).into_iter().enumerate() {
                 let wanted = if at / side == at % side { 2.0 } else { 0.0 };
-                assert!(
-                    (value - wanted).abs() < 1e-5,
-                    "{name} {shape:?}: {value} at {at}"
-                );
+                let error = (value - wanted).abs();
+                assert!(error < 1e-5, "{name} {shape:?}: {value} at {at}");
             }
         }
     }
@@ -137,10 +135,8 @@ fn tensors_that_do_not_fit_are_named() {
 
 /// Loads the file as parameters and as a policy. Both must fail, and the policy must stay as it was.
 fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
-    assert!(
-        Parameters::load_safetensors(config, file, &Device::Cpu).is_err(),
-        "{what}"
-    );
+    let loaded = Parameters::load_safetensors(config, file, &Device::Cpu);
+    assert!(loaded.is_err(), "{what}");
     let mut policy = policy(config, &parameters(config, 1), Precision::F32);
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
     let before = q_values(&mut policy, config, &frames);

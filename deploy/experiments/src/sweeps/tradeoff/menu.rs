@@ -378,7 +378,9 @@ mspacman coinrun chain|replay.shards|replay.shards=1";
             config
         };
         let is_preset = |it: &&DialLevel| it.dial.name.starts_with("preset");
-        for it in levels.iter().filter(is_preset) {
+        let presets: Vec<_> = levels.iter().filter(is_preset).collect();
+        assert!(!presets.is_empty());
+        for it in presets {
             assert_eq!(of("paper", &it.base), of(&it.dial.base, &it.base));
             let whole = of(&it.level, &it.base);
             assert_eq!(of("paper", &it.point), whole, "{}", it.point.key);

@@ -171,6 +171,9 @@ mod tests {
         // Two runs of `k` terms a row.
         let (row_stride, step_stride, run_stride) = if rows_adjacent {
             (depth, depth * rows, rows * k)
+        } else if rows == 1 && depth == 1 {
+            // A single row has any stride: twice this one wraps to a run.
+            (k / 2 + (1 << 63), depth, k)
         } else {
             (2 * k, depth, k)
         };
@@ -214,10 +217,8 @@ mod tests {
                 f64::from(left.value()) * f64::from(right.value())
             });
             let wanted = start + terms.sum::<f64>();
-            assert!(
-                (f64::from(got) - wanted).abs() <= 1e-5 * (1.0 + wanted.abs()),
-                "row {row}, column {col}: {got}, wanted {wanted}"
-            );
+            let is_close = (f64::from(got) - wanted).abs() <= 1e-5 * (1.0 + wanted.abs());
+            assert!(is_close, "row {row}, column {col}: {got}, wanted {wanted}");
         }
         true
     }
@@ -225,7 +226,7 @@ mod tests {
     #[test]
     fn every_instruction_set_computes_every_size_of_tile() {
         let mut tried = 0;
-        let heights = (1..=8).chain([16, 17, 40, 50, 64]);
+        let heights = (1..=17).chain([40, 50, 64]);
         let sizes = [1, 2, 4].map(|vecs| heights.clone().map(move |rows| [rows, vecs]));
         for [rows, vecs] in sizes.into_iter().flatten() {
             for (cols, mode, steps) in [
@@ -244,7 +245,8 @@ mod tests {
                 }
             }
         }
-        assert!(tried >= 2 * 3 * 4, "{tried} tiles");
+        // Portable code alone has four sizes.
+        assert!(tried >= 4 * 4 * 2 * 2, "{tried} tiles");
     }
 
     /// Lengths that do not fill registers; values from the whole range of f32, including subnormals, infinities and NaN.
@@ -274,10 +276,8 @@ mod tests {
             // Subnormals are exact too.
             let (got, wanted) = (bf16::rounded(value).to_f32(), nearest(value));
             let is_nearest = got.to_bits() == wanted.to_bits();
-            assert!(
-                is_nearest || got.is_nan() && value.is_nan(),
-                "{value:e}: {got:e}"
-            );
+            let is_nan = got.is_nan() && value.is_nan();
+            assert!(is_nearest || is_nan, "{value:e}: {got:e}");
         }
         for byte in 0..=255 {
             assert_eq!(f32::from_byte(byte), f32::from(byte) * (1.0 / 255.0));
