@@ -3,6 +3,7 @@
 # What is there already stays: a second call adds what is missing, to an existing authority.
 
 set -eu
+unset CDPATH
 
 usage() {
     cat <<'TEXT'
@@ -28,7 +29,7 @@ fail() { printf 'error: %s\n' "$*" >&2; exit 1; }
 
 # Whether an argument is a whole number from $2 to $3.
 whole() {
-    case $1 in '' | *[!0-9]*) return 1 ;; esac
+    case $1 in '' | *[!0-9]* | 0?*) return 1 ;; esac
     [ "${#1}" -le 6 ] && [ "$1" -ge "$2" ] && [ "$1" -le "$3" ]
 }
 
@@ -44,7 +45,9 @@ while [ $# -gt 0 ]; do
         --host)
             case $2 in
                 '' | *[!A-Za-z0-9._:-]*) fail "--host $2 is neither a name nor an address" ;;
-                *:* | [0-9]*.[0-9]*.[0-9]*.[0-9]*) names="$names,IP:$2" ;;
+                *:*) names="$names,IP:$2" ;;
+                *[!0-9.]*) names="$names,DNS:$2" ;;
+                *.*.*.*) names="$names,IP:$2" ;;
                 *) names="$names,DNS:$2" ;;
             esac
             shift ;;

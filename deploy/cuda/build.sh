@@ -4,6 +4,7 @@
 # requirements.txt, into the cache folder. It installs no driver and writes to nothing but cache and target folder.
 
 set -euo pipefail
+unset CDPATH
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 root=$(cd "$here/../.." && pwd)
 
@@ -68,8 +69,8 @@ fetch_toolkit() {
     fresh=$(mktemp -d "$folder.XXXXXX")
     # shellcheck disable=SC2064
     trap "rm -rf '$fresh'" EXIT
-    "${pip[@]}" install --quiet --no-deps --only-binary :all: --require-hashes --no-cache-dir --no-compile \
-        --disable-pip-version-check --no-input --target "$fresh" --requirement "$here/requirements.txt" ||
+    PIP_USER=0 PIP_REQUIRE_VIRTUALENV=0 "${pip[@]}" install --quiet --no-deps --only-binary :all: --require-hashes \
+        --no-cache-dir --no-compile --disable-pip-version-check --no-input --target "$fresh" --requirement "$here/requirements.txt" ||
         fail "pip could not fetch the CUDA compiler (see above): is the network reachable?"
     cp "$here/requirements.txt" "$fresh/fetched.txt"
     chmod 755 "$fresh"

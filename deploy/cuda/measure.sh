@@ -4,6 +4,7 @@
 # an interrupted run from its newest checkpoint, for the remaining minutes.
 
 set -euo pipefail
+unset CDPATH
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 
 say() { printf '=== %s\n' "$*"; }

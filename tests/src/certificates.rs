@@ -24,9 +24,12 @@ impl Certificates {
     /// Runs `deploy/certs.sh` for a folder, which may already exist; `args` are split at blanks.
     pub fn make(folder: PathBuf, args: &str) -> Self {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/certs.sh");
-        run(Command::new(script)
-            .arg(&folder)
-            .args(args.split_whitespace()));
+        let (parent, name) = (folder.parent().unwrap(), folder.file_name().unwrap());
+        let mut command = Command::new(script);
+        // A shell that follows CDPATH prints where it went.
+        command.current_dir(parent).env("CDPATH", parent).arg(name);
+        let said = run(command.args(args.split_whitespace()));
+        assert!(!said.starts_with('/'), "{said}");
         Self::in_folder(folder)
     }
 

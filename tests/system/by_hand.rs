@@ -62,7 +62,7 @@ fn processes_end_by_themselves_when_the_run_is_over() {
     for shards in [1, 2] {
         let system = system();
         let endpoints: Vec<_> = (0..shards)
-            .map(|shard| system.socket_endpoint(&format!("{shard}.sock")))
+            .map(|shard| system.socket_endpoint(&format!("e\u{301}{shard}")))
             .collect();
         let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
         let mut calls = Vec::new();

@@ -210,6 +210,10 @@ fn every_source_file_says_what_it_is_for() {
         let is_text = first.starts_with("//! ") && first.len() > 12;
         assert!(is_text, "{name} starts with {first:?}");
     }
+    for Source { name, text } in sources(&[".sh"]) {
+        let is_at_home = text.contains("\nunset CDPATH\n");
+        assert!(is_at_home, "{name} follows CDPATH");
+    }
 }
 
 #[test]

@@ -63,7 +63,7 @@ fn own_files_that_cannot_be_used() {
     tls_copy(&system, "number").replace_role("actor-1", "actor-0");
     tls_copy(&system, "old").sign_again("learner", EXPIRED);
     tls_copy(&system, "new").sign_again("learner", FUTURE);
-    let foreign = Certificates::make(system.path("foreign"), "");
+    let foreign = Certificates::make(system.path("foreign"), "--host 10.0.0.1.nip.io");
     let mixed = tls_copy(&system, "mixed").path("ca.pem");
     std::fs::copy(foreign.path("ca.pem"), mixed).unwrap();
     let [actor, learner] = ["actor --id 0", "learner --run-dir run"]
@@ -157,6 +157,7 @@ fn strangers_in_the_place_of_a_replay_server() {
     let new = tls_copy(&system, "new").sign_again("replay-server", FUTURE);
     let foreign = Certificates::make(system.path("foreign"), "");
     let [named, unknowing] = ["named", "unknowing"].map(|name| tls_copy(&system, name));
+    tls_copy(&system, "t\u{301}ls");
     for ending in ["pem", "key"] {
         std::fs::remove_file(named.path(&format!("replay-server.{ending}"))).unwrap();
     }
@@ -179,7 +180,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         let endpoint = quic_endpoint();
         let listening =
             stranger.map(|(files, role)| open_raw("listen", &endpoint, files, Some(role)).unwrap());
-        let actor = format!("actor --id 0 --connect {endpoint} --tls-dir tls");
+        let actor = format!("actor --id 0 --connect {endpoint} --tls-dir t\u{301}ls");
         let actor = system.start_process(&actor);
         (name, endpoint, listening, actor)
     });

@@ -5,6 +5,7 @@ mod requests;
 
 use std::{sync::Arc, time::Duration};
 
+use serde_json::json;
 use zenoh::{Session, Wait};
 
 pub use requests::{PendingReply, SessionError, answer, ask};
@@ -126,8 +127,8 @@ fn open_with_settings(
     let send_timeout_us = SEND_TIMEOUT.as_micros().to_string();
     let settings: &[(&str, &str)] = &[
         ("mode", if router { "\"router\"" } else { "\"client\"" }),
-        ("listen/endpoints", &format!("{:?}", endpoints.listen)),
-        ("connect/endpoints", &format!("{:?}", endpoints.connect)),
+        ("listen/endpoints", &json!(endpoints.listen).to_string()),
+        ("connect/endpoints", &json!(endpoints.connect).to_string()),
         (
             "connect/exit_on_failure",
             if router { "false" } else { "true" },

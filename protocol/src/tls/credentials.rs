@@ -17,6 +17,7 @@ use rustls::{
     server::{ParsedCertificate, WebPkiClientVerifier},
     sign::CertifiedKey,
 };
+use serde_json::json;
 use x509_parser::prelude::{FromDer, GeneralName, X509Certificate};
 
 use super::access::{ACTORS_MAX, Role};
@@ -167,7 +168,7 @@ impl Credentials {
             ("connect_certificate", &self.certificate),
             ("connect_private_key", &self.key),
         ];
-        let paths = paths.map(|(name, path)| format!("{name}: {:?}", path.display().to_string()));
+        let paths = paths.map(|(name, path)| format!("{name}: {}", json!(path.to_string_lossy())));
         format!(
             "{{ {}, enable_mtls: true, verify_name_on_connect: true, close_link_on_expiration: true }}",
             paths.join(", ")

@@ -11,7 +11,7 @@ use driml_learner::checkpoint::{self, AVERAGE};
 use super::plan::FinishedRun;
 use crate::{cache::Session, progress::Progress};
 
-/// The seed of the played episodes, so that every run plays the same levels.
+/// The seed of the played episodes, so that every run plays the same levels. Older checkpoints of a run play others, with the next seeds.
 const SEED: u64 = 1;
 
 #[derive(Clone, Copy, Debug)]
@@ -58,15 +58,15 @@ impl PlaySettings {
         folder: &RunFolder,
         progress: &mut Progress,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        let chosen = choose_checkpoints(folder, self.checkpoints)?;
+        let chosen = choose(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(chosen.len().max(1) as u32);
-        let returns = chosen.into_iter().map(|choice| {
+        let returns = chosen.into_iter().map(|(choice, seed)| {
             let player = Player::load(folder, choice, WeightsChoice::default())?;
             if world_with_levels(&player.config.world, self.levels).is_err() {
                 return Ok(None);
             }
             let (agent, is_over) = (PolicyKind::Agent, || progress.is_interrupted());
-            let returns = player.returns(agent, self.levels, each as usize, SEED, is_over)?;
+            let returns = player.returns(agent, self.levels, each as usize, seed, is_over)?;
             progress.advance(0)?;
             Ok(Some(returns))
         });
@@ -75,15 +75,16 @@ impl PlaySettings {
     }
 }
 
-fn choose_checkpoints(folder: &RunFolder, count: usize) -> anyhow::Result<Vec<CheckpointChoice>> {
+fn choose(folder: &RunFolder, count: usize) -> anyhow::Result<Vec<(CheckpointChoice, u64)>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
         // Averages of three checkpoints differ little, so the newest suffices. Without a checkpoint the player reports the error.
-        return Ok(vec![CheckpointChoice::Newest]);
+        return Ok(vec![(CheckpointChoice::Newest, SEED)]);
     }
-    let newest = all.iter().rev().take(count);
-    Ok(newest.map(|it| CheckpointChoice::After(it.0)).collect())
+    let newest = all.iter().rev().take(count).zip(SEED..);
+    let newest = newest.map(|(it, seed)| (CheckpointChoice::After(it.0), seed));
+    Ok(newest.collect())
 }
 
 #[cfg(test)]
@@ -96,18 +97,18 @@ mod tests {
     fn the_average_plays_before_the_newest_checkpoints() {
         let folder = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(folder.path());
-        let chosen = choose_checkpoints(&folder, 3).unwrap();
-        assert_eq!(chosen, [CheckpointChoice::Newest]);
+        let chosen = choose(&folder, 3).unwrap();
+        assert_eq!(chosen, [(CheckpointChoice::Newest, SEED)]);
         for updates in [1, 2, 3, 4] {
             let name = format!("checkpoint-{updates:012}");
             let path = folder.checkpoints().join(name);
             fs::create_dir_all(path).unwrap();
         }
-        let newest = [4, 3, 2].map(CheckpointChoice::After);
-        assert_eq!(choose_checkpoints(&folder, 3).unwrap(), newest);
+        let newest = [(4, 1), (3, 2), (2, 3)].map(|(it, seed)| (CheckpointChoice::After(it), seed));
+        assert_eq!(choose(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
-        let chosen = choose_checkpoints(&folder, 3).unwrap();
-        assert_eq!(chosen, [CheckpointChoice::Newest]);
+        let chosen = choose(&folder, 3).unwrap();
+        assert_eq!(chosen, [(CheckpointChoice::Newest, SEED)]);
     }
 }

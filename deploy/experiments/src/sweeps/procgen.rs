@@ -73,8 +73,10 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             session.progress.add_work(play.units);
             let key = format!("{}-single", it.plan.name);
             let returns = play.play_greedy(&mut session, &key, &it.run)?;
-            let score = returns.and_then(|it| mean(&it));
-            it.single = score.and_then(|score| normalise(&it.point.game, score));
+            let settings = it.metrics.settings.as_ref();
+            let mode = settings.and_then(|it| it.get("world.distribution_mode"));
+            let score = returns.and_then(|it| mean(&it)).zip(mode);
+            it.single = score.and_then(|(score, mode)| normalise(&it.point.game, mode, score));
         }
     }
     let values = page_values(&settings, &scored);

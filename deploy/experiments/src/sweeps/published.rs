@@ -18,9 +18,9 @@ pub(super) fn paper_return(game: &str, agent: &str) -> Option<f64> {
     Some(mean.parse().expect("it is built in, and a test reads it"))
 }
 
-/// Normalises a return on single levels: `(return - min) / (max - min)`. `None` for worlds other than Procgen.
-pub(super) fn normalise(game: &str, score: f64) -> Option<f64> {
-    let [min, max] = ["easy-min", "easy-max"].map(|what| paper_return(game, what));
+/// Normalises a return on single levels: `(return - min) / (max - min)`. `None` for worlds other than Procgen, and other modes than easy.
+pub(super) fn normalise(game: &str, mode: &str, score: f64) -> Option<f64> {
+    let [min, max] = ["min", "max"].map(|end| paper_return(game, &format!("{mode}-{end}")));
     let (min, max) = min.zip(max)?;
     Some((score - min) / (max - min))
 }
@@ -46,8 +46,8 @@ mod tests {
         ] {
             assert_eq!(paper_return(game, agent), wanted);
         }
-        assert_eq!(normalise("fruitbot", -1.5), Some(0.0));
-        assert_eq!(normalise("bossfight", 13.0), Some(1.0));
-        assert_eq!(normalise("chain", 1.0), None);
+        assert_eq!(normalise("fruitbot", "easy", -1.5), Some(0.0));
+        assert_eq!(normalise("bossfight", "easy", 13.0), Some(1.0));
+        assert_eq!(normalise("bossfight", "hard", 13.0), None);
     }
 }

@@ -277,7 +277,7 @@ fn front(placed: &[Marker]) -> Vec<(f64, f64)> {
 fn wall_figure(results: &Results) -> Figure {
     let panels = results.rows_by_dial().map(|rows| {
         let series = rows.iter().enumerate().map(|(index, row)| {
-            let each = row.result.seeds.iter().map(|it| it.curve.clone());
+            let each = row.result.uninterrupted().map(|it| it.curve.clone());
             let curve = combine_seeds(&each.collect::<Vec<_>>(), Band::Range);
             curve.series(row.name, index)
         });

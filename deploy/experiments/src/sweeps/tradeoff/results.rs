@@ -109,7 +109,7 @@ impl Row<'_> {
     /// time, beside other runs.
     pub(super) fn frames_gain(&self) -> Option<f64> {
         let mean_of = |point: &PointResult, other: &PointResult| {
-            let both = |it: &&SeedResult| other.seeds.iter().any(|that| that.seed == it.seed);
+            let both = |it: &&SeedResult| other.uninterrupted().any(|that| that.seed == it.seed);
             let values = point.seeds.iter().filter(both);
             mean(&values.filter_map(FRAMES_PER_SECOND.get).collect::<Vec<_>>())
         };
