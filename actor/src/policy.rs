@@ -73,10 +73,7 @@ impl NetworkPolicy {
         Ok(Self {
             network: PolicyNetwork::new(model, safetensors, precision)?,
             enlarge,
-            num_actions: u8::try_from(model.num_actions).map_err(|_| {
-                let actions = model.num_actions;
-                ActError::Other(format!("{actions} actions: a world has at most 255"))
-            })?,
+            num_actions: u8::try_from(model.num_actions).expect("a valid model has at most 255"),
             has_noise: false,
             greedy_envs: Vec::new(),
             states: Vec::new(),

@@ -1,9 +1,6 @@
 //! One update: computes the gradients of a batch, clips them, takes an Adam step and moves the target network.
 //! It does not fetch batches, publish weights or save checkpoints, and communicates with no other process.
 
-use std::collections::HashMap;
-
-use candle_core::Tensor;
 use driml_model::{
     Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, WeightDtype, is_dim,
 };
@@ -41,10 +38,10 @@ pub struct Agent {
     target: Parameters,
     key_encoder: Option<Parameters>,
     /// Torso and head of the averaged network; `None` before the first update, and without `average_tau`.
-    average: Option<Parameters>,
+    pub(crate) average: Option<Parameters>,
     noise_seed: [u8; 32],
     pub(crate) adam: Adam,
-    updates: u64,
+    pub(crate) updates: u64,
 }
 
 impl Agent {
@@ -199,19 +196,11 @@ impl Agent {
         Ok(self.average.is_some())
     }
 
-    /// The weights that actors need, torso and head, as safetensors bytes.
+    /// The weights that actors need, torso and head, as safetensors bytes with scalars of type `stored`.
     ///
     /// # Errors
-    /// A weight that is not finite; a failing serialisation.
-    pub fn weights(&self) -> Result<Vec<u8>, UpdateError> {
-        self.weights_as(WeightDtype::F32)
-    }
-
-    /// [`Agent::weights`] with scalars of another type.
-    ///
-    /// # Errors
-    /// As [`Agent::weights`], and a weight that is too large for the type.
-    pub fn weights_as(&self, stored: WeightDtype) -> Result<Vec<u8>, UpdateError> {
+    /// A weight that is not finite, or too large for the type; a failing serialisation.
+    pub fn weights(&self, stored: WeightDtype) -> Result<Vec<u8>, UpdateError> {
         Ok(self
             .online()
             .to_safetensors_as(stored, |name| !is_dim(name))?)
@@ -311,21 +300,5 @@ impl Agent {
             target::follow(&self.target, online, settings.target_tau, kernels)?;
         }
         Ok(norm)
-    }
-
-    pub(crate) fn restore_average(&mut self, average: Parameters) {
-        self.average = Some(average);
-    }
-
-    /// Restores the optimiser's state and the count of updates from a checkpoint.
-    pub(crate) fn restore_optimiser(
-        &mut self,
-        updates: u64,
-        adam_step: u64,
-        moments: HashMap<String, Tensor>,
-    ) -> Result<(), UpdateError> {
-        self.adam.restore(adam_step, moments)?;
-        self.updates = updates;
-        Ok(())
     }
 }

@@ -160,23 +160,11 @@ impl Augmenter {
         out.par_chunks_exact_mut(state_bytes)
             .zip(states.par_chunks_exact(state_bytes))
             .zip(&views)
-            .for_each_init(
-                || self.new_line(),
-                |line, ((out, state), view)| self.apply_view_using(state, view, out, line),
-            );
-    }
-
-    /// Allocates a buffer for a line of the crop.
-    fn new_line(&self) -> Vec<u16> {
-        vec![0; self.crop.1 * self.size.2]
+            .for_each(|((out, state), view)| self.apply_view(state, view, out));
     }
 
     /// Applies `view` to one state and writes the result to `out`.
     pub fn apply_view(&self, state: &[u8], view: &View, out: &mut [u8]) {
-        self.apply_view_using(state, view, out, &mut self.new_line());
-    }
-
-    fn apply_view_using(&self, state: &[u8], view: &View, out: &mut [u8], line: &mut [u16]) {
         let (height, width, channels) = self.size;
         if self.crop == (height, width) {
             out.copy_from_slice(state);
@@ -188,7 +176,8 @@ impl Augmenter {
                 12 => Self::resize::<12>,
                 _ => Self::resize_any,
             };
-            resize(self, state, view, out, line);
+            let mut line = vec![0; self.crop.1 * channels];
+            resize(self, state, view, out, &mut line);
         }
         recolour(out, view, self.frame_channels);
     }

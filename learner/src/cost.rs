@@ -65,7 +65,7 @@ impl UpdateCost {
             layers.iter().filter(of_parts).map(cost).sum()
         };
         let forward = |parts: &[&str]| sum(parts, |layer| layer.forward);
-        let learning = |parts: &[&str]| sum(parts, LayerCost::forward_backward);
+        let learning = |parts: &[&str]| sum(parts, |layer| layer.forward + layer.backward);
         let UpdateShape {
             rows,
             every_action,

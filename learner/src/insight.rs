@@ -5,7 +5,6 @@ use candle_core::Tensor;
 use driml_model::{Compute, Features, ModelConfig, Network, Parameters, Resizer};
 
 use crate::{
-    agent::Agent,
     auxiliary::dim::{DIM, HeadVectors},
     error::UpdateError,
     losses::{c51::softmax, scores::ScoreClip},
@@ -36,19 +35,8 @@ pub struct NetworkOutputs {
 }
 
 impl Insight {
-    /// Inspects the online network of `agent` and shares its parameters. `compute` must be on the agent's device.
-    pub fn from_agent(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
-        Self::new(
-            agent.model(),
-            agent.settings(),
-            agent.online(),
-            compute,
-            None,
-        )
-    }
-
-    /// Inspects a network with these parameters, trained with these settings. Without DIM's local heads it compares no features.
-    /// `enlarge` resizes states to the network's input; `None` if they have its size.
+    /// Inspects a network with these parameters, which it shares, trained with these settings. Without DIM's local heads it compares no
+    /// features. `compute` is on the parameters' device; `enlarge` resizes states to the network's input, `None` if they have its size.
     pub fn new(
         model: &ModelConfig,
         settings: &UpdateSettings,

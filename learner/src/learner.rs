@@ -185,7 +185,7 @@ impl Learner {
     /// Exports the current weights under a new version number.
     pub fn export_weights(&mut self) -> Result<Weights, UpdateError> {
         let dtype = self.config.learner.publish_dtype;
-        let safetensors = self.agent().weights_as(dtype)?;
+        let safetensors = self.agent().weights(dtype)?;
         self.state.weights_version += 1;
         let header = WeightsHeader::new(self.state.weights_version, self.updates(), &safetensors);
         Ok(Weights {

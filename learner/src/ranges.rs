@@ -39,9 +39,19 @@ pub(crate) fn check_array(name: &str, array: &[f64], len: usize) -> Result<(), U
             "{name} has {found} numbers, not {len}"
         )));
     }
-    match array.iter().position(|value| !value.is_finite()) {
+    check_numbers(name, array, "not finite", f64::is_finite)
+}
+
+/// Checks that each number of an affinity's array `is_right`. The error says that `name` is `wrong`, and where.
+pub(crate) fn check_numbers(
+    name: &str,
+    array: &[f64],
+    wrong: &str,
+    is_right: fn(f64) -> bool,
+) -> Result<(), UpdateError> {
+    match array.iter().position(|&number| !is_right(number)) {
         Some(at) => Err(UpdateError::Affinity(format!(
-            "{name} is not finite at index {at}"
+            "{name} is {wrong} at index {at}"
         ))),
         None => Ok(()),
     }
@@ -54,11 +64,6 @@ pub(crate) fn check_probabilities(
     len: usize,
 ) -> Result<(), UpdateError> {
     check_array(name, array, len)?;
-    let probability = |value: &f64| (0.0..=1.0 + 1e-6).contains(value);
-    match array.iter().position(|value| !probability(value)) {
-        Some(at) => Err(UpdateError::Affinity(format!(
-            "{name} is not a probability at index {at}"
-        ))),
-        None => Ok(()),
-    }
+    let is_probability = |number: f64| (0.0..=1.0 + 1e-6).contains(&number);
+    check_numbers(name, array, "not a probability", is_probability)
 }

@@ -79,7 +79,7 @@ fn train_agent(system: &TestSystem, flags: &str) -> (Agent, NetworkOutputs) {
     fs::write(system.path("states"), &states).unwrap();
     let mut agent = restored.unwrap().unwrap().agent;
     agent.copy_average_to_online().unwrap();
-    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let insight = Insight::new(model, update, agent.online(), Compute::CPU, None).unwrap();
     let ours = insight.evaluate(&states).unwrap();
     (agent, ours)
 }

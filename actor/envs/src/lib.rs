@@ -66,7 +66,7 @@ pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
 pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
-pub use registry::{WorldConfig, WorldName, WorldNameError};
+pub use registry::{WorldConfig, WorldName};
 pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{BuildResult, Levels, Variants, WorldSettings};
 pub use worlds::chain::{ChainConfig, ChainWorld};

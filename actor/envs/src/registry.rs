@@ -277,54 +277,47 @@ impl fmt::Display for WorldName {
 }
 
 impl FromStr for WorldName {
-    type Err = WorldNameError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
+    fn from_str(text: &str) -> Result<Self, String> {
         let known = WorldName::all().find(|name| name.to_string() == text);
         let known = known.or_else(|| WorldName::parse_free_text(text));
-        known.ok_or_else(|| WorldNameError::new(text))
+        known.ok_or_else(|| unknown_name_error(text))
     }
 }
 
-/// The error for a text that names no world. The message lists all worlds and suggests the nearest if one is near.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct WorldNameError(String);
-
-impl WorldNameError {
-    fn new(text: &str) -> Self {
-        let mut why = format!("no world is named \"{text}\"");
-        if let Some(name) = nearest_world(text) {
-            why += &format!("; did you mean \"{name}\"?");
-        }
-        if is_gymnasium_name(text) {
-            let flags = match text.starts_with("ALE/") {
-                true => "--atari",
-                false => "--pixels --size 64 --grey",
-            };
-            why += &format!(
-                "; a world of Gymnasium is \"exec:python3 deploy/python/driml_env.py {text} {flags}\", \
-                 and deploy/docs/src/how-to/own-world.md says what that needs"
-            );
-        }
-        let mut names = Vec::new();
-        let mut listed = String::new();
-        for (kind, variants) in KINDS {
-            let variants = variants();
-            let key = variants.key.to_uppercase();
-            if variants.is_free_text {
-                names.push(format!("{kind}:{key}"));
-            } else if variants.names.is_empty() {
-                names.push((*kind).to_owned());
-            } else {
-                names.push(format!("{kind}:{key}"));
-                listed += &format!("; {key} is one of {}", variants.names.join(", "));
-            }
-        }
-        names.push(format!("{LIBENV_PREFIX}:PATH:GAME"));
-        names.extend(plugin::registered_names().map(str::to_owned));
-        Self(format!("{why} (the worlds: {}{listed})", names.join(", ")))
+/// The error for a text that names no world. It lists all worlds and suggests the nearest if one is near.
+fn unknown_name_error(text: &str) -> String {
+    let mut why = format!("no world is named \"{text}\"");
+    if let Some(name) = nearest_world(text) {
+        why += &format!("; did you mean \"{name}\"?");
     }
+    if is_gymnasium_name(text) {
+        let flags = match text.starts_with("ALE/") {
+            true => "--atari",
+            false => "--pixels --size 64 --grey",
+        };
+        why += &format!(
+            "; a world of Gymnasium is \"exec:python3 deploy/python/driml_env.py {text} {flags}\", \
+             and deploy/docs/src/how-to/own-world.md says what that needs"
+        );
+    }
+    let (mut names, mut listed) = (Vec::new(), String::new());
+    for (kind, variants) in KINDS {
+        let variants = variants();
+        if variants.key.is_empty() {
+            names.push((*kind).to_owned());
+            continue;
+        }
+        let key = variants.key.to_uppercase();
+        names.push(format!("{kind}:{key}"));
+        if !variants.names.is_empty() {
+            listed += &format!("; {key} is one of {}", variants.names.join(", "));
+        }
+    }
+    names.push(format!("{LIBENV_PREFIX}:PATH:GAME"));
+    names.extend(plugin::registered_names().map(str::to_owned));
+    format!("{why} (the worlds: {}{listed})", names.join(", "))
 }
 
 /// Whether a name has the form of Gymnasium's names: `ALE/Pong-v5`, `CartPole-v1`.

@@ -51,7 +51,7 @@ pub(crate) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<St
 
 /// Returns parameters with these finite scalars, in the order of [`tensors`].
 pub(crate) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
-    Parameters::from_tensors(config, tensors(config, values)?, &Device::Cpu)
+    Parameters::from_tensors(config, |_| true, tensors(config, values)?, &Device::Cpu)
 }
 
 /// Returns the scalars of all parameters, in the order of [`parameters`].

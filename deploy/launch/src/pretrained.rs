@@ -85,7 +85,7 @@ fn load_bytes(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
         config.actor.precision = Precision::F32;
     }
     let model = config.model.without_dim();
-    let network = Parameters::load_safetensors(&model, bytes, &Compute::CPU.device)
+    let network = Parameters::load_safetensors(&model, |_| true, bytes, &Compute::CPU.device)
         .with_context(|| usage!("{name} does not have the weights of its settings"))?;
     Ok(Player {
         config,

@@ -74,7 +74,7 @@ pub fn world(name: &str) -> Result<WorldName, Usage> {
     let game = format!("procgen:{name}");
     let known = name.parse::<WorldName>();
     let known = known.or_else(|e| game.parse().map_err(|_| e));
-    known.map_err(|e| Usage(e.to_string()))
+    known.map_err(Usage)
 }
 
 /// Finds an agent by name.

@@ -21,11 +21,6 @@ pub struct LayerCost {
 }
 
 impl LayerCost {
-    /// FLOPs of one state forward and backward.
-    pub const fn forward_backward(&self) -> u64 {
-        self.forward + self.backward
-    }
-
     /// Whether the layer belongs to the part of the network with this name, such as `torso` or `dim.psi4`.
     pub fn is_in(&self, part: &str) -> bool {
         let rest = self.name.strip_prefix(part);

@@ -60,7 +60,7 @@ pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_minus_max, soft_clip};
 pub use kernels::isa::{describe_kernels, is_bf16_fast, multiply_in_first_cache};
 pub use kernels::linear::{linear, relu};
-pub use kernels::precision::{Precision, UnknownPrecision};
+pub use kernels::precision::Precision;
 pub use kernels::tensors::{Values, floats, values_of};
 pub use network::{Encoder, Features, Network};
 pub use parameters::{Parameters, is_dim};

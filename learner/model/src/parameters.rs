@@ -35,21 +35,12 @@ impl Parameters {
         Ok(Self(vars))
     }
 
-    /// Builds parameters from copies of `tensors`.
+    /// Builds the parameters whose names pass `filter` from copies of `tensors`.
     ///
     /// # Errors
     /// [`ModelError::Parameter`] for the first parameter that is missing, unknown, not f32, of another shape or not
     /// finite; an invalid configuration.
     pub fn from_tensors(
-        config: &ModelConfig,
-        tensors: HashMap<String, Tensor>,
-        device: &Device,
-    ) -> Result<Self> {
-        Self::part_from_tensors(config, |_| true, tensors, device)
-    }
-
-    /// [`Parameters::from_tensors`] for the parameters whose names pass `filter`.
-    pub fn part_from_tensors(
         config: &ModelConfig,
         filter: impl Fn(&str) -> bool,
         tensors: HashMap<String, Tensor>,
@@ -61,19 +52,15 @@ impl Parameters {
             return Err(ModelError::parameter(name, why));
         }
         let file = safetensors::serialize(&tensors, None)?;
-        Self::load_part(config, filter, &file, device)
+        Self::load_safetensors(config, filter, &file, device)
     }
 
-    /// Loads parameters from the bytes of a safetensors file that holds exactly the parameters of `config`.
+    /// Loads parameters from the bytes of a safetensors file that holds exactly those parameters of `config` whose
+    /// names pass `filter`.
     ///
     /// # Errors
     /// Bytes that are not safetensors; otherwise as [`Parameters::from_tensors`].
-    pub fn load_safetensors(config: &ModelConfig, bytes: &[u8], device: &Device) -> Result<Self> {
-        Self::load_part(config, |_| true, bytes, device)
-    }
-
-    /// [`Parameters::load_safetensors`] for the parameters whose names pass `filter`.
-    pub fn load_part(
+    pub fn load_safetensors(
         config: &ModelConfig,
         filter: impl Fn(&str) -> bool,
         bytes: &[u8],

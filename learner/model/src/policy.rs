@@ -4,7 +4,7 @@
 //! This module runs the same kernels as `Network`. It splits the batch over the rayon pool once, not layer by
 //! layer, so that a task's maps stay in its core's cache.
 
-use std::{convert::Infallible, fmt};
+use std::convert::Infallible;
 
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -28,7 +28,6 @@ pub struct PolicyNetwork {
     support: Vec<f32>,
     precision: Precision,
     weights: Weights,
-    values: Vec<f32>,
 }
 
 impl PolicyNetwork {
@@ -46,7 +45,6 @@ impl PolicyNetwork {
             config,
             precision,
             weights,
-            values: Vec::new(),
         })
     }
 
@@ -117,24 +115,12 @@ impl PolicyNetwork {
     /// Writes the greedy action of each frame in `frames` [B, H, W, C] to `actions` [B]. On a tie the lowest action wins.
     pub fn greedy_actions(&mut self, frames: &[u8], actions: &mut [u8]) -> Result<()> {
         let count = self.config.num_actions;
-        let mut values = std::mem::take(&mut self.values);
-        values.resize(actions.len() * count, 0.0);
-        let result = self.q_values(frames, &mut values);
-        if result.is_ok() {
-            for (action, values) in actions.iter_mut().zip(values.chunks_exact(count)) {
-                *action = argmax(values);
-            }
+        let mut values = vec![0.0; actions.len() * count];
+        self.q_values(frames, &mut values)?;
+        for (action, values) in actions.iter_mut().zip(values.chunks_exact(count)) {
+            *action = argmax(values);
         }
-        self.values = values;
-        result
-    }
-}
-
-impl fmt::Debug for PolicyNetwork {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("PolicyNetwork")
-            .field("config", &self.config)
-            .finish_non_exhaustive()
+        Ok(())
     }
 }
 

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::alphabet::Alphabet;
 use crate::{
     error::UpdateError,
-    ranges::{check_array, check_probabilities, check_ranges},
+    ranges::{check_array, check_numbers, check_probabilities, check_ranges},
 };
 
 /// Decay and smoothing of the pair counts.
@@ -67,11 +67,7 @@ impl ExactAffinity {
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         check_array("counts", &self.counts, m * m)?;
-        if let Some(at) = self.counts.iter().position(|&count| count < 0.0) {
-            return Err(UpdateError::Affinity(format!(
-                "counts is below 0 at index {at}"
-            )));
-        }
+        check_numbers("counts", &self.counts, "below 0", |count| count >= 0.0)?;
         check_probabilities("matrix", &self.ratios(), m * m)
     }
 

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::alphabet::Alphabet;
 use crate::{
     error::UpdateError,
-    ranges::{check_array, check_probabilities, check_ranges},
+    ranges::{check_array, check_numbers, check_probabilities, check_ranges},
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -107,11 +107,9 @@ impl LearnedAffinity {
         let count = parameter_count(m, self.settings.hidden);
         check_array("parameters", &self.parameters, count)?;
         check_array("first_moments", &self.first_moments, count)?;
-        check_array("second_moments", &self.second_moments, count)?;
-        if let Some(at) = self.second_moments.iter().position(|&moment| moment < 0.0) {
-            let why = format!("second_moments is below 0 at index {at}");
-            return Err(UpdateError::Affinity(why));
-        }
+        let second_moments = &self.second_moments;
+        check_array("second_moments", second_moments, count)?;
+        check_numbers("second_moments", second_moments, "below 0", |it| it >= 0.0)?;
         check_probabilities("smoothed", &self.smoothed, m * m)
     }
 

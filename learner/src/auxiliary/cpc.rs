@@ -24,9 +24,7 @@ pub const CPC: MenuItem = MenuItem {
     positives: Positives::Several,
     loss_names: &NAMES,
     make: |settings| {
-        settings.check_no_own_table()?;
-        settings.check_any_pair_active()?;
-        let dim = Dim::new(settings);
+        let dim = Dim::new(settings)?;
         Ok(Box::new(Cpc { dim }))
     },
 };

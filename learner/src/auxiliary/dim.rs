@@ -7,13 +7,14 @@ use driml_model::{DimHeads, Features, Kernels, Network};
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
     positives::Positives,
-    settings::{AuxiliarySettings, Lambda},
+    settings::Lambda,
 };
 use crate::{
     batch::Batch,
     deduplicate::StateBytes,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::DotProducts},
+    settings::UpdateSettings,
 };
 
 /// The menu item of DIM.
@@ -21,11 +22,7 @@ pub const DIM: MenuItem = MenuItem {
     name: "dim",
     positives: Positives::One,
     loss_names: &NAMES,
-    make: |settings| {
-        settings.check_no_own_table()?;
-        settings.check_any_pair_active()?;
-        Ok(Box::new(Dim::new(settings)))
-    },
+    make: |settings| Ok(Box::new(Dim::new(settings)?)),
 };
 
 /// The name under which each pair's loss is reported, in the order of `settings::PAIRS`.
@@ -41,12 +38,14 @@ pub struct Dim {
 }
 
 impl Dim {
-    /// Creates the loss from settings.
-    pub const fn new(settings: &AuxiliarySettings<'_>) -> Self {
-        Self {
+    /// Creates the loss from settings; at least one lambda must be above 0.
+    pub fn new(settings: &UpdateSettings) -> Result<Self, UpdateError> {
+        settings.check_no_own_table()?;
+        settings.check_any_pair_active()?;
+        Ok(Self {
             lambda: settings.lambda,
             tanh_clip: settings.tanh_clip,
-        }
+        })
     }
 
     /// Computes the losses of the pairs with a weight above 0.

@@ -172,7 +172,7 @@ fn files(
         format: FORMAT,
         run_spec_hash: format_hash(extras.run_spec_hash),
         updates: agent.updates(),
-        adam_step: agent.adam.step_count(),
+        adam_step: agent.adam.step,
         weights_version: state.weights_version,
         progress: state.run_counts.clone(),
         rng: state.rng.clone(),

@@ -23,18 +23,9 @@ pub enum CheckpointError {
         file.display(), file.parent().unwrap_or(file).display()
     )]
     Damaged { file: PathBuf, why: String },
-    /// Another version of this program wrote the checkpoint, or its run had another network or another estimator of the affinity.
+    /// Another version of this program wrote the checkpoint, or its run had another specification, network or estimator of the affinity.
     #[error("{0}")]
     Mismatch(String),
-    #[error(
-        "{folder} belongs to a run with specification {found}, this run's is {expected}: \
-         resume with the settings it was made with, or choose another folder"
-    )]
-    OtherRun {
-        folder: PathBuf,
-        found: String,
-        expected: String,
-    },
     /// No learner could be restored from the state, for example because a weight is not finite.
     #[error("the checkpoint was not saved, and the newest one is still that before it: {0}")]
     Unsound(UpdateError),

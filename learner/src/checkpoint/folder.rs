@@ -9,7 +9,7 @@ use std::{
 
 use driml_protocol::{atomic_write, lock_file};
 
-use super::error::{CheckpointError, io_error};
+use super::error::{CheckpointError, damaged, io_error};
 
 /// The name of the checkpoints' folder in a run's folder.
 pub const FOLDER: &str = "checkpoints";
@@ -125,13 +125,11 @@ fn clean_up(folder: &Path) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-pub(super) fn read_file(path: &Path) -> Result<Vec<u8>, CheckpointError> {
-    fs::read(path).map_err(|why| match why.kind() {
-        io::ErrorKind::NotFound => CheckpointError::Damaged {
-            file: path.to_owned(),
-            why: "it is missing".to_owned(),
-        },
-        _ => io_error("read", path)(why),
+pub(super) fn read_file(folder: &Path, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    let path = folder.join(name);
+    fs::read(&path).map_err(|why| match why.kind() {
+        io::ErrorKind::NotFound => damaged(folder, name, "it is missing".to_owned()),
+        _ => io_error("read", &path)(why),
     })
 }
 

@@ -50,19 +50,19 @@ pub fn load(
     let state = read_state(path)?;
     let expected = format_hash(run_spec_hash);
     if state.run_spec_hash != expected {
-        let (folder, found) = (path.to_owned(), state.run_spec_hash);
-        return Err(CheckpointError::OtherRun {
-            folder,
-            found,
-            expected,
-        });
+        return Err(CheckpointError::Mismatch(format!(
+            "{} belongs to a run with specification {}, this run's is {expected}: resume with the settings it was made with, or choose \
+             another folder",
+            path.display(),
+            state.run_spec_hash
+        )));
     }
     let has_key = settings.make_auxiliary_loss()?.key_tau().is_some();
     let tensors = |name: &str| read_verified(path, &state, name);
     let online = tensors(ONLINE)?;
     check_model(path, &online, model)?;
     let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str, bytes: &[u8]| {
-        let loaded = Parameters::load_part(model, part, bytes, &compute.device);
+        let loaded = Parameters::load_safetensors(model, part, bytes, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
     let in_key = Encoder::has_parameter;
@@ -80,13 +80,11 @@ pub fn load(
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
     let (model, settings) = (model.clone(), settings.clone());
     let mut agent = Agent::from_parameters(model, settings, compute, networks)?;
+    let restored = agent.adam.restore(state.adam_step, moments);
+    restored.map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
+    agent.updates = state.updates;
     // Without a saved average, a run that has `average_tau` starts averaging with its next update.
-    if let Some(average) = average {
-        agent.restore_average(average);
-    }
-    agent
-        .restore_optimiser(state.updates, state.adam_step, moments)
-        .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
+    agent.average = average;
     Ok(LearnerState {
         agent,
         affinity: state.affinity,
@@ -146,28 +144,22 @@ pub fn read_companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
 }
 
 fn read_state(path: &Path) -> Result<StateFile, CheckpointError> {
-    let text = read_file(&path.join(STATE))?;
-    let sum = read_file(&path.join(STATE_SHA256))?;
+    let text = read_file(path, STATE)?;
+    let sum = read_file(path, STATE_SHA256)?;
     if !sum.starts_with(sha256_hex(&text).as_bytes()) {
-        return Err(damaged(
-            path,
-            STATE,
-            format!("its SHA-256 is not the one in {STATE_SHA256}"),
-        ));
+        let why = format!("its SHA-256 is not the one in {STATE_SHA256}");
+        return Err(damaged(path, STATE, why));
     }
     StateFile::read(path, &text)
 }
 
 /// Reads the checkpoint's file `name` and checks its SHA-256.
 fn read_verified(path: &Path, state: &StateFile, name: &str) -> Result<Vec<u8>, CheckpointError> {
-    let bytes = read_file(&path.join(name))?;
+    let bytes = read_file(path, name)?;
     if state.sha256.get(name) == Some(&sha256_hex(&bytes)) {
         return Ok(bytes);
     }
     let length = bytes.len();
-    Err(damaged(
-        path,
-        name,
-        format!("the SHA-256 of its {length} bytes is not the one in {STATE}"),
-    ))
+    let why = format!("the SHA-256 of its {length} bytes is not the one in {STATE}");
+    Err(damaged(path, name, why))
 }

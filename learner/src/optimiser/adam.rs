@@ -79,7 +79,8 @@ impl AdamSettings {
 #[derive(Debug)]
 pub struct Adam {
     settings: AdamSettings,
-    step: u64,
+    /// Steps taken so far, which the bias correction counts.
+    pub(crate) step: u64,
     kernels: Kernels,
     /// The running mean of a parameter's gradient, and that of its square, in the parameter's shape and on its device.
     moments: BTreeMap<String, [Tensor; 2]>,
@@ -106,11 +107,6 @@ impl Adam {
             kernels,
             moments,
         })
-    }
-
-    /// Steps taken so far, which the bias correction counts.
-    pub const fn step_count(&self) -> u64 {
-        self.step
     }
 
     /// Takes one step, in place, on gradients times `factor`.

@@ -12,7 +12,7 @@ use std::{
 };
 
 use anyhow::{Context, Result};
-use driml_model::{Compute, Encoder, Parameters};
+use driml_model::{Compute, Encoder, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 
 use case::Case;
@@ -236,13 +236,14 @@ fn case_agent(case: &Case, settings: UpdateSettings, compute: &Compute) -> Resul
     let model = case.model(auxiliary.heads(settings.condition_on_action));
     let slow = model.without_dim();
     let device = &compute.device;
-    let key_encoder = auxiliary.key_tau().map(|_| {
-        let named = case.parameters("key.", &model);
-        Parameters::part_from_tensors(&model, Encoder::has_parameter, named, device)
-    });
+    let read = |prefix: &str, model: &ModelConfig, part: fn(&str) -> bool| {
+        Parameters::from_tensors(model, part, case.parameters(prefix, model), device)
+    };
+    let key_encoder = auxiliary.key_tau();
+    let key_encoder = key_encoder.map(|_| read("key.", &model, Encoder::has_parameter));
     let parameters = NetworkParameters {
-        online: Parameters::from_tensors(&model, case.parameters("online.", &model), device)?,
-        target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
+        online: read("online.", &model, |_| true)?,
+        target: read("target.", &slow, |_| true)?,
         key_encoder: key_encoder.transpose()?,
     };
     let agent = Agent::from_parameters(model, settings, compute, parameters);

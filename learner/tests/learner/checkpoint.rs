@@ -7,10 +7,10 @@ use std::{
 };
 
 use driml_learner::{
-    AffinityEstimator, Alphabet, LearnedAffinity, RunCounts,
+    AffinityEstimator, Agent, Alphabet, LearnedAffinity, RunCounts,
     checkpoint::{self, CheckpointError, Extras, LearnerState, list, load_latest, lock},
 };
-use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
+use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName, WeightDtype};
 use driml_protocol::ShardCounts;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -170,7 +170,8 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
         let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
         let restored = load_latest(folder.path(), &model, &settings, loader, SPEC).unwrap();
         let mut resumed = restored.expect("a checkpoint").agent;
-        let is_same = run.agent.weights().unwrap() == resumed.weights().unwrap();
+        let weights = |agent: &Agent| agent.weights(WeightDtype::F32).unwrap();
+        let is_same = weights(&run.agent) == weights(&resumed);
         assert!(is_same, "the weights are the same bits");
         let rows = random_batch(6, 9);
         let (a, b) = (

@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Tensor};
 use driml_learner::{Agent, Batch, OwnedBatch, UpdateError};
-use driml_model::Compute;
+use driml_model::{Compute, WeightDtype};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -108,7 +108,7 @@ fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
         let mut agent = agent_with_lr(compute, 1e38);
         let error = failure(&mut agent, &random_batch(6, 30).batch());
         check_says(error, &["a step of Adam with lr = 1e38 is not finite"]);
-        agent.weights().unwrap();
+        agent.weights(WeightDtype::F32).unwrap();
     }
 }
 
@@ -133,11 +133,12 @@ fn parameters_that_a_step_took_beyond_the_finite_numbers_are_not_published() {
         assert!(matches!(said, UpdateError::Diverged { .. }), "{said}");
         let beyond = format!("update 1 made {name} infinite or NaN");
         check_says(said, &[&beyond, "newest checkpoint"]);
-        check_says(agent.weights().unwrap_err(), &[name, "inf"]);
+        let refused = |agent: &Agent| agent.weights(WeightDtype::F32).unwrap_err();
+        check_says(refused(&agent), &[name, "inf"]);
         // With candle's operations, the error shows only when the weights are exported.
         let (agent, said) = diverged_agent(&CANDLE, name);
         said.unwrap();
-        check_says(agent.weights().unwrap_err(), &[name, "inf"]);
+        check_says(refused(&agent), &[name, "inf"]);
     }
 }
 

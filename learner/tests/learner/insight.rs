@@ -1,13 +1,18 @@
 //! The inspection of a trained network agrees with the loss that it was trained with.
 
-use driml_learner::{Compute, Lambda, insight::Insight};
+use driml_learner::{Agent, Compute, Lambda, insight::Insight};
 
 use crate::synthetic::{ALL_DIM, agent, random_batch};
+
+fn insight(agent: &Agent) -> Insight {
+    let (model, settings, online) = (agent.model(), agent.settings(), agent.online());
+    Insight::new(model, settings, online, Compute::CPU, None).unwrap()
+}
 
 #[test]
 fn distributions_have_the_network_s_values() {
     let (agent, rows) = (agent(ALL_DIM, 5), random_batch(4, 3));
-    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let insight = insight(&agent);
     let outputs = insight.evaluate(&rows.states_t).unwrap();
     assert_eq!(outputs.q_values, agent.q_values_t(&rows.batch()).unwrap());
     let support = agent.model().atoms_support();
@@ -25,7 +30,7 @@ fn distributions_have_the_network_s_values() {
 fn matches_are_what_the_loss_is_made_of() {
     let (agent, mut rows) = (agent(ALL_DIM, 5), random_batch(4, 3));
     rows.positive_valid.fill(1);
-    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let insight = insight(&agent);
     assert_eq!(insight.f3_shape(), Some((2, 3)));
     let [now, later] = [&rows.states_t, &rows.states_k].map(|it| insight.evaluate(it).unwrap());
     let matches = insight.local_matches(&now, &rows.action, &later).unwrap();
@@ -44,7 +49,7 @@ fn an_agent_without_the_local_pair_has_no_map() {
         ..ALL_DIM
     };
     let (agent, rows) = (agent(lambda, 5), random_batch(4, 3));
-    let insight = Insight::from_agent(&agent, Compute::CPU).unwrap();
+    let insight = insight(&agent);
     let it = insight.evaluate(&rows.states_t).unwrap();
     assert_eq!(insight.f3_shape(), None);
     let matches = insight.local_matches(&it, &rows.action, &it).unwrap();

@@ -107,7 +107,7 @@ impl Batch {
                     let place = place.expect("the parts fill the column");
                     place.copy_from_slice(from);
                     if let Some(stacked) = part.header.stacked {
-                        if column.holds_states() {
+                        if matches!(column, Column::StatesT | Column::StatesK | Column::StatesN) {
                             StackedFrames::shift_numbers(place, frames_before);
                         }
                         frames_before += stacked.frames;

@@ -148,12 +148,6 @@ pub(super) enum Column {
     Probability,
 }
 
-impl Column {
-    pub(super) const fn holds_states(self) -> bool {
-        matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
-    }
-}
-
 /// The layout of the payload.
 impl BatchHeader {
     /// Returns all columns in order, with the bytes of each. A return, a discount and a probability are f32, a transition is u64, and other

@@ -119,14 +119,15 @@ impl fmt::Display for ProcessName {
 pub struct Peer {
     /// The process, in any incarnation.
     pub process: ProcessName,
-    /// The hash of this incarnation's number.
+    /// The first 8 bytes of the SHA-256 of this incarnation's number.
     pub hash: u64,
 }
 
 impl Peer {
     /// The incarnation of `process` with this number.
     pub fn new(process: ProcessName, number: u64) -> Self {
-        let hash = incarnation_hash(number);
+        let digest = Sha256::digest(number.to_le_bytes());
+        let hash = u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"));
         Self { process, hash }
     }
 
@@ -139,12 +140,6 @@ impl Peer {
     pub fn learner(learner: u64) -> Self {
         Self::new(ProcessName::Learner, learner)
     }
-}
-
-/// Proves knowledge of `number` without revealing it: the first 8 bytes of its SHA-256.
-fn incarnation_hash(number: u64) -> u64 {
-    let digest = Sha256::digest(number.to_le_bytes());
-    u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
 }
 
 #[cfg(test)]

@@ -158,10 +158,6 @@ impl ReplayFolder {
         segment_path(&self.path, number)
     }
 
-    pub(super) fn segment_numbers(&self) -> Result<Vec<u64>, PersistError> {
-        segment_numbers(&self.path)
-    }
-
     /// Reads a segment and flushes it, as the process that wrote it may have died before it did.
     pub(super) fn read_segment(&self, number: u64) -> Result<Vec<u8>, PersistError> {
         let path = self.segment_path(number);
@@ -248,7 +244,7 @@ fn segment_path(folder: &Path, number: u64) -> PathBuf {
     folder.join(format!("segment-{number:012}.log"))
 }
 
-fn segment_numbers(folder: &Path) -> Result<Vec<u64>, PersistError> {
+pub(super) fn segment_numbers(folder: &Path) -> Result<Vec<u64>, PersistError> {
     let number = |entry: io::Result<fs::DirEntry>| {
         let name = entry?.file_name();
         let name = name.to_str();

@@ -12,7 +12,7 @@ use std::{
 use driml_protocol::{BufferPool, Chunk, RecoveryProgress, Shutdown, codec};
 
 use super::{
-    folder::{Mark, PersistError, ReplayFolder, SegmentHeader},
+    folder::{Mark, PersistError, ReplayFolder, SegmentHeader, segment_numbers},
     journal::{LogPosition, Segment},
     record::{self, ORDINAL_MAX, Record, RecordError, RecordKind},
     snapshot::ProcessEvent,
@@ -68,7 +68,7 @@ pub struct RecoveryReport {
 
 pub(super) fn roll_back(folder: &ReplayFolder, mark: Mark) -> Result<(), PersistError> {
     let no_mark = || PersistError::NoMark(folder.segment_path(mark.0));
-    let numbers = folder.segment_numbers()?;
+    let numbers = segment_numbers(&folder.path)?;
     if !numbers.contains(&mark.0) {
         return Err(no_mark());
     }
@@ -90,7 +90,7 @@ pub(super) fn recover(
     replay: &mut Replay,
     control: &RecoveryControl,
 ) -> Result<(LogPosition, RecoveryReport), PersistError> {
-    let mut numbers = folder.segment_numbers()?;
+    let mut numbers = segment_numbers(&folder.path)?;
     // After a power cut, segments may be empty that were begun after the last one with records.
     while let [_, .., last] = numbers[..]
         && folder.read_segment(last)?.iter().all(|byte| *byte == 0)

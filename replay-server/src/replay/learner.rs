@@ -65,7 +65,7 @@ impl Replay {
             rows_received: learned,
         };
         state.learner = Some(join);
-        state.affinity.expect_another_source();
+        state.affinity.from_another = true;
         self.awaits_row_count = false;
         self.requests = LastRequests::default();
         self.append_to_log(ProcessEvent::LearnerJoined(join));

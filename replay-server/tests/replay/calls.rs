@@ -121,11 +121,7 @@ pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> L
         learner,
         run: 1,
         updates,
-        counts: counts(inserted, rows),
+        counts: ShardCounts::new(inserted, rows),
         ..LearnerJoin::default()
     }
-}
-
-pub(crate) const fn counts(inserted: u64, rows_sampled: u64) -> ShardCounts {
-    ShardCounts::new(inserted, rows_sampled)
 }

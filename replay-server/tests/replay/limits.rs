@@ -14,8 +14,8 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::check_rows,
     calls::{
-        Actor, affinity, counts, header, insert, is_refused, is_stored, join, small_replay,
-        small_spec, stored, wait,
+        Actor, affinity, header, insert, is_refused, is_stored, join, small_replay, small_spec,
+        stored, wait,
     },
     history::{History, spec},
 };
@@ -208,17 +208,18 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     // The limit of rows: 4 for each of 106 transitions stored, a capacity of 1000 and a slack of 100.
     for (lie, bound) in [
-        (counts(6001, 0), "at most 6000"),
-        (counts(u64::MAX, u64::MAX), "at most 6000"),
-        (counts(100, 4825), "at most 4824"),
-        (counts(100, u64::MAX), "at most 4824"),
+        (ShardCounts::new(6001, 0), "at most 6000"),
+        (ShardCounts::new(u64::MAX, u64::MAX), "at most 6000"),
+        (ShardCounts::new(100, 4825), "at most 4824"),
+        (ShardCounts::new(100, u64::MAX), "at most 4824"),
     ] {
         let why = replay.set_other_shards(lie).unwrap_err();
         assert!(why.contains(bound), "{why}");
     }
-    replay.set_other_shards(counts(100, 400)).unwrap();
+    replay.set_other_shards(ShardCounts::new(100, 400)).unwrap();
     replay.sample(8).expect("of the lies nothing was counted");
-    replay.set_other_shards(counts(100, 4824)).unwrap();
+    let most = ShardCounts::new(100, 4824);
+    replay.set_other_shards(most).unwrap();
     assert_eq!(replay.sample(8), Err(NotReady::Wait(HUNGRY)));
     replay.check_valid();
 }
@@ -248,7 +249,7 @@ proptest! {
             since: resumed.map(|_| RatioStart { transitions, rows: rows_before, updates: 0 }),
             ..Config::unlimited(1)
         })
-        .with_counts(counts(transitions, rows_before), ShardCounts::default());
+        .with_counts(ShardCounts::new(transitions, rows_before), ShardCounts::default());
         let (mut inserted, mut sampled) = (transitions, rows_before);
         // The rows that the ratio allows, counted one transition at a time.
         let mut allowed = rows_before as f64;
@@ -297,8 +298,8 @@ proptest! {
     ) {
         let rows_sampled = (8 * inserted).saturating_add_signed(-credit);
         let (inserted_there, sampled_there) = others.unwrap_or_default();
-        let there = counts(inserted_there % inserted, sampled_there % rows_sampled);
-        let here = counts(inserted - there.inserted, rows_sampled - there.rows_sampled);
+        let there = ShardCounts::new(inserted_there % inserted, sampled_there % rows_sampled);
+        let here = ShardCounts::new(inserted - there.inserted, rows_sampled - there.rows_sampled);
         let config = Config { replay_ratio: 8.0, slack_transitions: 1000, ..Config::unlimited(1) };
         let limiter = RateLimiter::new(&config).with_counts(here, there);
         let near = credit.unsigned_abs() as u32;

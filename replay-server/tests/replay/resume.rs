@@ -1,10 +1,10 @@
 //! A run that is resumed from its learner's checkpoint with an empty replay: its counts, and when it waits.
 //! Resuming all processes together is an end-to-end test.
 
-use driml_protocol::LearnerJoin;
+use driml_protocol::{LearnerJoin, ShardCounts};
 use driml_replay_server::{Config, NotReady, RatioStart, Replay};
 
-use crate::calls::{counts, header, insert, is_stored, learner, small_spec, stored};
+use crate::calls::{header, insert, is_stored, learner, small_spec, stored};
 
 fn config() -> Config {
     Config {
@@ -122,8 +122,8 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         let mut replay = Replay::shard(&small_spec(), &config, 8, shard).unwrap();
         let counted = 30 + u64::from(shard);
         let join = LearnerJoin {
-            counts: counts(counted, 80),
-            other_shards: counts(120 - counted, 152),
+            counts: ShardCounts::new(counted, 80),
+            other_shards: ShardCounts::new(120 - counted, 152),
             ..learner(1, 29, 0, 0)
         };
         replay.join_learner(join).unwrap();
@@ -155,14 +155,14 @@ fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));
     }
     // The other shard has served all rows of 90 + 90 transitions; the learner's checkpoint has 200 of them.
-    replay.set_other_shards(counts(90, 480)).unwrap();
+    replay.set_other_shards(ShardCounts::new(90, 480)).unwrap();
     assert_eq!(replay.sample(8), Err(NotReady::Finished));
     let join = LearnerJoin {
-        other_shards: counts(80, 200),
+        other_shards: ShardCounts::new(80, 200),
         ..learner(2, 25, 0, 90)
     };
     replay.join_learner(join).unwrap();
-    replay.set_other_shards(counts(90, 200)).unwrap();
+    replay.set_other_shards(ShardCounts::new(90, 200)).unwrap();
     let mut batches = 0;
     while replay.sample(8).is_ok() {
         batches += 1;

@@ -114,24 +114,6 @@ impl GroupedLinear {
         let len = self.out * self.inputs;
         Matrix::new(&w[group * len..][..len], self.out, self.inputs)
     }
-
-    /// Adds the gradient of the weight to `sum`.
-    fn add_weight_gradient(&self, sum: &mut [f32], grad: &[f32], x: &[f32]) {
-        sum.par_chunks_exact_mut(self.out * self.inputs)
-            .zip(&self.ranges)
-            .for_each(|(sum, rows)| {
-                let grad = Self::group_rows(grad, rows, self.out).transposed();
-                let x = Self::group_rows(x, rows, self.inputs);
-                Product::new(self.precision, grad, x).write(sum, Mode::Add);
-            });
-    }
-
-    /// Adds the gradient of the bias to `sum`.
-    fn add_bias_gradient(&self, sum: &mut [f32], grad: &[f32]) {
-        for (sum, rows) in sum.chunks_exact_mut(self.out).zip(&self.ranges) {
-            add_rows(sum, &grad[rows.start * self.out..rows.end * self.out]);
-        }
-    }
 }
 
 impl Operation<3> for GroupedLinear {
@@ -175,12 +157,19 @@ impl Operation<3> for GroupedLinear {
         let zeros = |like: &Tensor| vec![0.0; like.elem_count()];
         let grad_w = gradients::accumulate(w, |sum| {
             let mut sum = sum.unwrap_or_else(|| zeros(w));
-            self.add_weight_gradient(&mut sum, &grad, sorted);
+            let sums = sum.par_chunks_exact_mut(self.out * self.inputs);
+            sums.zip(&self.ranges).for_each(|(sum, rows)| {
+                let grad = Self::group_rows(&grad, rows, self.out).transposed();
+                let x = Self::group_rows(sorted, rows, self.inputs);
+                Product::new(self.precision, grad, x).write(sum, Mode::Add);
+            });
             sum
         });
         let grad_b = gradients::accumulate(b, |sum| {
             let mut sum = sum.unwrap_or_else(|| zeros(b));
-            self.add_bias_gradient(&mut sum, &grad);
+            for (sum, rows) in sum.chunks_exact_mut(self.out).zip(&self.ranges) {
+                add_rows(sum, &grad[rows.start * self.out..rows.end * self.out]);
+            }
             sum
         });
         Ok([grad_x.transpose()?, grad_w, grad_b])

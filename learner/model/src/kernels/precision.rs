@@ -60,19 +60,12 @@ impl fmt::Display for Precision {
     }
 }
 
-/// The error for a name that is not a precision.
-#[derive(Debug, thiserror::Error)]
-#[error("{0:?} is not a precision: use f32 or bf16")]
-pub struct UnknownPrecision(String);
-
 impl FromStr for Precision {
-    type Err = UnknownPrecision;
+    type Err = String;
 
-    fn from_str(name: &str) -> Result<Self, UnknownPrecision> {
-        Self::ALL
-            .into_iter()
-            .find(|precision| precision.name() == name)
-            .ok_or_else(|| UnknownPrecision(name.to_owned()))
+    fn from_str(name: &str) -> Result<Self, String> {
+        let known = Self::ALL.into_iter().find(|it| it.name() == name);
+        known.ok_or_else(|| format!("{name:?} is not a precision: use f32 or bf16"))
     }
 }
 
@@ -86,7 +79,7 @@ mod tests {
             let parsed: Precision = precision.to_string().parse().unwrap();
             assert_eq!(parsed, precision);
         }
-        let error = "f16".parse::<Precision>().unwrap_err().to_string();
+        let error = "f16".parse::<Precision>().unwrap_err();
         assert!(error.contains("use f32 or bf16"), "{error}");
     }
 }

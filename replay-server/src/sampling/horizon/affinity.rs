@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Affinity {
     version: u64,
-    /// Whether to take the next matrix whatever its version, as it comes from another learner.
-    from_another: bool,
+    /// Whether to take the next matrix whatever its version, as it comes from another learner, which may start from an earlier update.
+    pub(crate) from_another: bool,
     num_actions: u32,
     matrix: Vec<f32>,
 }
@@ -24,11 +24,6 @@ impl Affinity {
             num_actions,
             matrix: vec![1.0 / num_actions as f32; n * n],
         }
-    }
-
-    /// Expects the next matrices from another learner, whose versions start from an earlier update.
-    pub fn expect_another_source(&mut self) {
-        self.from_another = true;
     }
 
     /// Takes a newer matrix; one that is not newer is ignored.

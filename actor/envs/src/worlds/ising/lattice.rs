@@ -163,12 +163,6 @@ impl IsingLattice {
         let twice: i64 = self.sites.iter().map(|&site| bonds(site as usize)).sum();
         -twice / 2
     }
-
-    /// Sum of all spins, in -sites..=sites.
-    #[cfg(test)]
-    pub(super) fn magnetisation(&self) -> i64 {
-        self.spins.iter().map(|&s| i64::from(s)).sum()
-    }
 }
 
 /// The highest temperature, in units of J / k_B; a higher one is rejected. Above it nearly every proposal is taken. As sweeps propose in a

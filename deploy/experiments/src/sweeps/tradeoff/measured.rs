@@ -9,7 +9,7 @@ use driml_learner::{
     parity::deviation::{QDeviation, REFERENCE, UpdateDeviation},
 };
 use driml_machine::speed_meter::{SpeedMeter, Work};
-use driml_model::PolicyNetwork;
+use driml_model::{PolicyNetwork, WeightDtype};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -37,7 +37,7 @@ fn timed_work(config: &RunConfig) -> anyhow::Result<TimedWork> {
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
     let mut agent = Agent::new(model, update, &compute, rng)?
         .with_deduplication(config.learner.deduplicate_states);
-    let weights = agent.weights_as(config.learner.publish_dtype)?;
+    let weights = agent.weights(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
     // All actions are random, so that the weights do not decide the rows.
     let fixed = fixed_batch::sample(config, &weights, 1.0, config.learner.batch_size as usize)?;
@@ -103,12 +103,12 @@ pub(super) fn errors(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<N
     };
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
         .with_deduplication(config.learner.deduplicate_states);
-    let weights = agent.weights()?;
+    let weights = agent.weights(WeightDtype::F32)?;
     let (rows, states) = sizes(config);
     let sample = |rows| fixed_batch::sample(config, &weights, EPSILON, rows);
     let fixed = sample(rows)?;
     let found = UpdateDeviation::new(&agent, &fixed.batch(), &reference)?;
-    let published = agent.weights_as(config.learner.publish_dtype)?;
+    let published = agent.weights(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
     let fixed = sample(states)?;
     let mut actor_values = vec![0.0; fixed.action.len() * model.num_actions];

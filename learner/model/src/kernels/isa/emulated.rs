@@ -33,12 +33,12 @@ impl EmulatedTiles {
     }
 }
 
-/// Loads rows of `cols` pairs each, `stride` bytes apart.
-unsafe fn load<const N: usize>(at: *const bf16, stride: usize, to: &mut [[u32; N]], cols: usize) {
+/// Loads rows of `cols` values of 4 bytes each, `stride` bytes apart.
+unsafe fn load<T, const N: usize>(at: *const T, stride: usize, to: &mut [[T; N]], cols: usize) {
     for (row, to) in to.iter_mut().enumerate() {
         for (col, to) in to.iter_mut().enumerate().take(cols) {
             let at = at.cast::<u8>().wrapping_add(row * stride + col * 4);
-            *to = unsafe { at.cast::<u32>().read_unaligned() };
+            *to = unsafe { at.cast::<T>().read_unaligned() };
         }
     }
 }
@@ -56,13 +56,13 @@ impl TileRegisters for EmulatedTiles {
     unsafe fn load_left(&mut self, at: *const bf16, stride: usize, tail: bool) {
         let steps = self.steps(tail);
         let to = &mut self.left[usize::from(tail)][..self.rows];
-        unsafe { load(at, stride, to, steps) }
+        unsafe { load(at.cast(), stride, to, steps) }
     }
 
     unsafe fn load_right(&mut self, at: *const bf16, stride: usize, tail: bool) {
         let steps = self.steps(tail);
         let to = &mut self.right[usize::from(tail)][..steps];
-        unsafe { load(at, stride, to, LANES) }
+        unsafe { load(at.cast(), stride, to, LANES) }
     }
 
     unsafe fn dot(&mut self, sums: usize, tail: bool) {
@@ -79,12 +79,7 @@ impl TileRegisters for EmulatedTiles {
     }
 
     unsafe fn load_sums(&mut self, sums: usize, at: *const f32, stride: usize) {
-        for (row, to) in self.sums[sums][..self.rows].iter_mut().enumerate() {
-            for (col, to) in to.iter_mut().enumerate() {
-                let at = at.cast::<u8>().wrapping_add(row * stride + col * 4);
-                *to = unsafe { at.cast::<f32>().read_unaligned() };
-            }
-        }
+        unsafe { load(at, stride, &mut self.sums[sums][..self.rows], LANES) }
     }
 
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize) {
