@@ -11,11 +11,11 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_515),
+    ("protocol", 7_510),
     ("actor", 10_740),
     ("replay-server", 11_125),
-    ("learner", 22_560),
-    ("deploy", 31_215),
+    ("learner", 22_385),
+    ("deploy", 31_000),
     ("tests", 10_435),
 ];
 /// The most lines of one file.

@@ -67,7 +67,6 @@ pub(crate) struct BenchFlags {
 }
 
 impl BenchFlags {
-    /// Returns `full`, or `quick` if few iterations are enough.
     pub(crate) fn unless_quick<T>(&self, full: T, quick: T) -> T {
         if self.quick { quick } else { full }
     }

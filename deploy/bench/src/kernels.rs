@@ -26,19 +26,14 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
             figures.record(with_precision(what, precision), gflop * calls, "GFLOP/s");
         };
         let gflop = multiply_in_first_cache(precision, TILES) / 1e9;
-        let calls = meter.rate_by_median(|| {
-            multiply_in_first_cache(precision, TILES);
-            Ok(())
-        })?;
+        let calls = meter.rate_by_median(|| Ok(multiply_in_first_cache(precision, TILES)))?;
         record("products in the first cache", gflop, calls);
         for (side, channels) in STAGES {
             let maps = random(&[ROWS, side + 2, side + 2, channels])?;
             let (weight, bias) = (random(&[channels, channels, 3, 3])?, random(&[channels])?);
             let gflop = (2 * ROWS * side * side * 9 * channels * channels) as f64 / 1e9;
-            let calls = meter.rate_by_median(|| {
-                conv2d_relu(&maps, &weight, &bias, 1, precision)?;
-                Ok(())
-            })?;
+            let calls =
+                meter.rate_by_median(|| Ok(conv2d_relu(&maps, &weight, &bias, 1, precision)?))?;
             let what = format!("convolution of 256 maps, {side}x{side}x{channels}");
             record(&what, gflop, calls);
         }

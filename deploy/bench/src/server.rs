@@ -126,9 +126,7 @@ impl Server {
             ..LearnerJoin::default()
         };
         let (client, _alive) = self.join_run(Role::Learner, Peer::learner(LEARNER), &join)?;
-        let LearnerConfig {
-            learner, transport, ..
-        } = &self.learner;
+        let (learner, transport) = (&self.learner.learner, &self.learner.transport);
         let requests = Requests {
             learner_id: LEARNER,
             rows: learner.batch_size,

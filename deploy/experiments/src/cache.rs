@@ -301,15 +301,14 @@ fn first_change(path: &str, before: &Json, now: &Json) -> Option<String> {
     })
 }
 
-/// Returns the folder of the experiment `name`: `--out`, or the default.
 fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
     let suffix = if flags.smoke { "-smoke" } else { "" };
     let default = || Path::new("experiments").join(format!("{name}{suffix}"));
     flags.out.clone().unwrap_or_else(default)
 }
 
-/// Identifies this program and its processor, for [`Session::load_or_make`]: the size and modification time of its file, and the model.
-pub(crate) fn program_id() -> anyhow::Result<String> {
+/// Identifies this program and its processor, for [`Session::load_or_compute`]: the size and modification time of its file, and the model.
+fn program_id() -> anyhow::Result<String> {
     let file = process_env::program_path();
     let metadata = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
     let modified = metadata.modified().ok();

@@ -218,11 +218,6 @@ pub(crate) mod tests {
         args: T,
     }
 
-    /// Returns the flags of the full or the smoke length.
-    pub(crate) fn length(smoke: bool) -> ExperimentFlags {
-        parse(if smoke { "--smoke" } else { "" })
-    }
-
     pub(crate) fn parse<T: Args>(words: &str) -> T {
         let words = ["driml"].into_iter().chain(words.split_whitespace());
         CommandLine::parse_from(words).args

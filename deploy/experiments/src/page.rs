@@ -47,16 +47,15 @@ pub(crate) fn summary(page: &str) -> String {
     list.split("\n\n").next().unwrap_or_default().to_owned() + "\n"
 }
 
-/// Fills `template` with `values`. Empty blocks are dropped.
-///
-/// # Errors
-/// The template has a syntax error, or names a value that its experiment does not provide.
+/// Fills `template` with `values`. Empty blocks are dropped. Fails if the template names a value that its experiment does not provide.
 pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);
     environment.set_lstrip_blocks(true);
-    environment.add_function("figure", figure_markdown);
+    environment.add_function("figure", |stem: &str, caption: &str| {
+        format!("![{caption}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
+    });
     environment.add_filter("fixed", fixed);
     environment.add_filter("percent", |value: Value| {
         or_dash(&value, |it| format!("{:.1}%", 100.0 * it))
@@ -133,11 +132,6 @@ fn mean_and_sd(values: &[f64], decimals: usize, in_words: bool) -> Option<String
         (_, false) => format!("{mean} ± {sd}"),
         (count, true) => format!("{mean} (standard deviation {sd} over {count} seeds)"),
     })
-}
-
-/// Returns the Markdown of a picture with its caption below and a link to the SVG.
-fn figure_markdown(stem: &str, caption: &str) -> String {
-    format!("![{caption}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
 }
 
 #[cfg(test)]

@@ -23,8 +23,7 @@ const SLACK: f64 = 0.05;
 /// One axis of a chart: its label, its scale (linear, logarithmic or names) and the values that it must cover.
 #[derive(Clone, Debug, Default)]
 pub struct Axis {
-    /// The quantity on this axis, with its unit.
-    pub label: String,
+    label: String,
     /// Whether the axis is logarithmic. Values of 0 and below are then left out.
     is_log: bool,
     /// Values that the axis always covers, whatever values the series have.
@@ -289,7 +288,6 @@ pub(super) fn draw_legend<'a>(
     bottom - area.y
 }
 
-/// Returns the height of a legend of this width.
 pub(super) fn legend_height<'a>(width: f64, all: impl IntoIterator<Item = &'a Series>) -> f64 {
     let mut scratch = Canvas::new(width, 0.0, Letters::Text);
     draw_legend(&mut scratch, Rect::new(0.0, 0.0, width, 0.0), all)

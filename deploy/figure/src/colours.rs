@@ -9,11 +9,11 @@ pub struct Colour {
 }
 
 impl Colour {
-    const fn new(r: u8, g: u8, b: u8) -> Self {
-        Self {
-            rgb: [r, g, b],
-            alpha: 1.0,
-        }
+    /// The opaque colour 0xrrggbb.
+    const fn new(hex: u32) -> Self {
+        let [_, r, g, b] = hex.to_be_bytes();
+        let rgb = [r, g, b];
+        Self { rgb, alpha: 1.0 }
     }
 
     /// Returns the colour without its alpha, as #rrggbb.
@@ -28,50 +28,36 @@ impl Colour {
 }
 
 /// The card under a figure: light, so that a figure reads the same on a dark page and on paper.
-pub(super) const CARD: Colour = Colour::new(255, 255, 255);
-pub(super) const CARD_BORDER: Colour = Colour::new(208, 213, 221);
+pub(super) const CARD: Colour = Colour::new(0xffffff);
+pub(super) const CARD_BORDER: Colour = Colour::new(0xd0d5dd);
 /// Text and axes.
-pub(super) const INK: Colour = Colour::new(26, 30, 36);
+pub(super) const INK: Colour = Colour::new(0x1a1e24);
 /// Notes and tick labels.
-pub(super) const INK_SOFT: Colour = Colour::new(72, 80, 92);
-pub(super) const GRID: Colour = Colour::new(228, 231, 236);
+pub(super) const INK_SOFT: Colour = Colour::new(0x48505c);
+pub(super) const GRID: Colour = Colour::new(0xe4e7ec);
 /// The grey of reference lines, with which a chart compares its series.
-pub const GREY: Colour = Colour::new(120, 126, 135);
+pub const GREY: Colour = Colour::new(0x787e87);
 /// Dark cells of a lattice. The next two are its light cells, and the frame that marks part of a map.
-pub(super) const CELL_DARK: Colour = Colour::new(38, 42, 48);
-pub(super) const CELL_LIGHT: Colour = Colour::new(246, 247, 249);
-pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
+pub(super) const CELL_DARK: Colour = Colour::new(0x262a30);
+pub(super) const CELL_LIGHT: Colour = Colour::new(0xf6f7f9);
+pub(super) const OUTLINE: Colour = Colour::new(0xd55e00);
 /// A heat map cell without a value.
-const NO_VALUE: Colour = Colour::new(220, 222, 226);
+const NO_VALUE: Colour = Colour::new(0xdcdee2);
 
 pub(crate) const SERIES_COLOURS: usize = 7;
 /// Colours of series. Source: Okabe and Ito 2008, without the yellow, which is faint on white.
-const SERIES: [Colour; SERIES_COLOURS] = [
-    Colour::new(0, 114, 178),
-    Colour::new(213, 94, 0),
-    Colour::new(0, 158, 115),
-    Colour::new(204, 121, 167),
-    Colour::new(230, 159, 0),
-    Colour::new(86, 180, 233),
-    Colour::new(0, 0, 0),
+const SERIES: [u32; SERIES_COLOURS] = [
+    0x0072b2, 0xd55e00, 0x009e73, 0xcc79a7, 0xe69f00, 0x56b4e9, 0x000000,
 ];
 
 /// Returns the colour of the series with this index. The colours repeat after seven series.
 pub(crate) const fn series_colour(index: usize) -> Colour {
-    SERIES[index % SERIES.len()]
+    Colour::new(SERIES[index % SERIES.len()])
 }
 
 /// Nine colours of viridis, evenly spaced. Source: matplotlib's viridis, by van der Walt and Smith, CC0.
-const VIRIDIS: [[u8; 3]; 9] = [
-    [68, 1, 84],
-    [71, 44, 122],
-    [59, 81, 139],
-    [44, 113, 142],
-    [33, 144, 141],
-    [39, 173, 129],
-    [92, 200, 99],
-    [170, 220, 50],
-    [253, 231, 37],
+const VIRIDIS: [u32; 9] = [
+    0x440154, 0x472c7a, 0x3b518b, 0x2c718e, 0x21908d, 0x27ad81, 0x5cc863, 0xaadc32, 0xfde725,
 ];
 
 /// Returns the viridis colour of `share` in 0..=1, dark to light; grey if not finite. Viridis is even to the eye, also if colour-blind.
@@ -82,11 +68,13 @@ pub(super) fn heat_colour(share: f64) -> Colour {
     let place = share.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f64;
     let low = (place as usize).min(VIRIDIS.len() - 2);
     let part = place - low as f64;
+    let ends = [low, low + 1].map(|at| Colour::new(VIRIDIS[at]));
     let mix = |i: usize| {
-        let (a, b) = (f64::from(VIRIDIS[low][i]), f64::from(VIRIDIS[low + 1][i]));
+        let [a, b] = ends.map(|end| f64::from(end.rgb[i]));
         (a + (b - a) * part).round() as u8
     };
-    Colour::new(mix(0), mix(1), mix(2))
+    let rgb = [0, 1, 2].map(mix);
+    Colour { rgb, ..ends[0] }
 }
 
 /// Returns dark or light ink, whichever is easier to read on `colour`.
@@ -102,10 +90,10 @@ mod tests {
 
     #[test]
     fn the_scale_ends_where_it_should() {
-        assert_eq!(heat_colour(0.0).rgb, VIRIDIS[0]);
-        assert_eq!(heat_colour(1.0).rgb, VIRIDIS[8]);
+        assert_eq!(heat_colour(0.0), Colour::new(VIRIDIS[0]));
+        assert_eq!(heat_colour(1.0), Colour::new(VIRIDIS[8]));
         assert_eq!(heat_colour(7.0), heat_colour(1.0));
-        assert_eq!(heat_colour(0.5).rgb, VIRIDIS[4]);
+        assert_eq!(heat_colour(0.5), Colour::new(VIRIDIS[4]));
         assert_eq!(heat_colour(f64::NAN), NO_VALUE);
         assert_eq!(ink_on(heat_colour(0.0)), CARD);
         assert_eq!(ink_on(heat_colour(1.0)), INK);

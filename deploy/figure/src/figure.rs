@@ -189,7 +189,7 @@ mod tests {
         let series = vec![line, Series::line("none", 1, vec![])];
         let (x, y) = (Axis::linear("frames"), Axis::linear("return"));
         let chart = Chart::new("returns", x, y, series);
-        let heat = Heat::new("A", 2, vec![Some(0.0), Some(1.0), None, Some(0.5)]);
+        let heat = Heat::new("A", 2, vec![0.0, 1.0, f64::NAN, 0.5]);
         let lattice = Lattice {
             title: "spins".into(),
             side: 2,
@@ -229,7 +229,6 @@ mod tests {
         }
     }
 
-    /// Returns a chart with a line of each name.
     fn chart(title: &str, names: &[String]) -> Panel {
         let points = || vec![(0.0, 1.0), (1.0, 3.0)];
         let lines = names.iter().map(|name| Series::line(name, 0, points()));

@@ -78,18 +78,11 @@ impl<W: Write> Film<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::picture::Image;
 
     fn picture(pixels: &[u8], width: usize) -> Picture {
         let height = pixels.len() / 3 / width;
         let mut picture = Picture::new(width, height).unwrap();
-        let image = Image {
-            pixels,
-            height,
-            width,
-            channels: 3,
-        };
-        picture.image((0, 0), 1, image);
+        picture.image((0, 0), 1, pixels, [height, width, 3]);
         picture
     }
 

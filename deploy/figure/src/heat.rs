@@ -1,5 +1,5 @@
 //! A heat map: a matrix as square coloured cells, with a colour scale beside them.
-//! The colours cover the range that the caller gives, or else the range of the values.
+//! The colours cover the range that the caller gives.
 
 use super::{
     canvas::{Anchor, Canvas, Rect, TextStyle, draw_title},
@@ -43,16 +43,16 @@ pub struct Heat {
     pub title: String,
     /// The number of cells in a row and in a column.
     pub side: usize,
-    /// The values, row by row. A cell without a value is grey.
-    pub values: Vec<Option<f64>>,
+    /// The values, row by row. A cell whose value is not finite is grey.
+    pub values: Vec<f64>,
     /// The names of the rows, which are also those of the columns; empty if there are none.
     pub names: Vec<String>,
-    /// The label under the columns and the label beside the rows.
+    /// The label under the columns and the label beside the rows, if those have names.
     pub labels: (String, String),
     /// The label beside the scale: what a value means, with its unit.
     pub unit: String,
-    /// The ends of the scale; `None` takes the smallest and the largest value.
-    pub range: Option<(f64, f64)>,
+    /// The ends of the scale.
+    pub range: (f64, f64),
     /// The number of decimals of values written into cells that are large enough; `None` writes no values.
     pub decimals: Option<usize>,
     /// The larger square in which the cells lie; `None` if the cells fill the map.
@@ -63,7 +63,7 @@ pub struct Heat {
 
 impl Heat {
     /// Creates a heat map without names.
-    pub fn new(title: &str, side: usize, values: Vec<Option<f64>>) -> Self {
+    pub fn new(title: &str, side: usize, values: Vec<f64>) -> Self {
         assert_eq!(values.len(), side * side, "a square matrix");
         Self {
             title: title.to_owned(),
@@ -73,14 +73,12 @@ impl Heat {
         }
     }
 
+    /// Returns the ends of the scale, or others where those span no length.
     fn value_range(&self) -> (f64, f64) {
-        let values = self.values.iter().flatten().copied();
-        let found = ticks::bounds(values.filter(|value| value.is_finite()));
-        let ends = self.range.or(found);
-        match ends.filter(|(low, high)| low.is_finite() && high.is_finite()) {
-            Some((low, high)) if high > low => (low, high),
-            Some((low, _)) => (low, low + 1.0),
-            None => (0.0, 1.0),
+        match self.range {
+            (low, high) if !(low.is_finite() && high.is_finite()) => (0.0, 1.0),
+            (low, high) if high > low => (low, high),
+            (low, _) => (low, low + 1.0),
         }
     }
 
@@ -91,10 +89,9 @@ impl Heat {
         let bar_labels = ticks::labels(&bar_ticks);
         let bar_labels_width = font::max_width(&bar_labels, TICK_SIZE);
         let names_width = font::max_width(&self.names, TICK_SIZE);
-        let left = match (self.names.is_empty(), self.labels.1.is_empty()) {
-            (true, true) => 0.0,
-            (false, true) => names_width + 6.0,
-            (_, false) => names_width + LABEL_SIZE + 12.0,
+        let (left, label_below) = match self.names.is_empty() {
+            true => (0.0, 0.0),
+            false => (names_width + LABEL_SIZE + 12.0, LABEL_SIZE + 6.0),
         };
         let right = 14.0 + BAR_WIDTH + 6.0 + bar_labels_width + LABEL_SIZE + 8.0;
         // Column names are rotated if they are longer than a cell is wide.
@@ -104,10 +101,6 @@ impl Heat {
             (true, _) => 0.0,
             (false, true) => names_width + 6.0,
             (false, false) => TICK_SIZE + 6.0,
-        };
-        let label_below = match self.labels.0.is_empty() {
-            true => 0.0,
-            false => LABEL_SIZE + 6.0,
         };
         let below = names_below + label_below + 4.0;
         let map_side = (area.width - left - right).min(area.height - below);
@@ -158,12 +151,10 @@ impl Heat {
         for (index, value) in self.values.iter().enumerate() {
             let (row, column) = (index / self.side, index % self.side);
             let (x, y) = (map.x + column as f64 * cell, map.y + row as f64 * cell);
-            let colour = heat_colour((value.unwrap_or(f64::NAN) - low) / (high - low));
+            let colour = heat_colour((value - low) / (high - low));
             // Each cell overlaps the next a little, so that no line shows between them.
             canvas.rects(&[Rect::new(x, y, cell + 0.3, cell + 0.3)], colour);
-            if let (Some(value), Some(decimals)) = (value, self.decimals)
-                && cell >= CELL_TEXT_MIN
-            {
+            if let Some(decimals) = self.decimals.filter(|_| cell >= CELL_TEXT_MIN) {
                 let size = (cell * 0.36).min(TICK_SIZE);
                 let style = TextStyle::new(size, ink_on(colour), Anchor::Middle);
                 let at = (x + cell / 2.0, y + cell / 2.0 + size * 0.36);

@@ -48,6 +48,6 @@ pub use crate::{
     film::Film,
     heat::{Field, Heat, Outline},
     lattice::Lattice,
-    picture::{Image, Ink, Picture},
+    picture::{Ink, Picture},
     render::FigureError,
 };

@@ -9,19 +9,6 @@ use crate::{
     render::{self, FigureError},
 };
 
-/// An image [H, W, C] of bytes, channels last. Three channels are red, green and blue; otherwise the first channel is drawn as grey.
-#[derive(Clone, Copy, Debug)]
-pub struct Image<'a> {
-    /// The bytes, row by row.
-    pub pixels: &'a [u8],
-    /// The height H in pixels.
-    pub height: usize,
-    /// The width W in pixels.
-    pub width: usize,
-    /// The number of channels C.
-    pub channels: usize,
-}
-
 /// The style of a line of text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ink {
@@ -56,14 +43,16 @@ impl Picture {
         (self.images.width() as usize, self.images.height() as usize)
     }
 
-    /// Draws an image at (x, y). Each image pixel becomes a square of `zoom` pixels; parts outside the picture are cut off.
-    pub fn image(&mut self, (x, y): (usize, usize), zoom: usize, image: Image<'_>) {
+    /// Draws an image of bytes, whose shape is [H, W, C], at (x, y). Each image pixel becomes a square of `zoom` pixels; parts outside the
+    /// picture are cut off. Three channels are red, green and blue; otherwise the first channel is drawn as grey.
+    pub fn image(&mut self, (x, y): (usize, usize), zoom: usize, bytes: &[u8], shape: [usize; 3]) {
         let (width, height) = self.size();
-        for row in y..(y + image.height * zoom).min(height) {
-            for column in x..(x + image.width * zoom).min(width) {
-                let source = (row - y) / zoom * image.width + (column - x) / zoom;
-                let pixel = &image.pixels[source * image.channels..];
-                let rgb = match image.channels {
+        let [rows, columns, channels] = shape;
+        for row in y..(y + rows * zoom).min(height) {
+            for column in x..(x + columns * zoom).min(width) {
+                let source = (row - y) / zoom * columns + (column - x) / zoom;
+                let pixel = &bytes[source * channels..];
+                let rgb = match channels {
                     3 => [pixel[0], pixel[1], pixel[2]],
                     _ => [pixel[0]; 3],
                 };
@@ -149,26 +138,14 @@ mod tests {
     #[test]
     fn images_are_enlarged_pixel_by_pixel_and_cut_at_the_edge() {
         let mut picture = Picture::new(5, 4).unwrap();
-        let image = Image {
-            pixels: &[1, 2, 3, 40, 50, 60],
-            height: 1,
-            width: 2,
-            channels: 3,
-        };
-        picture.image((1, 1), 3, image);
+        picture.image((1, 1), 3, &[1, 2, 3, 40, 50, 60], [1, 2, 3]);
         let rgb = picture.rgb();
         let at = |x: usize, y: usize| rgb[y * 5 + x];
         assert_eq!([at(0, 1), at(1, 0)], [[255; 3]; 2]);
         assert_eq!([at(1, 1), at(3, 3)], [[1, 2, 3]; 2]);
         assert_eq!([at(4, 1), at(4, 3)], [[40, 50, 60]; 2]);
         // An image with one channel is drawn as grey.
-        let grey = Image {
-            pixels: &[7],
-            height: 1,
-            width: 1,
-            channels: 1,
-        };
-        picture.image((0, 0), 1, grey);
+        picture.image((0, 0), 1, &[7], [1, 1, 1]);
         assert_eq!(picture.rgb()[0], [7; 3]);
     }
 

@@ -184,6 +184,7 @@ mod tests {
     fn endpoints_that_zenoh_cannot_open_are_refused() {
         let none = "not an endpoint";
         let quic = "with --tls-dir it is quic/host:1";
+        let too_long = "107 bytes, and this one has 108: choose a shorter one";
         let socket = |bytes: usize| format!("unixsock-stream//{}", "x".repeat(bytes - 1));
         let [short, long] = [107, 108].map(socket);
         for (endpoint, tls, said) in [
@@ -191,11 +192,7 @@ mod tests {
             ("tcp/[::1]:7447", false, ""),
             ("unixsock-stream//tmp/driml.sock", false, ""),
             (&*short, false, ""),
-            (
-                &*long,
-                false,
-                "107 bytes, and this one has 108: choose a shorter one",
-            ),
+            (&*long, false, too_long),
             ("quic/host:1", true, ""),
             ("unixsock-stream//tmp/s", true, ""),
             ("", false, none),

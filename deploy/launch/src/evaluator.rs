@@ -24,22 +24,11 @@ use crate::{
 /// The seed of the episodes on which checkpoints are compared; reports use other seeds.
 pub const SELECTION_SEED: u64 = 1 << 32;
 
-/// The evaluation of a checkpoint, and whether the checkpoint is the run's best.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RankedEvaluation {
-    /// The evaluation of the checkpoint.
-    pub evaluation: EvaluationRow,
-    /// Whether the checkpoint was kept.
-    pub is_best: bool,
-    /// The evaluation of the best checkpoint before this one, over at least as many episodes.
-    pub best_before: Option<EvaluationRow>,
-}
-
 /// Plays a checkpoint of a run on the training levels, with averaged weights if it has them. Adds the evaluation to the run's table, and
 /// keeps the checkpoint if it earned more than the best before it.
 ///
 /// Both are compared over the same episodes. A best checkpoint that was played for fewer episodes is played again. A checkpoint that is
-/// played for fewer episodes than the best does not replace it.
+/// played for fewer episodes than the best does not replace it. Returns the evaluation and its rank, as the end of a sentence.
 ///
 /// # Errors
 /// A file system error; [`Interrupted`] once `is_stopped` returns true: then nothing is kept.
@@ -48,7 +37,7 @@ pub fn evaluate_and_keep(
     choice: CheckpointChoice,
     episodes: u32,
     is_stopped: &dyn Fn() -> bool,
-) -> anyhow::Result<RankedEvaluation> {
+) -> anyhow::Result<(EvaluationRow, String)> {
     let path = checkpoint_path(folder, choice)?;
     check_file("the table", &folder.evaluations())?;
     let candidate = Candidate::read(&path)?;
@@ -73,11 +62,15 @@ pub fn evaluate_and_keep(
         best_before = Some(again);
     }
     let is_best = candidate.keep_if_best(folder, &evaluation)?;
-    Ok(RankedEvaluation {
-        evaluation,
-        is_best,
-        best_before,
-    })
+    let rank = match best_before {
+        _ if is_best => ", the best so far".into(),
+        Some(best) if best.episodes > episodes => format!(
+            "; the best checkpoint stays, as its mean is over {}",
+            count(best.episodes, "episode")
+        ),
+        _ => String::new(),
+    };
+    Ok((evaluation, rank))
 }
 
 const LAST_EVALUATION_MAX: Duration = Duration::from_secs(3600);

@@ -342,9 +342,7 @@ mod tests {
                 Value::Members { label, .. } => format!("`driml_{}{{{label}}}`", column.name),
                 Value::Words(_) => "-".into(),
             };
-            let Column {
-                name, unit, help, ..
-            } = column;
+            let (name, unit, help) = (column.name, column.unit, column.help);
             page += &format!("| `{name}` | {unit} | {help} | {prometheus} |\n");
         }
         expect_file!["../../docs/src/reference/metrics.md"].assert_eq(&page);

@@ -169,11 +169,7 @@ mod tests {
         let mut mixed = untrained_player("chain", "c51");
         for (from, to, why) in [
             ("hidden = 32", "hidden = 16", "has shape"),
-            (
-                "num_actions = 3",
-                "num_actions = 5",
-                "num_actions = 5, but it",
-            ),
+            ("num_actions = 3", "num_actions = 5", " = 5, but it"),
         ] {
             let text = mixed.config.to_toml().replace(from, to);
             let description = serde_json::json!({

@@ -96,10 +96,7 @@ pub(crate) fn report_end(
     })
 }
 
-/// Prints what the user can do after a run has ended: commands, or how to resume it.
-///
-/// # Errors
-/// [`Interrupted`] if the run was interrupted.
+/// Prints what the user can do after a run has ended: commands, or how to resume it. Fails as [`Interrupted`] if the run was interrupted.
 pub(crate) fn print_next_steps(
     summary: &Summary,
     world: &WorldConfig,

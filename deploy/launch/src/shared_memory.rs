@@ -24,7 +24,6 @@ pub fn remove_own_segments() {
     }
 }
 
-/// The segments that a process has mapped.
 fn mapped_segments(pid: &str) -> BTreeSet<PathBuf> {
     let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default();
     let lines = maps.lines();

@@ -1,7 +1,10 @@
 //! The one measuring loop: how long a benchmark runs, and how its speed is computed.
 //! This module keeps no figures and judges none.
 
-use std::time::{Duration, Instant};
+use std::{
+    hint::black_box,
+    time::{Duration, Instant},
+};
 
 /// The function that is measured; each call is timed.
 pub type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
@@ -30,10 +33,11 @@ impl SpeedMeter {
     }
 
     /// Calls of `work` per second, from the median duration: for calls that all do the same.
-    pub fn rate_by_median<'a>(
+    pub fn rate_by_median<'a, T>(
         &self,
-        work: impl FnMut() -> anyhow::Result<()> + 'a,
+        mut work: impl FnMut() -> anyhow::Result<T> + 'a,
     ) -> anyhow::Result<f64> {
+        let work = move || work().map(|it| drop(black_box(it)));
         Ok(self.rates_in_turn(&mut [Box::new(work)])?[0])
     }
 
@@ -111,6 +115,7 @@ mod tests {
         let counts: Vec<_> = durations.iter().map(Vec::len).collect();
         assert_eq!(counts, [3, 3]);
         assert_eq!(*calls.borrow(), "ababababab");
-        assert!(meter.rate_by_median(|| anyhow::bail!("broken")).is_err());
+        let broken = || -> anyhow::Result<()> { anyhow::bail!("broken") };
+        assert!(meter.rate_by_median(broken).is_err());
     }
 }

@@ -3,10 +3,7 @@
 
 use std::ops::RangeInclusive;
 
-/// Reads a whole number.
-///
-/// # Errors
-/// The text is not a whole number, or is 2^64 or more. The message says what to write.
+/// Reads a whole number below 2^64. An error says what to write.
 pub fn read(text: &str) -> Result<u64, String> {
     if text.starts_with('-') {
         return Err(format!("{text} is negative"));

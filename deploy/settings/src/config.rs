@@ -167,11 +167,11 @@ impl RunConfig {
 
     /// Returns these settings if they pass the checks of each component and those that span two tables.
     pub(crate) fn checked(self) -> Result<Self, Usage> {
-        fn to_usage(e: impl std::fmt::Display) -> Usage {
-            Usage(e.to_string())
+        fn check<T>(result: Result<T, impl std::fmt::Display>) -> Result<T, Usage> {
+            result.map_err(|e| Usage(e.to_string()))
         }
-        self.run.validate().map_err(to_usage)?;
-        self.world.validate().map_err(to_usage)?;
+        check(self.run.validate())?;
+        check(self.world.validate())?;
         let name = self.world.name().to_string();
         if name != self.run.world {
             return Err(usage!(
@@ -179,7 +179,7 @@ impl RunConfig {
                 self.run.world
             ));
         }
-        self.actor.validate().map_err(to_usage)?;
+        check(self.actor.validate())?;
         if self.replay.transitions_max.is_none() {
             return Err(usage!(
                 "replay.transitions_max is missing: say with --frames how long the run is"
@@ -194,18 +194,16 @@ impl RunConfig {
                 frames / 10
             ));
         }
-        let checked = replay.validate(&self.run, learner.batch_size);
-        checked.map_err(to_usage)?;
-        learner.validate().map_err(to_usage)?;
+        check(replay.validate(&self.run, learner.batch_size))?;
+        check(learner.validate())?;
         let update = learner.update.validate();
         update.map_err(|e| usage!("learner.update cannot work: {e}"))?;
-        self.model.validate().map_err(to_usage)?;
-        if !(1..=256).contains(&local.actors) {
-            let actors = local.actors;
+        check(self.model.validate())?;
+        let (actors, threads) = (local.actors, local.learner_threads);
+        if !(1..=256).contains(&actors) {
             return Err(usage!("local.actors = {actors}: a run has 1 to 256 actors"));
         }
-        if !(1..=1024).contains(&local.learner_threads) {
-            let threads = local.learner_threads;
+        if !(1..=1024).contains(&threads) {
             return Err(usage!(
                 "local.learner_threads = {threads}: a learner has 1 to 1024 threads"
             ));
@@ -225,12 +223,10 @@ impl RunConfig {
                 ));
             }
         }
-        let device = local.learner_device.check_precision(learner.precision);
-        device.map_err(to_usage)?;
+        check(local.learner_device.check_precision(learner.precision))?;
         self.check_auxiliary_loss()?;
         let rng = &mut ChaCha8Rng::seed_from_u64(0);
-        let affinity = learner.affinity.make_estimator(self.model.num_actions, rng);
-        affinity.map_err(to_usage)?;
+        check(learner.affinity.make_estimator(self.model.num_actions, rng))?;
         let needs_affinity = matches!(self.run.horizon, Horizon::Nhg { .. });
         let learns_affinity = learner.affinity.estimator != EstimatorKind::None;
         match (needs_affinity, learns_affinity) {

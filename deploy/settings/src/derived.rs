@@ -59,12 +59,8 @@ pub(crate) fn fill_in_declaration(table: &mut Table, command: &str) -> Result<()
     let [start_ms, step_ms] = limits.map(|limit| read(table, limit));
     let declared = driml_envs::probe_exec_command(command, start_ms?, step_ms?);
     let declared = declared.map_err(|e| usage!("--env: {e}"))?;
-    for (path, side) in [
-        ("input.height", declared.height),
-        ("input.width", declared.width),
-    ] {
-        insert_missing(table, path, Value::Integer(side as i64));
-    }
+    insert_missing(table, "input.height", (declared.height as i64).into());
+    insert_missing(table, "input.width", (declared.width as i64).into());
     insert(table, "world", as_toml(declared)?);
     Ok(())
 }

@@ -110,7 +110,7 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
         out.push_str(&format!("\n[{path}]\n"));
     }
     for (key, value) in lines {
-        let setting = format!("{} = {value}", quoted(key));
+        let setting = format!("{key} = {value}");
         // Only a world in its own process has this setting.
         let is_process = sources.contains_key("world.start_timeout_ms");
         let source = find_source(&inner(key), sources, is_process);
@@ -120,14 +120,6 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
         if let Value::Table(table) = value {
             write_table(table, &inner(key), sources, out);
         }
-    }
-}
-
-fn quoted(key: &str) -> String {
-    let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    match key.chars().all(bare) {
-        true => key.to_owned(),
-        false => Value::String(key.to_owned()).to_string(),
     }
 }
 
@@ -144,7 +136,10 @@ fn find_source<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process
 /// Adds the comment on each setting of a layer, in place of the comment of an earlier layer.
 fn record_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
     for part in layer.parts().iter().filter(|it| it.applies_to(world)) {
-        let how = if part.is_general { "" } else { ", by world" };
+        let how = match part.worlds.is_empty() {
+            true => "",
+            false => ", by world",
+        };
         for (path, comment) in comments(&part.text) {
             let source = format!("{comment} [{}{how}]", layer.path);
             sources.insert(path, source.trim_start().to_owned());

@@ -44,12 +44,10 @@ impl Override {
             return Err(self.unknown_key(table));
         }
         let old = find(table, &self.path);
-        let (is_new, value) = match old {
-            Some(old) => (false, self.convert_to_type_of(old)?),
-            None => (
-                true,
-                as_whole(&self.value).unwrap_or_else(|| self.value.clone()),
-            ),
+        let is_new = old.is_none();
+        let value = match old {
+            Some(old) => self.convert_to_type_of(old)?,
+            None => as_whole(&self.value).unwrap_or_else(|| self.value.clone()),
         };
         insert(table, &self.path, value);
         Ok(is_new)
@@ -136,7 +134,6 @@ pub(crate) fn insert(table: &mut Table, path: &str, value: Value) {
     }
 }
 
-/// Removes the value at `path`, if there is one.
 pub(crate) fn remove(table: &mut Table, path: &str) -> Option<Value> {
     match path.split_once('.') {
         None => table.remove(path),

@@ -47,10 +47,7 @@ pub const AGENTS: &[Layer] = layers!("agent/":
 
 static CUSTOM: OnceLock<Vec<Layer>> = OnceLock::new();
 
-/// Adds agents, before anything else is done. An existing agent with the same name takes precedence.
-///
-/// # Panics
-/// If agents were registered before.
+/// Adds agents, once, before anything else is done. An existing agent with the same name takes precedence.
 pub fn register(agents: Vec<Layer>) {
     let first = CUSTOM.set(agents);
     first.expect("a program registers its agents once");
@@ -188,11 +185,8 @@ struct PresetTable {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct LayerPart {
-    /// The worlds of a block.
-    worlds: Vec<String>,
-    /// Whether these are the settings for all worlds.
-    #[serde(skip)]
-    pub(crate) is_general: bool,
+    /// The worlds of a block; empty for the settings for all worlds.
+    pub(crate) worlds: Vec<String>,
     #[serde(default)]
     set: Table,
     /// The text in the file, with its comments.
@@ -202,7 +196,7 @@ pub(crate) struct LayerPart {
 
 impl LayerPart {
     pub(crate) fn applies_to(&self, world: &str) -> bool {
-        self.is_general || self.worlds.iter().any(|name| name == world)
+        self.worlds.is_empty() || self.worlds.iter().any(|name| name == world)
     }
 }
 
@@ -257,7 +251,6 @@ impl Layer {
         let LayerFile { set, only, .. } = self.read();
         let general = LayerPart {
             worlds: Vec::new(),
-            is_general: true,
             set,
             text: String::new(),
         };

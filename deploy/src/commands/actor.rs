@@ -34,19 +34,16 @@ pub(crate) struct ActorArgs {
 /// Parses an actor's number, or `env:NAME`, where the environment variable NAME holds the number.
 fn actor_id(text: &str) -> Result<u32, String> {
     let Some(name) = text.strip_prefix("env:") else {
-        return text.parse().map_err(|_| {
-            "give a whole number from 0, or env:NAME for an environment variable that holds one"
-                .into()
-        });
+        let hint =
+            "give a whole number from 0, or env:NAME for an environment variable that holds one";
+        return text.parse().map_err(|_| hint.into());
     };
-    match std::env::var(name) {
-        Ok(value) => value.trim().parse().map_err(|_| {
-            format!("the environment variable {name} is {value:?}: set it to a whole number from 0")
-        }),
-        Err(_) => Err(format!(
-            "the environment variable {name} is not set: set it to a whole number from 0"
-        )),
-    }
+    let value = std::env::var(name);
+    let number = value.as_ref().ok().and_then(|it| it.trim().parse().ok());
+    number.ok_or_else(|| {
+        let is = value.map_or("not set".into(), |it| format!("{it:?}"));
+        format!("the environment variable {name} is {is}: set it to a whole number from 0")
+    })
 }
 
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {

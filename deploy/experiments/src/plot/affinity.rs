@@ -38,7 +38,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
     let matrix = affinity.matrix();
     // From 0, so that nearly equal probabilities have nearly the same colour.
     let most = matrix.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
-    let values = matrix.into_iter().map(|a| Some(f64::from(a)));
+    let values = matrix.into_iter().map(f64::from);
     let updates = count(*updates, "update");
     let title = format!("{}, {updates}", folder_name(folder.path()));
     Ok(Heat {
@@ -46,7 +46,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
         labels: ("next action".into(), "action".into()),
         unit: "A [probability]".into(),
         decimals: Some(2),
-        range: Some((0.0, most.into())),
+        range: (0.0, most.into()),
         ..Heat::new(&title, side, values.collect())
     })
 }

@@ -4,7 +4,6 @@ use std::fmt;
 
 use rand::{Rng, seq::IndexedRandom};
 
-/// The ends of ranges.
 const RANGE_ENDS: [f32; 11] = [
     0.0,
     -0.0,
@@ -158,7 +157,6 @@ pub(super) fn softmax_f64(row: &[f64]) -> (Vec<f64>, f64, f64) {
     (shares.collect(), max, sum)
 }
 
-/// Converts the numbers to f64.
 pub(super) fn to_f64(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&x| f64::from(x)).collect()
 }
@@ -203,7 +201,6 @@ pub(super) fn draw_nonfinite(rng: &mut impl Rng) -> f32 {
     one_of(&[f32::INFINITY, f32::NEG_INFINITY, f32::NAN], rng)
 }
 
-/// Draws one of these values.
 pub(super) fn one_of<T: Clone>(values: &[T], rng: &mut impl Rng) -> T {
     let value = values.choose(rng).cloned();
     value.expect("a list that is written out has an item")

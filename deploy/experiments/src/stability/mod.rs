@@ -19,7 +19,7 @@ use rand_chacha::ChaCha8Rng;
 
 use self::property::{Row, Settings};
 use crate::{
-    cache::{self, Session},
+    cache::Session,
     flags::{self, ExperimentFlags},
 };
 
@@ -27,23 +27,17 @@ const NAME: &str = "stability";
 const SETTINGS: &str = include_str!("config.toml");
 const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,input";
 
-/// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
     let table = checks::table(&settings);
     let units = table.len() as u64 * u64::from(settings.seeds);
     let mut session = Session::open(NAME, args, &settings, units, false)?;
-    // Pieces of another build of the program are not valid for its routines.
-    let program = cache::program_id()?;
     let mut rows: Vec<Row> = Vec::new();
     for (at, property) in table.iter().enumerate() {
-        let name = property
-            .routine
-            .replace(|c: char| !c.is_alphanumeric(), "-");
         let mut seeds = Vec::new();
         for seed in 1..=settings.seeds {
-            let key = format!("{at:02}-{name}-seed{seed}");
-            seeds.push(session.load_or_make(&program, &key, 1, |progress| {
+            let key = format!("{at:02}-{}-seed{seed}", property.routine);
+            seeds.push(session.load_or_compute("", &key, 1, |progress| {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed.into());
                 rng.set_stream(at as u64);
                 property.run(&settings, rng, progress)
@@ -80,7 +74,6 @@ fn case_count(rows: &[Row]) -> String {
     HumanCount(rows.iter().map(|row| row.tally.cases).sum()).to_string()
 }
 
-/// Returns the outcome as a sentence.
 fn verdict(rows: &[Row]) -> String {
     let kept = rows.iter().filter(|row| row.is_kept()).count();
     let (all, cases) = (rows.len(), case_count(rows));
@@ -137,7 +130,6 @@ fn points(rows: &[Row], names: &[String], is_drawn: bool, x_offset: f64) -> Vec<
     points.collect()
 }
 
-/// Draws one chart for some of the routines.
 fn chart(rows: &[Row], names: &[String]) -> Chart {
     let series_points = |is_drawn, x_offset| points(rows, names, is_drawn, x_offset);
     let ends = vec![(-0.5, 1.0), (names.len() as f64 - 0.5, 1.0)];
@@ -154,7 +146,6 @@ fn chart(rows: &[Row], names: &[String]) -> Chart {
     )
 }
 
-/// Draws all rows, split into several charts.
 fn figure(rows: &[Row]) -> Figure {
     let mut names: Vec<String> = rows.iter().map(|row| row.routine.into()).collect();
     names.dedup();
@@ -178,9 +169,8 @@ fn figure(rows: &[Row]) -> Figure {
 #[cfg(test)]
 mod tests {
     use super::{property::Tally, *};
-    use crate::flags::tests::length;
+    use crate::flags::tests::parse;
 
-    /// Creates a row with these results.
     fn row(cases: u64, worst: f64, input: &str) -> Row {
         Row {
             routine: "halving",
@@ -200,7 +190,8 @@ mod tests {
     fn the_page_and_the_verdict_name_what_is_broken() {
         let reported = |worst: f64, input: &str| {
             let rows = [row(1, worst, input)];
-            let values = page_values(&rows, &flags::read_settings(NAME, SETTINGS, &length(true)));
+            let settings = flags::read_settings(NAME, SETTINGS, &parse("--smoke"));
+            let values = page_values(&rows, &settings);
             let page = crate::page::render_page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)
         };

@@ -36,14 +36,10 @@ struct Settings {
 }
 
 /// Makes the missing runs of every combination of settings and every seed, then the table and the plot.
-///
-/// # Errors
-/// As [`crate::run`].
 pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let flags = ExperimentFlags {
-        smoke: false,
         out: args.out.clone(),
-        seeds: None,
+        ..ExperimentFlags::default()
     };
     let stored = settings_of(NAME, &flags).filter(|_| args.report);
     let (settings, seeds) = resolve_settings(args, stored)?;

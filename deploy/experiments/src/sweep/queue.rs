@@ -270,7 +270,8 @@ impl Queue {
         }))
     }
 
-    /// Builds the command that starts a run, or resumes it. A resumed run keeps its replay size and its number of threads.
+    /// Builds the command that starts a run, or resumes it. A resumed run keeps its replay size and its number of threads. Runs at once
+    /// divide the cores among them, so that their learners do not compete.
     fn train_command(&self, plan: &PlannedRun, resumed: bool) -> Command {
         let folder = self.runs.folder(plan);
         let mut command = Command::new(process_env::program_path());
@@ -280,7 +281,11 @@ impl Queue {
             command.arg("--resume").arg(folder.path());
         } else {
             command.arg("--run-dir").arg(folder.path());
-            command.args(self.thread_flags()).args(plan.call.args());
+            if self.jobs > 1 {
+                let threads = (Machine::detect().cores / self.jobs).max(1);
+                command.args(["--set", &format!("local.learner_threads={threads}")]);
+            }
+            command.args(plan.call.args());
             command.env(MEMORY_SHARE_ENV, self.memory_share.to_string());
         }
         command
@@ -311,15 +316,6 @@ impl Queue {
                 Ok(newest)
             }
         }
-    }
-
-    /// Returns the flags that divide the cores among the concurrent runs, so that their learners do not compete for them.
-    fn thread_flags(&self) -> Vec<String> {
-        if self.jobs == 1 {
-            return Vec::new();
-        }
-        let threads = (Machine::detect().cores / self.jobs).max(1);
-        vec!["--set".into(), format!("local.learner_threads={threads}")]
     }
 
     /// Asks all children to stop and waits until they have saved. A second interrupt, or `DRAIN_MAX`, kills them.

@@ -55,9 +55,6 @@ struct Tradeoff<'a> {
 }
 
 /// Measures what each dial that buys speed costs: plans, benchmarks, trains, and writes the page.
-///
-/// # Errors
-/// As [`crate::run`].
 pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let world = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let name = format!("tradeoff-{}", world.to_string().replace("procgen:", ""));
@@ -65,10 +62,8 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let is_new = stored.is_none() && !args.queue.report;
     let mut settings = Settings::from_args(args, world, stored)?;
     let report_only = args.queue.report;
-    if !report_only {
-        let base = settings.common.plan_run(&settings.levels[0].base, 1);
-        install_worlds(&[((), base)], false)?;
-    }
+    let base = settings.common.plan_run(&settings.levels[0].base, 1);
+    install_worlds(&[((), base)], report_only)?;
     // The budget is the machine time for the runs of this call.
     let (started, budget_seconds) = (Instant::now(), f64::from(args.budget) * 60.0);
     if settings.may_shorten {
@@ -138,16 +133,10 @@ impl Tradeoff<'_> {
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
         let (smoke, settings) = (self.args.flags.smoke, &self.settings);
         let (units, common) = (self.piece_units(), &settings.common);
-        let program = cache::program_id()?;
-        let source = format!(
-            "{program}, {}, {:?}, {:?}",
-            common.env, common.preset, common.sets
-        );
+        let inputs = format!("{}, {:?}, {:?}", common.env, common.preset, common.sets);
         let points = || settings.levels.iter().flat_map(DialLevel::points);
-        let requested = points().filter(|it| !self.args.queue.report && settings.requests(it));
-        let keys = requested
-            .map(|it| &it.key)
-            .filter(|it| !self.speeds.contains_key(*it));
+        let is_wanted = |it: &&Point| !self.args.queue.report && settings.requests(it);
+        let keys = points().filter(is_wanted).map(|it| &it.key);
         let count = keys.collect::<BTreeSet<_>>().len() as u64;
         self.session.progress.add_work(units * count);
         for point in points() {
@@ -155,14 +144,15 @@ impl Tradeoff<'_> {
                 continue;
             }
             let key = format!("speed-{}", point.key);
-            let speed = if self.args.queue.report || !settings.requests(point) {
+            let speed = if !is_wanted(&point) {
                 // Accept the result of any program: only requested points are measured again.
                 self.session.read_piece(&key)
             } else {
                 let base = common.config(settings.timing_base(point))?;
                 let config = common.config(point)?;
                 let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
-                Some(self.session.load_or_make(&source, &key, units, measure)?)
+                let session = &mut self.session;
+                Some(session.load_or_compute(&inputs, &key, units, measure)?)
             };
             self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
         }

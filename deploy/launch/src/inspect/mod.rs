@@ -11,10 +11,6 @@ use serde::Serialize;
 use crate::console::align_columns;
 use count::{CostCounter, EVERYTHING, Line};
 
-/// Width of the names in characters; a longer name pushes its row to the right.
-const WHAT_COLUMNS: usize = 26;
-const NUMBER_COLUMNS: usize = 16;
-
 /// The size and the cost of a world and an agent.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Inspection {
@@ -61,21 +57,24 @@ impl Inspection {
 
     /// The table for a terminal.
     pub fn describe(&self) -> String {
-        let mut text = format!("{} on {}\n", self.agent, self.world);
+        let mut rows: Vec<Vec<String>> = Vec::new();
         for (heading, lines, is_summed) in [
             ("parameters", &self.parameters, true),
             ("FLOPs per update", &self.update_flops, true),
             ("FLOPs per decision", &self.decision_flops, true),
             ("bytes held and sent", &self.bytes, false),
         ] {
-            text += &format!("\n{}", row(heading, "is", "everything"));
+            let heads = [heading, "is", "everything"].map(String::from);
+            rows.extend([Vec::new(), heads.into()]);
             let sum = is_summed.then(|| sum_line("all", lines));
             for line in lines.iter().chain(&sum) {
                 let [is, all] = [line.is, line.everything].map(|n| HumanCount(n).to_string());
-                text += &row(&line.what, &is, &all);
+                rows.push(vec![line.what.clone(), is, all]);
             }
         }
-        format!("{text}\neverything: {}\n", self.everything)
+        let (agent, world, everything) = (&self.agent, &self.world, self.everything);
+        let table = align_columns(&rows, &[1, 2]);
+        format!("{agent} on {world}\n{table}\neverything: {everything}\n")
     }
 }
 
@@ -104,10 +103,6 @@ fn sum_line(what: &str, lines: &[Line]) -> Line {
         is: lines.iter().map(|line| line.is).sum(),
         everything: lines.iter().map(|line| line.everything).sum(),
     }
-}
-
-fn row(what: &str, is: &str, everything: &str) -> String {
-    format!("{what:WHAT_COLUMNS$}{is:>NUMBER_COLUMNS$}{everything:>NUMBER_COLUMNS$}\n")
 }
 
 #[cfg(test)]

@@ -162,10 +162,7 @@ impl Launch<'_> {
     }
 
     /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. Transitions that an actor had
-    /// not delivered are lost; the run continues.
-    ///
-    /// # Errors
-    /// A process has died that is not restarted.
+    /// not delivered are lost; the run continues. Fails if a process has died that is not restarted.
     pub(super) fn restart_dead(&mut self) -> anyhow::Result<()> {
         let is_actor_needed = self.is_actor_needed();
         for number in 0..self.processes.len() {

@@ -65,7 +65,7 @@ pub fn run(
         };
         let choice = CheckpointChoice::After(updates);
         match evaluate_and_keep(run_dir, choice, episodes, &is_stopped) {
-            Ok(ranked) => screen.print_line(&ranked.evaluation.describe()),
+            Ok((evaluation, _)) => screen.print_line(&evaluation.describe()),
             Err(_) if is_stopped() => screen.print_line("skipped an evaluation"),
             Err(e) => screen.print_line(&format!("the run continues without an evaluation: {e:#}")),
         }

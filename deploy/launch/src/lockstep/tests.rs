@@ -133,11 +133,9 @@ fn what_cannot_go_on_says_why() {
     let why = "replay.sampling differs from the rule that was used before";
     assert!(said.contains(why), "{said}");
     // The newest segment begins with the mark, the one before it has the transitions.
+    let damaged = "is missing or damaged: the replay cannot be rolled back";
     for (is_newest, why) in [
-        (
-            true,
-            "is missing or damaged: the replay cannot be rolled back",
-        ),
+        (true, damaged),
         (false, "cannot resume to the same weights"),
     ] {
         let (_folder, run_dir, _) = begun(&config, 9);

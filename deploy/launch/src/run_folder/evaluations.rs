@@ -20,26 +20,21 @@ const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct EvaluationRow {
     /// Seconds of the run at the checkpoint, from the metrics; none without metrics.
-    pub seconds: Option<f64>,
+    pub(crate) seconds: Option<f64>,
     /// Frames of the run at the checkpoint, likewise.
-    pub frames: Option<u64>,
-    /// Updates of the weights.
-    pub updates: u64,
-    /// Whole episodes played.
-    pub episodes: u32,
+    pub(crate) frames: Option<u64>,
+    pub(crate) updates: u64,
+    pub(crate) episodes: u32,
     /// Mean undiscounted return of the episodes.
     #[serde(rename = "evaluated_return")]
-    pub mean_return: f64,
+    pub(crate) mean_return: f64,
     /// Standard deviation of the return over episodes; none for one episode.
     #[serde(rename = "evaluated_return_sd")]
-    pub deviation: Option<f64>,
+    pub(crate) deviation: Option<f64>,
 }
 
 impl EvaluationRow {
     /// Reads all evaluations in a run's folder, in the order in which they were made; none without the file.
-    ///
-    /// # Errors
-    /// The file is not a table of evaluations, or cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
         let rows = Table::read(&path)?.parse_rows(&path);

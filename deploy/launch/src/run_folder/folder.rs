@@ -137,10 +137,7 @@ impl RunFolder {
                 && saved.is_ok_and(|all| all.is_empty())
     }
 
-    /// Keeps other launchers out as long as the returned file is held.
-    ///
-    /// # Errors
-    /// Another launcher holds the lock, or the file system failed.
+    /// Keeps other launchers out as long as the returned file is held. Fails if another launcher holds it.
     pub fn lock(&self) -> anyhow::Result<File> {
         let path = self.lock_file();
         let folder = self.display();

@@ -219,9 +219,6 @@ pub(super) fn append(file: &mut File, bytes: &[u8]) -> io::Result<()> {
 }
 
 /// Formats a row of a CSV file as bytes.
-///
-/// # Panics
-/// The row cannot be formatted, which cannot happen in memory.
 pub(super) fn csv_row<T: AsRef<[u8]>>(cells: impl IntoIterator<Item = T>) -> Vec<u8> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record(cells).expect("a row in memory");

@@ -78,13 +78,10 @@ fn prometheus_text(view: &RunView) -> String {
         let planned = [plan.frames_planned, plan.updates_planned].map(|it| it as f64);
         page.add_gauge("frames_planned", "Frames of the whole run.", planned[0]);
         page.add_gauge("updates_planned", "Updates of the whole run.", planned[1]);
-        let flags = [view.is_finished(), actions_needed(view).is_empty()].map(f64::from);
-        let [finished, healthy] = [
-            "Whether all updates are made and saved.",
-            "Whether no process of the run is missing.",
-        ];
-        page.add_gauge("finished", finished, flags[0]);
-        page.add_gauge("healthy", healthy, flags[1]);
+        let help = "Whether all updates are made and saved.";
+        page.add_gauge("finished", help, view.is_finished().into());
+        let help = "Whether no process of the run is missing.";
+        page.add_gauge("healthy", help, actions_needed(view).is_empty().into());
     }
     page.text
 }
@@ -95,8 +92,13 @@ struct PrometheusText {
 }
 
 impl PrometheusText {
-    /// Adds a metric: its head, and a sample for each member that has a value; nothing if none has. `label` distinguishes members.
-    fn add_metric(&mut self, kind: &str, name: &str, help: &str, label: &str, members: &[Member]) {
+    /// Adds a metric: its head, and a sample for each member that has a value; nothing if none has. `label` distinguishes members. The
+    /// name of a counter, and of no gauge, ends in `_total`.
+    fn add_metric(&mut self, name: &str, help: &str, label: &str, members: &[Member]) {
+        let kind = match name.ends_with("_total") {
+            true => "counter",
+            false => "gauge",
+        };
         let members = members.iter();
         let known = members.filter_map(|(member, value)| Some((member, (*value)?)));
         for (nth, (member, value)) in known.enumerate() {
@@ -112,18 +114,18 @@ impl PrometheusText {
     }
 
     fn add_gauge(&mut self, name: &str, help: &str, value: f64) {
-        self.add_metric("gauge", name, help, "", &[(String::new(), Some(value))]);
+        self.add_metric(name, help, "", &[(String::new(), Some(value))]);
     }
 
     fn add_columns(&mut self, view: &RunView) {
         for column in COLUMNS {
-            let (kind, label, ending) = match column.value {
-                Value::Counter(_) => ("counter", "", "_total"),
-                Value::Members { label, .. } => ("gauge", label, ""),
-                Value::Gauge(_) | Value::Words(_) => ("gauge", "", ""),
+            let (label, ending) = match column.value {
+                Value::Counter(_) => ("", "_total"),
+                Value::Members { label, .. } => (label, ""),
+                Value::Gauge(_) | Value::Words(_) => ("", ""),
             };
             let name = format!("{}{ending}", column.name);
-            self.add_metric(kind, &name, column.help, label, &column.members(view));
+            self.add_metric(&name, column.help, label, &column.members(view));
         }
     }
 
@@ -133,22 +135,16 @@ impl PrometheusText {
         let mut seen = BTreeSet::new();
         let processes = statuses.flat_map(|it| &it.processes);
         let processes: Vec<_> = processes.filter(|it| seen.insert(it.who)).collect();
-        let mut each = |kind, name, help, value: fn(&ProcessStatus) -> Option<f64>| {
+        let mut each = |name, help, value: fn(&ProcessStatus) -> Option<f64>| {
             let members = processes.iter().map(|it| (it.who.to_string(), value(it)));
-            self.add_metric(kind, name, help, "process", &members.collect::<Vec<_>>());
+            self.add_metric(name, help, "process", &members.collect::<Vec<_>>());
         };
-        let connected = "Whether a process that has joined the run is connected.";
-        each("gauge", "process_connected", connected, |it| {
-            Some(it.connected.into())
-        });
+        let up = "Whether a process that has joined the run is connected.";
+        each("process_connected", up, |it| Some(it.connected.into()));
         let joined = "How often a process has joined the run.";
-        each("counter", "process_joined_total", joined, |it| {
-            Some(it.lives.into())
-        });
+        each("process_joined_total", joined, |it| Some(it.lives.into()));
         let silent = "Seconds since the last chunk or request for a batch of a process.";
-        each("gauge", "process_silent_seconds", silent, |it| {
-            it.last_seen_s
-        });
+        each("process_silent_seconds", silent, |it| it.last_seen_s);
     }
 }
 

@@ -116,7 +116,6 @@ impl Poller {
         Ok(Self::new(&config.context("no endpoint to ask")?, servers))
     }
 
-    /// The time until the next poll.
     pub(crate) const fn pause(&self) -> Duration {
         match self.view.replay.waiting {
             Waiting::Finished => LAST_POLL,

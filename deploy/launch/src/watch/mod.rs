@@ -223,9 +223,6 @@ pub struct UnreachableRun {
 
 impl UnreachableRun {
     /// Prints the state, as one line of JSON or as text for a person.
-    ///
-    /// # Errors
-    /// Stdout cannot be written to.
     pub fn print(&self, as_json: bool) -> anyhow::Result<()> {
         console::print(&match as_json {
             true => format!("{}\n", serde_json::to_string(self)?),

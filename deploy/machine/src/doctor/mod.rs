@@ -108,10 +108,8 @@ mod tests {
             (State::Ok, State::Note, "can train on the CPU, not with"),
             (State::Missing, State::Ok, "cannot train yet"),
         ] {
-            let (text, verdict) = (
-                "not there:\n  do this",
-                format!("\n\nThis machine {verdict}"),
-            );
+            let text = "not there:\n  do this";
+            let verdict = format!("\n\nThis machine {verdict}");
             let report = Report {
                 cpu: vec![fact("cores", State::Ok, "2"), fact("disk", disk, "")],
                 cuda: vec![fact("cuda:0", State::Missing, text), fact("1", cuda, "")],

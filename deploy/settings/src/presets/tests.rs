@@ -26,7 +26,6 @@ const SOURCES: [&str; 8] = [
     "PyTorch",
 ];
 
-/// Every layer, by its path.
 fn all_layers() -> BTreeMap<&'static str, Layer> {
     // The command of an external world is not a name; any command serves here.
     let exec = "exec:true".parse().unwrap();

@@ -16,7 +16,7 @@ use driml_launch::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice},
     console::{self, Screen, print},
     evaluate::{EPSILON, Levels, Player, PolicyKind, world_with_levels},
-    evaluator::{RankedEvaluation, evaluate_and_keep},
+    evaluator::evaluate_and_keep,
     metrics::rounded,
     output, pretrained,
     run_folder::RunFolder,
@@ -116,9 +116,9 @@ fn evaluate(args: &EvaluateArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         ));
     }
     if args.keep {
-        let ranked = evaluate_and_keep(&folder, choice, args.episodes, &|| shutdown.is_set())?;
-        let evaluation = ranked.evaluation.describe();
-        return print(&format!("{evaluation}{}\n", compare_with_best(&ranked)));
+        let is_stopped = || shutdown.is_set();
+        let (evaluation, rank) = evaluate_and_keep(&folder, choice, args.episodes, &is_stopped)?;
+        return print(&format!("{}{rank}\n", evaluation.describe()));
     }
     let mut player = match pretrained {
         Some(player) => player,
@@ -218,18 +218,6 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     ))
 }
 
-/// Returns how the checkpoint compares with the run's best one, as the end of a sentence.
-fn compare_with_best(ranked: &RankedEvaluation) -> String {
-    match &ranked.best_before {
-        _ if ranked.is_best => ", the best so far".into(),
-        Some(best) if best.episodes > ranked.evaluation.episodes => format!(
-            "; the best checkpoint stays, as its mean is over {}",
-            count(best.episodes, "episode")
-        ),
-        _ => String::new(),
-    }
-}
-
 /// The name of a policy, and the returns of its episodes.
 type PolicyReturns<'a> = (&'a str, Vec<f64>);
 
@@ -250,14 +238,11 @@ fn json_report(
     played: &[PolicyReturns<'_>],
 ) -> anyhow::Result<String> {
     let spec = &player.config.run;
-    let policies: serde_json::Map<_, _> = played
-        .iter()
-        .map(|(name, returns)| {
-            let (mean, deviation) = mean_and_deviation(returns);
-            let of = serde_json::json!({ "mean_return": mean, "standard_deviation": deviation, "episodes": returns.len() });
-            ((*name).to_owned(), of)
-        })
-        .collect();
+    let mut policies = serde_json::json!({});
+    for (name, returns) in played {
+        let (mean, deviation) = mean_and_deviation(returns);
+        policies[name] = serde_json::json!({ "mean_return": mean, "standard_deviation": deviation, "episodes": returns.len() });
+    }
     let levels = levels.to_possible_value();
     let object = serde_json::json!({
         "world": spec.world,

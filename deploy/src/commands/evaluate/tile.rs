@@ -1,8 +1,7 @@
 //! Layout and texts of one filmed environment in a picture: its enlarged frame, and beside it the network's outputs.
 //! This file does not call the network; it receives the outputs.
 
-use driml_envs::FrameShape;
-use driml_figure::{Image, Ink, Picture, Rect};
+use driml_figure::{Ink, Picture, Rect};
 use driml_learner::insight::NetworkOutputs;
 use driml_settings::config::RunConfig;
 
@@ -52,7 +51,8 @@ pub(super) struct Local {
 
 #[derive(Debug)]
 pub(super) struct Layout {
-    frame: FrameShape,
+    /// The shape [H, W, C] of a frame.
+    frame: [usize; 3],
     zoom: usize,
     /// Width and height of an enlarged frame, and of the whole tile of an environment, in pixels.
     enlarged: (f64, f64),
@@ -94,7 +94,7 @@ impl Layout {
         let along = |count: usize, side: f64| MARGIN + count as f64 * (side + MARGIN);
         let across = along(columns, tile.0) as usize;
         Self {
-            frame: FrameShape::new(height, width, spec.frame_channels as usize),
+            frame: [height, width, spec.frame_channels as usize],
             zoom,
             enlarged,
             tile,
@@ -129,13 +129,7 @@ impl Layout {
         let (column, row) = (i % self.columns, i / self.columns);
         let x = MARGIN + column as f64 * (tile_width + MARGIN);
         let y = MARGIN + row as f64 * (tile_height + MARGIN);
-        let image = Image {
-            pixels: &shot.frame,
-            height: self.frame.height,
-            width: self.frame.width,
-            channels: self.frame.channels,
-        };
-        picture.image((x as usize, y as usize), self.zoom, image);
+        picture.image((x as usize, y as usize), self.zoom, &shot.frame, self.frame);
         let Some(outputs) = &shot.outputs else { return };
         let (frame_width, frame_height) = self.enlarged;
         let panel = Rect::new(x + frame_width + MARGIN, y, PANEL_WIDTH, tile_height);

@@ -161,7 +161,6 @@ impl Batch {
         (loss, slopes)
     }
 
-    /// Counts the errors of the loss and of its slopes.
     fn record_errors(&self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let rows = self.logits.len() / self.atoms;
         let (loss, gradient) = self.kl();

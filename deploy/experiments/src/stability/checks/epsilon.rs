@@ -15,7 +15,6 @@ pub(super) fn properties() -> Vec<Property> {
     ]
 }
 
-/// Draws a number of any size.
 fn draw_count(rng: &mut ChaCha8Rng) -> u64 {
     rng.random::<u64>() >> rng.random_range(0..64)
 }

@@ -73,7 +73,6 @@ impl Batch {
         (loss.to_bits(), bits(&slopes))
     }
 
-    /// Returns the valid rows.
     fn valid_rows(&self) -> Vec<usize> {
         let rows = 0..self.valid.len();
         rows.filter(|&row| self.valid[row] != 0).collect()

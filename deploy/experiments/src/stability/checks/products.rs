@@ -69,7 +69,6 @@ struct Layer {
 /// Inputs, weights, biases, and the gradient with respect to the results.
 type Operands = [Tensor; 4];
 
-/// Draws a number of values.
 type Draw<'a> = &'a mut dyn FnMut(usize, &mut ChaCha8Rng) -> Vec<f32>;
 
 impl Layer {

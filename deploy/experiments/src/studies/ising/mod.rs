@@ -114,21 +114,21 @@ fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
             outline: Some(outline(episode)),
         })
     };
-    let range = Spread::of(first.maps.iter().flatten().copied());
+    let shown_scores = Spread::of(first.maps.iter().flatten().copied());
+    let range = shown_scores.map_or((0.0, 1.0), |it| (it.min, it.max));
     let fields = ReceptiveFields::of(&task.model);
     let title = format!("Scores, t = {} to {early_t}", settings.from_t);
     let scores = |episode: usize| {
-        let map = first.maps[episode].iter().map(|score| Some(*score));
         Panel::Heat(Heat {
             unit: "score [nats]".into(),
-            range: range.map(|it| (it.min, it.max)),
+            range,
             field: Some(Field {
                 side: side as f64,
                 first: (fields.side - fields.step) as f64 / 2.0,
                 cell: fields.step as f64,
             }),
             outline: Some(outline(episode)),
-            ..Heat::new(&title, fields.columns, map.collect())
+            ..Heat::new(&title, fields.columns, first.maps[episode].clone())
         })
     };
     let panels = (0..shown)
@@ -211,18 +211,16 @@ fn page_values(task: &Task, trained: &[Outcome]) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flags::tests::length;
+    use crate::flags::tests::parse;
 
     pub(super) fn smoke() -> Settings {
-        flags::read_settings(NAME, SETTINGS, &length(true))
+        flags::read_settings(NAME, SETTINGS, &parse("--smoke"))
     }
 
     #[test]
     fn both_lengths_read_and_ask_for_local_dim_alone() {
-        for settings in [
-            smoke(),
-            flags::read_settings(NAME, SETTINGS, &length(false)),
-        ] {
+        for length in ["", "--smoke"] {
+            let settings = flags::read_settings(NAME, SETTINGS, &parse(length));
             let task = new_task(&settings).unwrap();
             // From the paper's table of parameters.
             let local = [true, false, false, false];

@@ -163,12 +163,12 @@ fn fig1(results: &Results) -> Figure {
     let k = settings.states;
     let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let high = truth.iter().copied().fold(0.0, f64::max) * 1.1;
-    let heat = |title: String, values: Vec<Option<f64>>| {
+    let heat = |title: String, values: Vec<f64>| {
         Panel::Heat(Heat {
             names: (1..=k).map(|state| state.to_string()).collect(),
             labels: ("next state".into(), "state".into()),
             unit: "T / \u{3c1} [ratio]".into(),
-            range: Some((0.0, high)),
+            range: (0.0, high),
             decimals: Some(1),
             ..Heat::new(&title, k, values)
         })
@@ -178,7 +178,6 @@ fn fig1(results: &Results) -> Figure {
         "(b) Learnt ratio, mean of {}",
         count(settings.seeds, "seed")
     );
-    let learnt = learnt.iter().map(|it| Some(it.mean));
     Figure {
         title: format!("InfoNCE on a biased random walk over {k} states"),
         notes: vec![format!(
@@ -188,8 +187,8 @@ fn fig1(results: &Results) -> Figure {
         columns: 2,
         panel_size: (430.0, 380.0),
         panels: vec![
-            heat(of_truth, truth.into_iter().map(Some).collect()),
-            heat(of_learnt, learnt.collect()),
+            heat(of_truth, truth),
+            heat(of_learnt, learnt.iter().map(|it| it.mean).collect()),
             information_panel(results),
             inverse_gap_panel(results),
         ],
@@ -306,12 +305,12 @@ fn curves_panel(results: &Results) -> Panel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flags::tests::length;
+    use crate::flags::tests::parse;
 
     #[test]
     fn both_lengths_read_and_have_the_figure_s_alpha() {
-        for smoke in [false, true] {
-            let settings: Settings = flags::read_settings(NAME, SETTINGS, &length(smoke));
+        for length in ["", "--smoke"] {
+            let settings: Settings = flags::read_settings(NAME, SETTINGS, &parse(length));
             assert!(settings.alphas.contains(&settings.figure_alpha));
             assert!(settings.alphas.iter().all(|a| 0.0 < *a && *a < 1.0));
             assert!(settings.states >= 2 && settings.seeds > 0 && settings.updates > 0);

@@ -143,18 +143,18 @@ fn resolve_agents(names: &[String]) -> Result<Vec<String>, Usage> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flags::tests::length;
+    use crate::flags::tests::parse;
 
-    fn settings(smoke: bool) -> Settings {
-        flags::read_settings(NAME, include_str!("../procgen.toml"), &length(smoke))
+    fn settings(length: &str) -> Settings {
+        flags::read_settings(NAME, include_str!("../procgen.toml"), &parse(length))
     }
 
     #[test]
     fn the_full_length_is_sixteen_games_of_two_agents() {
-        let full = settings(false);
+        let full = settings("");
         assert_eq!(resolve_worlds(&full.games).unwrap().len(), 16);
         assert_eq!(resolve_agents(&full.agents).unwrap(), ["c51", "driml-ada"]);
-        for settings in [full, settings(true)] {
+        for settings in [full, settings("--smoke")] {
             assert!(presets::preset(&settings.preset).is_ok());
         }
     }
@@ -168,11 +168,8 @@ mod tests {
         let both = "driml-noact-k1 driml-noact-k5";
         assert_eq!(found(both, resolve_agents).unwrap(), both);
         assert_eq!(found("all", resolve_agents).unwrap().split(' ').count(), 7);
-        let worlds = |names| found(names, resolve_worlds);
-        let both = worlds("chain bigfish chain").unwrap();
-        assert_eq!(both, "chain procgen:bigfish");
-        let said = worlds("bigfihs").unwrap_err().to_string();
-        assert!(said.contains("did you mean"), "{said}");
+        let worlds = found("chain bigfish chain", resolve_worlds).unwrap();
+        assert_eq!(worlds, "chain procgen:bigfish");
         for wrong in ["driml-ada-k5", "driml-noact-kx"] {
             assert!(found(wrong, resolve_agents).is_err(), "{wrong}");
         }
@@ -184,7 +181,7 @@ mod tests {
         let settings = Settings {
             games: vec!["procgen:heist".into()],
             agents: vec!["driml-noact-k5".into()],
-            ..settings(true)
+            ..settings("--smoke")
         };
         let plan = &settings.plans(2)[0].1;
         assert_eq!(plan.name, "heist-driml-noact-k5-seed2");

@@ -96,13 +96,10 @@ impl Events {
     /// Histograms of what was counted since the last ones.
     fn histograms(&mut self, at: EventTime, replay: &ReplayStatus) -> Option<Vec<u8>> {
         let mut histograms = Vec::new();
+        let (of_k, of_actions) = (&mut self.k_counts, &mut self.action_counts);
         for (name, now, before) in [
-            ("k/served", &replay.k_histogram, &mut self.k_counts),
-            (
-                "actions/stored",
-                &replay.action_histogram,
-                &mut self.action_counts,
-            ),
+            ("k/served", &replay.k_histogram, of_k),
+            ("actions/stored", &replay.action_histogram, of_actions),
         ] {
             let counts = counts_since(now, before);
             before.clone_from(now);
