@@ -9,8 +9,8 @@ use serde::{Deserialize, Deserializer, Serialize, de::Error};
 use crate::{
     auxiliary::{
         AuxiliaryKind,
-        loss::{AuxiliaryLoss, MenuItem},
-        settings::Lambda,
+        loss::AuxiliaryLoss,
+        settings::{AuxiliarySettings, Lambda},
     },
     error::UpdateError,
     optimiser::adam::AdamSettings,
@@ -88,16 +88,15 @@ impl UpdateSettings {
     /// Creates the auxiliary loss.
     ///
     /// # Errors
-    /// Invalid settings of the loss, or a table of another loss.
+    /// Invalid settings of the loss.
     pub fn make_auxiliary_loss(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-        let MenuItem { name, make, .. } = self.auxiliary_loss.0;
-        let loss = make(self)?;
-        match self.own.keys().find(|other| other != name) {
-            Some(other) => Err(UpdateError::AuxiliaryLoss(format!(
-                "auxiliary_loss = {name} has no use for the table {other}: take the table {other} out of learner.update, or take the agent {other}"
-            ))),
-            None => Ok(loss),
-        }
+        self.auxiliary_loss.make_loss(&AuxiliarySettings {
+            auxiliary_loss: self.auxiliary_loss.name(),
+            lambda: self.lambda,
+            condition_on_action: self.condition_on_action,
+            tanh_clip: self.tanh_clip,
+            own: &self.own,
+        })
     }
 
     /// The heads that the online network needs in an environment of `num_actions` actions; none if the settings are invalid, which

@@ -14,8 +14,8 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_510),
     ("actor", 10_740),
     ("replay-server", 11_125),
-    ("learner", 22_385),
-    ("deploy", 31_000),
+    ("learner", 22_420),
+    ("deploy", 31_010),
     ("tests", 10_435),
 ];
 /// The most lines of one file.
@@ -204,13 +204,13 @@ fn identifiers(text: &str) -> BTreeSet<&str> {
 }
 
 #[test]
-fn every_source_file_says_what_it_is_for() {
+fn every_source_file_says_what_it_is_for_and_no_script_follows_cdpath() {
     for Source { name, text } in sources(&[".rs"]) {
         let first = text.lines().next().unwrap_or_default();
         let is_text = first.starts_with("//! ") && first.len() > 12;
         assert!(is_text, "{name} starts with {first:?}");
     }
-    for Source { name, text } in sources(&[".sh"]) {
+    for Source { name, text } in sources(&[".sh", ".ci/run"]) {
         let is_at_home = text.contains("\nunset CDPATH\n");
         assert!(is_at_home, "{name} follows CDPATH");
     }

@@ -97,7 +97,8 @@ impl Delivery {
         self.queue.send(chunk).is_ok()
     }
 
-    /// Waits until the last chunk is settled and `Leave` is sent, unless the actor `has_failed`. Returns the number of unwanted transitions.
+    /// Waits until the last chunk is settled, and then sends `Leave`, unless the actor `has_failed` with all chunks delivered. Returns the
+    /// number of transitions that the run no longer wanted.
     ///
     /// # Errors
     /// The replay server was unreachable for too long, rejected a chunk, or did not store it in time after a shutdown.

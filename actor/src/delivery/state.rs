@@ -49,7 +49,7 @@ pub(crate) struct Progress {
     pub(crate) is_finished: bool,
     /// Whether the rate limiter holds chunks: the actor then queues one at a time, as others would only grow old.
     pub(super) is_held: bool,
-    /// Whether the actor has failed: it then sends no `Leave`, so that it counts as missing.
+    /// Whether the actor has failed: with all chunks delivered it then sends no `Leave`, so that it counts as missing.
     pub(super) has_failed: bool,
     /// Chunks that were queued and are not yet settled.
     pub(super) in_flight: usize,

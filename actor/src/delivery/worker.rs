@@ -131,7 +131,7 @@ impl DeliveryWorker {
             lock(&self.state.progress).in_flight -= 1;
             self.state.settled.notify_all();
         }
-        // Lost transitions are counted in any case.
+        // If delivery failed, the replay server counts the lost transitions by `Leave`.
         let is_missing = result.is_ok() && lock(&self.state.progress).has_failed;
         if let Some((actor, incarnation)) = sender.filter(|_| !is_missing) {
             self.send_leave(Leave::new(actor, incarnation, produced - unwanted));

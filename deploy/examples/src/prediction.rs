@@ -4,8 +4,11 @@
 
 use candle_core::{D, DType, Tensor};
 use driml_learner::{
-    Batch, Positives, UpdateError, UpdateSettings,
-    auxiliary::loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
+    Batch, Positives, UpdateError,
+    auxiliary::{
+        loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
+        settings::AuxiliarySettings,
+    },
 };
 use driml_model::{LossLayer, ModelConfig};
 use serde::Deserialize;
@@ -30,7 +33,7 @@ struct PredictionSettings {
     weight: f64,
 }
 
-fn make(settings: &UpdateSettings) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     match settings.own_table()? {
         Some(PredictionSettings { weight }) if weight > 0.0 && weight.is_finite() => {
             Ok(Box::new(Prediction { weight }))

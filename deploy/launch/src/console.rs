@@ -190,7 +190,9 @@ pub fn log_to_stderr() {
     // A client without a certificate may try to connect ten times a second.
     let rejections = Mutex::new(LogLimiter::default());
     let rare = dynamic_filter_fn(move |it: &Metadata<'_>, _: &LayerContext<'_, Registry>| {
-        !it.target().starts_with("zenoh_link_commons::quic") || lock(&rejections).admit().is_some()
+        let is_rejection =
+            it.target().starts_with("zenoh_link_commons::quic") && *it.level() <= Level::WARN;
+        !is_rejection || lock(&rejections).admit().is_some()
     });
     let log = tracing_subscriber::fmt::layer()
         .with_writer(stderr)

@@ -21,8 +21,8 @@ const BATCHES_MAX: u32 = 5;
 const PLAY_MAX: Duration = Duration::from_secs(30);
 const FIRST_BATCH_MAX: Duration = Duration::from_secs(120);
 
-/// Plays the weights of a finished run and adds their returns to its summary, if the settings ask for it. Ends at a `shutdown`, on a thread
-/// because the world may hang.
+/// Plays the weights of a finished run and adds their returns to its summary, if the settings ask for it. Plays on a
+/// thread, so that a `shutdown` also ends the wait for a world that hangs.
 pub(crate) fn play(
     summary: &mut Summary,
     config: &RunConfig,

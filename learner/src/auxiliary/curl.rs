@@ -14,12 +14,12 @@ use super::{
     dim,
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
     positives::Positives,
+    settings::AuxiliarySettings,
 };
 use crate::{
     error::UpdateError,
     losses::info_nce::info_nce_loss,
     ranges::{TAU_RANGE, check_range},
-    settings::UpdateSettings,
 };
 
 /// The menu item of CURL.
@@ -39,7 +39,7 @@ pub struct CurlSettings {
     pub key_tau: f64,
 }
 
-fn make(settings: &UpdateSettings) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     settings.check_any_pair_active()?;
     let said = |what: &str| format!("auxiliary_loss = curl {what}");
     let fault = |what: &str| Err(UpdateError::AuxiliaryLoss(said(what)));

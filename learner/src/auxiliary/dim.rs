@@ -7,14 +7,13 @@ use driml_model::{DimHeads, Features, Kernels, Network};
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
     positives::Positives,
-    settings::Lambda,
+    settings::{AuxiliarySettings, Lambda},
 };
 use crate::{
     batch::Batch,
     deduplicate::StateBytes,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::DotProducts},
-    settings::UpdateSettings,
 };
 
 /// The menu item of DIM.
@@ -39,7 +38,7 @@ pub struct Dim {
 
 impl Dim {
     /// Creates the loss from settings; at least one lambda must be above 0.
-    pub fn new(settings: &UpdateSettings) -> Result<Self, UpdateError> {
+    pub fn new(settings: &AuxiliarySettings<'_>) -> Result<Self, UpdateError> {
         settings.check_no_own_table()?;
         settings.check_any_pair_active()?;
         Ok(Self {

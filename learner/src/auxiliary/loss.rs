@@ -6,13 +6,15 @@ use std::fmt;
 use candle_core::{Device, Tensor};
 use driml_model::{DimHeads, Encoder, Features, LossLayer, ModelConfig, Network};
 
-use super::{positives::Positives, settings::Lambda};
+use super::{
+    positives::Positives,
+    settings::{AuxiliarySettings, Lambda},
+};
 use crate::{
     batch::Batch,
     deduplicate::{PassInput, StateBytes},
     error::UpdateError,
     losses::scores::DotProducts,
-    settings::UpdateSettings,
     tensors::states_tensor,
 };
 
@@ -26,7 +28,7 @@ pub struct MenuItem {
     /// The names of all losses that may be reported, which are columns of a run's metrics.
     pub loss_names: &'static [&'static str],
     /// Creates the loss from settings; rejects settings that contradict each other.
-    pub make: fn(&UpdateSettings) -> Result<Box<dyn AuxiliaryLoss>, UpdateError>,
+    pub make: fn(&AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError>,
 }
 
 /// What an agent learns beside the return.

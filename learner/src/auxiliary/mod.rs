@@ -1,8 +1,8 @@
 //! The menu of auxiliary losses: what an agent learns beside the return.
 //!
-//! Each loss is a file of this folder that implements [`loss::AuxiliaryLoss`], and a line of [`MENU`]. An update does not depend on
-//! which loss it computes: the loss itself defines its heads, its positives and the names under which it is reported. A program that
-//! uses this crate adds a loss with [`register`], without a change here.
+//! Each loss is a file of this folder that implements [`AuxiliaryLoss`], and a line of [`MENU`]. An update does not depend on which
+//! loss it computes: the loss itself defines its heads, its positives and the names under which it is reported. A program that uses
+//! this crate adds a loss with [`register`], without a change here.
 
 pub mod cpc;
 pub mod curl;
@@ -14,9 +14,12 @@ pub mod settings;
 
 use std::{fmt, sync::OnceLock};
 
-use loss::MenuItem;
+use loss::{AuxiliaryLoss, MenuItem};
 use positives::Positives;
 use serde::{Deserialize, Serialize};
+use settings::AuxiliarySettings;
+
+use crate::error::UpdateError;
 
 /// All auxiliary losses of this crate; a new one adds a line here.
 pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
@@ -50,7 +53,7 @@ fn all_items() -> impl Iterator<Item = &'static MenuItem> {
 /// The auxiliary loss of an agent, from the [`MENU`] or [`register`]ed. Settings refer to it by its name.
 #[derive(Clone, Copy, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "&'static str")]
-pub struct AuxiliaryKind(pub(crate) &'static MenuItem);
+pub struct AuxiliaryKind(&'static MenuItem);
 
 impl AuxiliaryKind {
     /// No auxiliary loss: the agent learns the return alone.
@@ -74,6 +77,21 @@ impl AuxiliaryKind {
     /// The names of all losses that may be reported, in order.
     pub const fn loss_names(self) -> &'static [&'static str] {
         self.0.loss_names
+    }
+
+    /// Creates the loss from settings.
+    pub fn make_loss(
+        self,
+        settings: &AuxiliarySettings<'_>,
+    ) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+        let loss = (self.0.make)(settings)?;
+        match settings.own.keys().find(|other| *other != self.name()) {
+            Some(other) => Err(UpdateError::AuxiliaryLoss(format!(
+                "auxiliary_loss = {} has no use for the table {other}: take the table {other} out of learner.update, or take the agent {other}",
+                self.name()
+            ))),
+            None => Ok(loss),
+        }
     }
 }
 

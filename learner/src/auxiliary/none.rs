@@ -3,9 +3,9 @@
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
     positives::Positives,
-    settings::PAIRS,
+    settings::{AuxiliarySettings, PAIRS},
 };
-use crate::{error::UpdateError, settings::UpdateSettings};
+use crate::error::UpdateError;
 
 /// The menu item for no auxiliary loss.
 pub const NONE: MenuItem = MenuItem {
@@ -15,7 +15,7 @@ pub const NONE: MenuItem = MenuItem {
     make,
 };
 
-fn make(settings: &UpdateSettings) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     settings.check_no_own_table()?;
     if settings.condition_on_action {
         return Err(UpdateError::AuxiliaryLoss(

@@ -1,10 +1,10 @@
-//! The weights of auxiliary losses, and how a loss reads and checks its settings.
+//! The settings that auxiliary losses use: weights, the scores' clip, and a table of each loss's own settings.
 //! The menu of losses is in `super`.
 
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use crate::{error::UpdateError, settings::UpdateSettings};
+use crate::error::UpdateError;
 
 /// The pairs NtM, in the order of every array of four here: features N of (s_t, a_t) are compared with features M of s_{t+k}.
 pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
@@ -86,21 +86,37 @@ impl Lambda {
     }
 }
 
-/// For the losses that are created from these settings.
-impl UpdateSettings {
-    /// Reads the auxiliary loss's own table; `None` if it is absent.
+/// The settings from which a loss is created.
+#[derive(Clone, Copy, Debug)]
+pub struct AuxiliarySettings<'a> {
+    /// The loss's name in the menu.
+    pub auxiliary_loss: &'static str,
+    /// Weights of the losses between pairs of levels.
+    pub lambda: Lambda,
+    /// Whether Psi receives a_t.
+    pub condition_on_action: bool,
+    /// Bound c of the scores' soft clip `c * tanh(x / c)`.
+    pub tanh_clip: f64,
+    /// Tables of the losses' own settings, by the loss's name: `[learner.update.<name>]`.
+    pub own: &'a toml::Table,
+}
+
+impl AuxiliarySettings<'_> {
+    /// Reads the loss's own table; `None` if it is absent.
     pub fn own_table<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
-        let name = self.auxiliary_loss.name();
-        let own = self.own.get(name).map(|table| table.clone().try_into());
-        own.transpose().map_err(|e: toml::de::Error| {
+        let Some(table) = self.own.get(self.auxiliary_loss) else {
+            return Ok(None);
+        };
+        let own = table.clone().try_into();
+        own.map(Some).map_err(|e| {
             let why = e.to_string();
-            UpdateError::AuxiliaryLoss(format!("{name}: {}", why.trim_end()))
+            UpdateError::AuxiliaryLoss(format!("{}: {}", self.auxiliary_loss, why.trim_end()))
         })
     }
 
     /// Rejects a table for a loss that has no own settings.
     pub fn check_no_own_table(&self) -> Result<(), UpdateError> {
-        let name = self.auxiliary_loss.name();
+        let name = self.auxiliary_loss;
         if !self.own.contains_key(name) {
             return Ok(());
         }
@@ -114,7 +130,7 @@ impl UpdateSettings {
         if self.lambda.active_pairs().contains(&true) {
             return Ok(());
         }
-        let name = self.auxiliary_loss.name();
+        let name = self.auxiliary_loss;
         Err(UpdateError::AuxiliaryLoss(format!(
             "auxiliary_loss = {name}, but all lambdas are 0: set one above 0, or take the agent c51"
         )))

@@ -222,7 +222,8 @@ impl Chunk {
     }
 }
 
-/// Asks whether the replay server has stored a chunk that it keeps until its rate limiter has room.
+/// Asks whether the replay server has stored a chunk that it keeps until its rate limiter has room. An actor that makes its environments
+/// asks about its first chunk, to learn whether the run is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkPoll {
     /// The actor's number in the run.

@@ -64,7 +64,7 @@ impl Shutdown {
         let thread = std::thread::Builder::new().name(name.into());
         thread.spawn(move || {
             fail_point::reach(name);
-            // The receiver is gone if the flag was raised meanwhile.
+            // The receiver is gone if the caller no longer waits.
             let _ = sender.send(work());
         })?;
         for tick in 1_u64.. {
@@ -75,7 +75,7 @@ impl Shutdown {
                 Err(_) => {}
             }
         }
-        // Work that checks the flag itself ends in order.
+        // Work that checks the flag itself returns soon.
         Ok(receiver.recv_timeout(10 * TICK).ok())
     }
 

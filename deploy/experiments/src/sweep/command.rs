@@ -69,7 +69,10 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let names = axes.iter().map(|axis| axis.name.as_str());
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
     session.write_csv(NAME, &header.join(","), &rows)?;
-    let short = |it: &String| it.rsplit('.').next().unwrap_or(it).to_owned();
+    // An axis by the last part of its name, unless two axes end alike.
+    let end = |it: &String| it.rsplit('.').next().unwrap_or(it).to_owned();
+    let is_only = |it: &String| header.iter().filter(|other| end(other) == end(it)).count() == 1;
+    let short = |it: &String| if is_only(it) { end(it) } else { it.clone() };
     let mut lines = [vec![header.iter().map(short).collect()], rows].concat();
     // The columns from `lowest` to `updates_per_second` are in the file alone, as a terminal is narrow.
     for line in &mut lines {
