@@ -100,7 +100,7 @@ impl Replay {
         self.prune();
     }
 
-    /// Drops the oldest transitions, if the disk budget has no room for a whole segment more. Removes segments that are no longer needed.
+    /// Drops the oldest transitions, if the disk budget has no room for a whole segment more. Then removes unneeded segments.
     fn keep_within_disk_budget(&mut self) {
         let journal = self.journal.as_ref();
         if let Some(oldest) = journal.and_then(|it| it.oldest_within_budget(|| self.snapshot())) {
