@@ -129,10 +129,10 @@ fn faulty(arguments: &str) -> Result<(), EnvError> {
 /// The world stops the actor for longer than a step may take, as if the whole run were stopped and continued, and answers afterwards.
 #[test]
 fn a_step_in_which_the_run_was_stopped_is_not_late() {
-    let stop = "kill -STOP $PPID; sleep 2; kill -CONT $PPID; sleep 0.2; printf .; read -r line";
+    let stop = "kill -STOP $PPID; sleep 3; kill -CONT $PPID; sleep 0.2; printf .; read -r line";
     let command = declares(ONE) + "; printf .; dd bs=1 count=1 status=none >/dev/null; " + stop;
     let config = ExecConfig {
-        step_timeout_ms: 1500,
+        step_timeout_ms: 2500,
         ..config(command)
     };
     let mut world = ExecWorld::new(&config, 1, 1).unwrap();
