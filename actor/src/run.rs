@@ -6,8 +6,8 @@ use std::{sync::Arc, time::Duration};
 use anyhow::Context;
 use driml_envs::WorldName;
 use driml_protocol::{
-    Activity, ActorJoin, ChunkPoll, InsertReply, Keys, Participant, RunClient, Shutdown, join,
-    reporter,
+    Activity, ActorJoin, ChunkPoll, InsertReply, Keys, Leave, Participant, RunClient, Shutdown,
+    join, reporter,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -22,7 +22,7 @@ use crate::{
 
 /// How long an actor waits for the learner's first weights.
 const FIRST_WEIGHTS_WAIT_MAX: Duration = Duration::from_secs(120);
-/// Time-out of the question whether the run is over.
+/// Time-out of a request that is sent once: whether the run is over, or that the actor leaves before its first chunk.
 const ASK_MAX: Duration = Duration::from_secs(2);
 
 /// The arguments of one actor process. All other settings come from the replay server.
@@ -90,12 +90,19 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let activity = Activity::new("waits for the learner's first weights");
     let clients = vec![client.clone()];
     reporter::start(clients, participant, activity.clone(), shutdown.clone())?;
+    let leave_early = |is_finished| {
+        let leave = Leave::new(join.actor, join.incarnation, 0);
+        if let Err(e) = client.ask(&leave, ASK_MAX) {
+            tracing::debug!("the replay server did not receive this actor's `Leave`: {e}");
+        }
+        Ok(is_finished)
+    };
     let Some(first) = weights::wait_for_first(&client, FIRST_WEIGHTS_WAIT_MAX, shutdown)? else {
-        return Ok(false);
+        return leave_early(false);
     };
     // The learner has joined by now, so the replay server knows after how many updates a resumed run continues.
     let Some(run_info) = join::fetch_run_info(client.session(), client.keys(), shutdown)? else {
-        return Ok(false);
+        return leave_early(false);
     };
     let pool = settings.chunk_buffers();
     activity.begin("makes its environments");
@@ -121,13 +128,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         shutdown.run_unless_set("environments", build, is_over)?
     };
     let Some(collector) = built else {
-        return Ok(!shutdown.is_set());
+        return leave_early(!shutdown.is_set());
     };
     let mut collector = collector?;
     let newest = weights::start_puller(client.clone(), version, shutdown.clone())?;
     let (actor, config) = (args.actor, &settings.actor);
     let (inserted, limits) = (run_info.inserted_total, DeliveryLimits::from_config(config));
-    let delivery = Delivery::start(client.clone(), inserted, limits, pool, shutdown.clone())?;
+    let (run, stop) = (client.clone(), shutdown.clone());
+    let delivery = Delivery::start(run, join, inserted, limits, pool, stop)?;
     let envs = config.envs;
     tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
     // At the start, not all planned actors are connected yet.

@@ -1,10 +1,15 @@
 //! `driml status`: its output for a run in which a process is missing, gone, suspended or done.
 //! The messages that processes log while they wait are tested here, too.
 
+use driml_protocol::Leave;
 use driml_tests::{TestSystem, check_has, wait_for, wait_until};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, system};
+use crate::{
+    LONG, SHORT,
+    refusals::{Row, check_replies},
+    system,
+};
 
 /// Returns the page of `driml status` as one line, because words stand where its lines are broken.
 pub(crate) fn status_text(system: &TestSystem) -> String {
@@ -53,6 +58,10 @@ fn missing_processes_are_named_with_what_to_do() {
         let text = status_text(&system);
         text.contains("nothing is missing") && !text.contains("actor-5")
     });
+    // An actor whose delivery failed counts a transition that is not stored.
+    client.join_as_actor(6, 1);
+    check_replies(&client, [Row::of(&client, &Leave::new(6, 1, 1), "Ack")]);
+    wait_for_status(&system, &["actor-6 DOWN "]);
     let killed = system.start_actor(5);
     wait_for_status(&system, &["actor-5 up "]);
     killed.signal(Signal::SIGKILL);
@@ -69,13 +78,26 @@ fn missing_processes_are_named_with_what_to_do() {
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);
     assert_eq!(processes[2]["who"]["Actor"], 5);
-    assert_eq!(answer["actions_needed"].as_array().unwrap().len(), 2);
+    assert_eq!(answer["actions_needed"].as_array().unwrap().len(), 3);
 
     // A suspended server is reported within seconds, too.
     server.signal(Signal::SIGSTOP);
     let ended = system.run(&system.connect_args("status"));
     server.signal(Signal::SIGCONT);
     ended.expect_code(1).expect_stderr("endpoint");
+}
+
+#[test]
+fn an_actor_that_is_stopped_before_its_first_chunk_is_not_missing() {
+    let system = system();
+    let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let mut actor = system.start_actor(0);
+    actor.wait_for_stderr("waiting for the learner's first weights");
+    wait_for_status(&system, &["actor-0 up "]);
+    actor.stop(130);
+    wait_until("a status without it", || {
+        !status_text(&system).contains("actor-0")
+    });
 }
 
 #[test]

@@ -7,7 +7,7 @@ use driml_actor::{Delivery, DeliveryLimits};
 use driml_learner::remote::batch_source::{
     BatchSource, Counters, NextBatch, Requests, ServedBatch,
 };
-use driml_protocol::{BufferPool, Chunk, ChunkHeader, End, RunClient, Shutdown};
+use driml_protocol::{ActorJoin, BufferPool, Chunk, ChunkHeader, End, RunClient, Shutdown};
 
 /// The time-out of a batch and of a reply.
 const TIMEOUT: Duration = Duration::from_secs(60);
@@ -58,7 +58,8 @@ impl SyntheticActor {
         limits: DeliveryLimits,
         stop: &Shutdown,
     ) -> Self {
-        let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop.clone());
+        let actor = ActorJoin::new(first.actor, first.incarnation);
+        let delivery = Delivery::start(run, actor, 0, limits, BufferPool::new(8), stop.clone());
         Self {
             delivery: delivery.unwrap(),
             next: first,

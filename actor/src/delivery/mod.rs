@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown, lock};
+use driml_protocol::{ActorJoin, BufferPool, Chunk, RunClient, Shutdown, lock};
 
 use state::{DeliveryState, Progress};
 use worker::DeliveryWorker;
@@ -30,9 +30,10 @@ pub struct Delivery {
 
 impl Delivery {
     /// Starts the thread. `inserted_total` is the number of transitions that the run has stored so far; the chunks'
-    /// memory comes from `pool`. The actor must have joined the run with the incarnation of its chunks.
+    /// memory comes from `pool`. The actor must have joined the run, and its chunks carry its number and incarnation.
     pub fn start(
         client: RunClient,
+        actor: ActorJoin,
         inserted_total: u64,
         limits: DeliveryLimits,
         pool: BufferPool,
@@ -43,7 +44,7 @@ impl Delivery {
         // Held until a first chunk is stored at once: actors that start together must not run ahead of the learner together.
         lock(&state.progress).is_held = true;
         let (queue, chunks) = mpsc::channel();
-        let worker = DeliveryWorker::new(client, limits, pool, shutdown, state.clone());
+        let worker = DeliveryWorker::new(client, actor, limits, pool, shutdown, state.clone());
         let thread = std::thread::Builder::new()
             .name("delivery".into())
             .spawn(move || worker.run(&chunks))?;

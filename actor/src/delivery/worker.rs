@@ -10,8 +10,8 @@ use std::{
 
 use anyhow::bail;
 use driml_protocol::{
-    BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
-    RunClient, Shutdown, Silence, fail_point, lock, session::SessionError,
+    ActorJoin, BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter,
+    PendingReply, RunClient, Shutdown, Silence, fail_point, lock, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
@@ -56,6 +56,7 @@ enum Outcome {
 /// again, so must those after it, which the replay server has rejected as out of order.
 pub(super) struct DeliveryWorker {
     client: RunClient,
+    actor: ActorJoin,
     limits: DeliveryLimits,
     pool: BufferPool,
     shutdown: Shutdown,
@@ -79,6 +80,7 @@ pub(super) struct DeliveryWorker {
 impl DeliveryWorker {
     pub(super) fn new(
         client: RunClient,
+        actor: ActorJoin,
         limits: DeliveryLimits,
         pool: BufferPool,
         shutdown: Shutdown,
@@ -86,6 +88,7 @@ impl DeliveryWorker {
     ) -> Self {
         Self {
             client,
+            actor,
             limits,
             pool,
             shutdown,
@@ -104,7 +107,6 @@ impl DeliveryWorker {
 
     /// Delivers chunks until the queue closes. Returns the number of transitions that the run did not want.
     pub(super) fn run(mut self, chunks: &mpsc::Receiver<Chunk>) -> anyhow::Result<u64> {
-        let mut sender = None;
         let mut produced = 0;
         let mut unwanted = 0;
         let mut result = Ok(());
@@ -126,14 +128,14 @@ impl DeliveryWorker {
                 }
             }
             produced += transitions;
-            sender = Some((header.actor, header.incarnation));
             self.outgoing.pop_front();
             lock(&self.state.progress).in_flight -= 1;
             self.state.settled.notify_all();
         }
         // If delivery failed, the replay server counts the lost transitions by `Leave`.
         let is_missing = result.is_ok() && lock(&self.state.progress).has_failed;
-        if let Some((actor, incarnation)) = sender.filter(|_| !is_missing) {
+        if !is_missing {
+            let ActorJoin { actor, incarnation } = self.actor;
             self.send_leave(Leave::new(actor, incarnation, produced - unwanted));
         }
         result.map(|()| unwanted)

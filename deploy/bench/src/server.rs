@@ -98,7 +98,7 @@ impl Server {
         let who = Peer::actor(actor, INCARNATION);
         let (client, alive) = self.join_run(Role::Actor(actor), who, &join)?;
         let limits = DeliveryLimits::from_config(&self.actor.actor);
-        let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
+        let delivery = Delivery::start(client, join, 0, limits, pool.clone(), Shutdown::default())?;
         let mut chunks = recording.chunks(actor, shape, pool);
         let started = Instant::now();
         while !is_enough(chunks.transitions(), started) {

@@ -30,6 +30,9 @@ struct IncarnationState {
     /// Transitions that this incarnation has produced, by its last report.
     produced: u64,
     has_left: bool,
+    /// Whether it left although transitions were not stored. A restarted server does not need this, as it lists connected processes only.
+    #[serde(skip)]
+    has_failed: bool,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -132,10 +135,13 @@ impl Actors {
         self.actors.get(&actor).map(|it| it.current.incarnation)
     }
 
-    /// Whether this is an actor whose current incarnation has sent its `Leave`.
-    pub(crate) fn has_left(&self, who: ProcessName) -> bool {
-        let has_left = |actor| self.actors.get(&actor).map(|it| it.current.has_left);
-        matches!(who, ProcessName::Actor(actor) if has_left(actor) == Some(true))
+    /// Whether this is an actor whose current incarnation has sent its `Leave`, with all its transitions stored.
+    pub(crate) fn has_left_in_order(&self, who: ProcessName) -> bool {
+        let ProcessName::Actor(actor) = who else {
+            return false;
+        };
+        let current = self.actors.get(&actor).map(|it| it.current);
+        current.is_some_and(|it| it.has_left && !it.has_failed)
     }
 
     /// Returns the actor, if `incarnation` is its current one.
@@ -276,7 +282,9 @@ impl Actors {
             return Ok(None);
         }
         let stored = std::mem::replace(&mut state.produced, produced);
-        Ok(Some(Difference::between(produced, stored)))
+        let difference = Difference::between(produced, stored);
+        state.has_failed = difference.lost > 0;
+        Ok(Some(difference))
     }
 
     pub(crate) fn forgettable(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {

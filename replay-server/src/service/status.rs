@@ -92,9 +92,9 @@ impl Service {
             ProcessName::Actor(actor) => state.chunks.arrival(actor),
             ProcessName::Learner => state.requests.iter().map(|it| it.arrived).min(),
         };
-        // An actor that has left is not missing.
+        // An actor that has left in order is not missing.
         let mut processes = state.participants.processes(now, held_since);
-        processes.retain(|it| it.connected || !state.replay.state.actors.has_left(it.who));
+        processes.retain(|it| it.connected || !state.replay.state.actors.has_left_in_order(it.who));
         let status = ProcessesStatus {
             up_s: state.participants.up_s(now),
             waiting,
