@@ -34,7 +34,7 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
         Credentials::read_quietly(dir, Role::ReplayServer).map_err(|e| usage!("{e}"))?;
     }
     let recording = Recording::record()?;
-    let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
+    let folder = output::temporary_folder()?;
     let socket = format!("unixsock-stream/{}/s", folder.path().display());
     let wire = |name, endpoint: &str| Wire {
         name,

@@ -10,6 +10,7 @@ use anyhow::{bail, ensure};
 use driml_launch::{
     console::{self, align_columns},
     managed_process::ManagedProcess,
+    output,
     run_folder::{RunFolder, Summary},
     view::{Poller, ServerConnection},
 };
@@ -174,7 +175,7 @@ impl Run {
     /// Starts `driml local` with these flags and settings, and waits until it listens.
     fn start(flags: &[&str], sets: &[&str]) -> anyhow::Result<Self> {
         let config = settings::run_config(WORLD, AGENT, "paper", sets)?;
-        let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
+        let folder = output::temporary_folder()?;
         let endpoint = format!("unixsock-stream/{}", folder.path().join("s").display());
         let run_dir = folder.path().join("run").display().to_string();
         let args = [&["local", "--no-play", "--run-dir", &*run_dir][..], flags].concat();

@@ -9,6 +9,7 @@ use nix::{
     errno::Errno,
     unistd::{AccessFlags, access},
 };
+use tempfile::TempDir;
 
 /// Rejects a file that cannot be written, before any work is done for it. `what` names it in the error, such as `--out`.
 pub fn check_file(what: &str, path: &Path) -> Result<(), Usage> {
@@ -52,6 +53,20 @@ pub fn write_file(what: &str, path: &Path, bytes: &[u8]) -> Result<(), Usage> {
 
 fn is_special(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|it| !it.is_file())
+}
+
+/// Makes a folder among the temporary files, which is removed on drop.
+pub fn temporary_folder() -> Result<TempDir, Usage> {
+    let made = tempfile::Builder::new().prefix("driml-").tempdir();
+    made.map_err(|e| no_temporary_folder(&std::env::temp_dir(), &e))
+}
+
+/// The error for a folder that cannot be made in `parent`, the folder for temporary files.
+pub(crate) fn no_temporary_folder(parent: &Path, error: &io::Error) -> Usage {
+    let parent = parent.display();
+    usage!(
+        "no temporary folder can be made in {parent}: {error}; set TMPDIR to a folder that can be written"
+    )
 }
 
 /// The error for an output that cannot be written.

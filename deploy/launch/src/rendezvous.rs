@@ -12,11 +12,14 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::Context;
+use driml_machine::error::Usage;
 use driml_protocol::lock_file;
 use nix::unistd::{dup2_stdin, geteuid};
 
-use crate::endpoint::{ADDRESS_ENDS, SOCKET_PATH_MAX};
+use crate::{
+    endpoint::{ADDRESS_ENDS, SOCKET_PATH_MAX},
+    output::no_temporary_folder,
+};
 
 const PREFIX: &str = "driml-run-";
 /// The longest path of a socket below the folder for temporary files.
@@ -33,13 +36,10 @@ pub struct Rendezvous {
 }
 
 impl Rendezvous {
-    pub(crate) fn create() -> anyhow::Result<Self> {
+    pub(crate) fn create() -> Result<Self, Usage> {
         let parent = parent_folder(std::env::temp_dir());
         remove_unused(&parent);
-        Self::create_in(&parent).with_context(|| {
-            let parent = parent.display();
-            format!("making a folder for sockets in {parent} (TMPDIR sets another place)")
-        })
+        Self::create_in(&parent).map_err(|e| no_temporary_folder(&parent, &e))
     }
 
     fn create_in(parent: &Path) -> io::Result<Self> {

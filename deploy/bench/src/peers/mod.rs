@@ -12,7 +12,10 @@ use std::{
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_launch::console::{self, align_columns};
+use driml_launch::{
+    console::{self, align_columns},
+    output,
+};
 use driml_machine::{resources::MachineInfo, speed_meter::median, units};
 use serde::Serialize;
 
@@ -78,7 +81,7 @@ pub(super) fn run(
         [] => Component::value_variants().iter().copied().collect(),
         only => only.iter().copied().collect(),
     };
-    let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
+    let folder = output::temporary_folder()?;
     for (path, text) in script::SCRIPTS {
         let name = Path::new(path).file_name().expect("a script has a name");
         let written = fs::write(folder.path().join(name), text);

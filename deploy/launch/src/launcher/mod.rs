@@ -66,9 +66,10 @@ pub fn run(
     });
     let evaluator = Evaluator::new(config, run_dir)?;
     let (names, events) = (process_names(config), config.local.tensorboard);
+    // Before the run folder gets files.
+    let rendezvous = Rendezvous::create()?;
     let recorder = RunRecorder::open(run_dir, config, names.clone(), resumed, events)?;
     let resume_point = resumed.unwrap_or_default();
-    let rendezvous = Rendezvous::create()?;
     let servers = names.iter().take(config.replay.shards as usize);
     let mut endpoints: Vec<_> = servers.map(|name| rendezvous.endpoint(name)).collect();
     if let (Some(listen), None) = (&external.listen, &external.tls_dir) {
