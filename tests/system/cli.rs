@@ -6,7 +6,7 @@ use std::{fs, os::unix::process::CommandExt};
 use driml_tests::{Exit, Process};
 use expect_test::expect_file;
 
-use crate::system;
+use crate::{SHORT, system};
 
 /// Each line of the file that starts with `$` is a call; the expected output stands below it.
 #[test]
@@ -37,6 +37,16 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
     assert_eq!(fs::read_dir(used).unwrap().count(), 1);
     assert_eq!(system.file_names(".").len(), 3);
     assert_eq!(system.running_processes(), []);
+}
+
+#[test]
+fn a_run_without_engine_or_temporary_folder_leaves_no_run_folder() {
+    let system = system();
+    let offline = "env DRIML_OFFLINE=1 DRIML_CACHE=none DRIML local --env procgen:coinrun";
+    system.run(offline).expect_code(1);
+    let run = format!("env TMPDIR=none DRIML local {SHORT}");
+    system.rejects(&run, "set TMPDIR to a folder that can be written");
+    assert_eq!(system.file_names("runs"), [] as [&str; 0]);
 }
 
 #[test]

@@ -142,18 +142,23 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let (lockstep, point) = (args.lockstep, resume_point.unwrap_or_default());
     let plan = plan::describe(&config, &from, &run_dir, lockstep, point, &machine);
     print_wrapped(&plan, plan::INDENT)?;
-    config.world.install(&mut console::eprintln)?;
-    if args.lockstep {
-        lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
-    } else {
+    let parent = args.exit_with_parent;
+    let train = || -> anyhow::Result<()> {
+        config.world.install(&mut console::eprintln)?;
+        if args.lockstep {
+            return lockstep::run(&config, &run_dir, resume_point, parent);
+        }
         let external = launcher::ExternalAccess {
             listen: args.listen,
             tls_dir: args.tls.tls_dir,
             allow_insecure: args.network.allow_insecure,
         };
-        let parent = args.exit_with_parent;
         launcher::run(&config, &run_dir, resume_point, external, parent)
-    }
+    };
+    train().inspect_err(|_| {
+        // Removes only an empty folder: one in which nothing was begun.
+        let _ = fs::remove_dir(run_dir.path());
+    })
 }
 
 /// Checks that this program can start the run: as processes, or in lockstep, which is one process with one replay for all actors.
