@@ -53,9 +53,10 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
     assert_eq!(system.running_processes(), []);
-    let mut hanging = system.start("env HANG_AT=2 DRIML evaluate --run run");
+    let mut hanging = system.start("env HANG_AT=2 DRIML evaluate --run run --record play.gif");
     hanging.wait_for_stderr("sleeping");
     hanging.stop(130);
+    assert!(!system.path("play.gif.tmp").exists());
     system.wait_until_all_have_ended();
 }
 

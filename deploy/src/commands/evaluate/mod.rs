@@ -5,6 +5,7 @@ mod recording;
 mod tile;
 
 use std::{
+    fs,
     ops::ControlFlow,
     path::{Path, PathBuf},
 };
@@ -89,10 +90,16 @@ fn probability(text: &str) -> Result<f64, String> {
 pub(crate) fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(args.exit_with_parent);
     let shutdown = shutdown.context("listening for signals")?;
-    let flag = shutdown.clone();
+    let (flag, film) = (shutdown.clone(), args.film.tmp_path());
     let work = move || evaluate(&args, &flag);
     let ended = shutdown.run_unless_set("evaluation", work, || false);
-    ended.context("starting a thread")?.ok_or(Interrupted)?
+    ended.context("starting a thread")?.unwrap_or_else(|| {
+        // The thread that would remove it still waits for its world.
+        if let Some(film) = film {
+            let _ = fs::remove_file(film);
+        }
+        Err(Interrupted.into())
+    })
 }
 
 fn evaluate(args: &EvaluateArgs, shutdown: &Shutdown) -> anyhow::Result<()> {

@@ -43,6 +43,15 @@ pub(crate) struct RecordArgs {
     pub(crate) record_steps: u32,
 }
 
+impl RecordArgs {
+    /// The path of the unfinished film, if there is to be one.
+    pub(crate) fn tmp_path(&self) -> Option<PathBuf> {
+        let mut path = self.record.clone()?.into_os_string();
+        path.push(".tmp");
+        Some(path.into())
+    }
+}
+
 pub(crate) struct Recording {
     path: PathBuf,
     /// The file of an unfinished film: dropping it removes it. `finish` renames it to `path`, where an older file stays until then.
@@ -74,7 +83,7 @@ impl Recording {
         player: &Player,
         episodes: u32,
     ) -> anyhow::Result<Option<Self>> {
-        let Some(path) = &args.record else {
+        let (Some(path), Some(tmp_path)) = (&args.record, args.tmp_path()) else {
             return Ok(None);
         };
         let played = Player::envs(episodes as usize);
@@ -94,8 +103,6 @@ impl Recording {
         let layout = Layout::new(&player.config, envs, insight.is_some(), local);
         let rate = player.config.world.steps_per_second();
         let begin = || -> io::Result<_> {
-            let mut tmp_path = path.as_os_str().to_owned();
-            tmp_path.push(".tmp");
             let file = BufWriter::new(File::create(&tmp_path)?);
             let tmp_path = TempPath::try_from_path(tmp_path)?;
             Ok((tmp_path, Film::begin(file, layout.size, rate)?))
