@@ -4,8 +4,11 @@
 use std::{fs, path::Path, process::Command};
 
 use driml_tests::{python, skipped_offline, succeeds, wait_until};
+use nix::sys::signal::Signal;
 
-use crate::{lockstep::continues_exactly, repo_rules::root, system};
+use crate::{
+    failures::interrupt_until_it_ends, lockstep::continues_exactly, repo_rules::root, system,
+};
 
 /// The preset `smoke`, and the settings that a world with frames of 12 x 12 needs.
 const SMALL_WORLD: &str =
@@ -58,6 +61,19 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     hanging.stop(130);
     assert!(!system.path("play.gif.tmp").exists());
     system.wait_until_all_have_ended();
+}
+
+/// The interrupted round waits for the world until `world.step_timeout_ms`.
+#[test]
+fn a_run_in_lockstep_whose_world_hangs_says_how_to_exit_at_once() {
+    let system = system();
+    let flags = format!("{SMALL_WORLD} --env '{}'", numbered_world("hang 25"));
+    let mut process = system.start(&format!("local --lockstep {flags} --agent c51"));
+    process.wait_for_stderr("sleeping");
+    process.signal(Signal::SIGINT);
+    process.wait_for_stderr("Ctrl-C again exits at once");
+    let stopped = interrupt_until_it_ends(process).expect_code(1);
+    stopped.expect_stderr("stopped at once by a second interrupt");
 }
 
 #[test]

@@ -41,8 +41,8 @@ pub fn run(
 ) -> anyhow::Result<()> {
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
     let GracefulShutdown { drain, immediate } = shutdown.context("listening for signals")?;
+    watch_interrupts(drain.clone(), immediate)?;
     let is_stopped = || drain.is_set();
-    exit_on_second_interrupt(immediate)?;
     let mut schedule = EvaluationSchedule::new(config, run_dir)?;
     let events = config.local.tensorboard;
     // A state that does not fit the settings is an error before the folder changes.
@@ -135,15 +135,18 @@ pub fn run(
     resume::print_next_steps(&summary, &config.world, run_dir)
 }
 
-fn exit_on_second_interrupt(second: Shutdown) -> anyhow::Result<()> {
-    let exit = move || {
+/// Reports the first interrupt, because the round in progress may wait for a world for long. Exits at the second.
+fn watch_interrupts(first: Shutdown, second: Shutdown) -> anyhow::Result<()> {
+    let watch = move || {
+        first.wait();
+        console::eprintln("stopping after this round (Ctrl-C again exits at once)");
         second.wait();
         let error = "error: stopped at once by a second interrupt: what was not saved is lost";
         console::eprintln(error);
         std::process::exit(1);
     };
     let thread = std::thread::Builder::new().name("end".into());
-    thread.spawn(exit).context("starting a thread")?;
+    thread.spawn(watch).context("starting a thread")?;
     Ok(())
 }
 
