@@ -164,6 +164,16 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     assert!(!saved.is_empty(), "the learner saved");
 }
 
+#[test]
+fn a_replay_server_that_rejects_its_log_is_not_started_again() {
+    let system = system();
+    let process = start_run_with(&system, "--durable --agent c51", 100);
+    fs::write(system.path("run/replay/log.toml"), "no log").unwrap();
+    system.find_process("replay-server").signal(Signal::SIGKILL);
+    let ended = process.fails("error: replay-server exited with code 64 (log: ");
+    assert!(!ended.stderr.contains("(restart 2 of"), "{}", ended.stderr);
+}
+
 /// Processes started by hand continue when the server restarts with the same flags. New actors then get weights, although the learner waits
 /// for transitions and publishes none.
 #[test]

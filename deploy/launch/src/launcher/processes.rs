@@ -7,6 +7,7 @@ use std::{
 };
 
 use anyhow::bail;
+use driml_machine::error::EXIT_USAGE;
 use driml_protocol::{GracefulShutdown, session};
 use driml_settings::config::RunConfig;
 
@@ -177,6 +178,8 @@ impl Launch<'_> {
             }
             let (name, report) = (&self.names[number], process.exit_report());
             let (restarts, max, with_replay) = match role {
+                // A new process would reject its configuration again.
+                _ if status.code() == Some(EXIT_USAGE.into()) => bail!("{report}"),
                 ProcessRole::ReplayServer(_) if self.config.local.durable => {
                     let kept = " with its replay";
                     (&mut self.server_restarts, RESTARTS_MAX, kept)
