@@ -175,7 +175,10 @@ fn procgen_without_the_engine() {
     assert_eq!(&row("chain", "c51", "1")[10], "", "no commit");
 
     // A call can add agents, but cannot change the length.
-    system.run_ok(&format!("{call} --agents c51,cpc --report"));
+    let others = "runs: chain-driml-ada-seed1, chain-driml-ada-seed2, mspacman-driml-ada-seed1, ";
+    system
+        .run_ok(&format!("{call} --agents c51,cpc --report"))
+        .expect_stderr(others);
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     assert!(page.contains("Not finished: chain-cpc-seed1"), "{page}");
     system.run(&format!("{call} --frames 900")).expect_code(64);

@@ -37,7 +37,7 @@ const POLL: Duration = Duration::from_millis(250);
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
 /// Makes all runs, `jobs` at once, in the order of `plans`, and adds their work to the progress. For a report it makes none. Returns the
-/// finished runs in the same order.
+/// finished runs in the same order, and names on the screen those in the folder that no plan has.
 pub(crate) fn run_all<P>(
     session: &mut Session,
     plans: Vec<PointPlan<P>>,
@@ -67,6 +67,12 @@ pub(crate) fn run_all<P>(
     if let Err(e) = queue.run_jobs(progress) {
         queue.stop_all(progress);
         return Err(e);
+    }
+    let others = queue.runs.finished_besides(&plans).join(", ");
+    if !others.is_empty() {
+        progress.line(&format!(
+            "left out, as the flags do not ask for these finished runs: {others}"
+        ));
     }
     let (mut finished, mut missing) = (Vec::new(), Vec::new());
     for (point, plan) in plans {

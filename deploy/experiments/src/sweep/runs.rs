@@ -2,6 +2,7 @@
 //! This module starts no run.
 
 use std::{
+    collections::HashSet,
     fs,
     path::{Path, PathBuf},
 };
@@ -54,6 +55,24 @@ impl Runs {
             summary,
             commit: self.read_commit(plan),
         })
+    }
+
+    /// Returns the names of the finished runs in this folder that none of `plans` has, sorted.
+    pub(super) fn finished_besides<P>(&self, plans: &[PointPlan<P>]) -> Vec<String> {
+        let planned: HashSet<_> = plans.iter().map(|(_, plan)| plan.name.as_str()).collect();
+        let is_other = |name: &str| {
+            let summary = Summary::read(&RunFolder::new(self.root.join(name)));
+            !planned.contains(name) && summary.is_ok_and(|it| it.outcome == Outcome::Finished)
+        };
+        let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
+        let names = entries.filter_map(|entry| {
+            let file = entry.file_name().into_string().ok()?;
+            let name = file.strip_suffix(".call.json")?;
+            is_other(name).then(|| name.to_owned())
+        });
+        let mut names: Vec<_> = names.collect();
+        names.sort();
+        names
     }
 
     /// Checks that the existing runs have the settings that the same calls mean now: presets may have changed since, and defaults depend on
