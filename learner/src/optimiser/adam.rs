@@ -24,7 +24,8 @@ const CHUNK: usize = 1 << 14;
 /// Steps from one flush of subnormal moments to the next. A flush in every step would cost a quarter of the step's time.
 const FLUSH_PERIOD: u64 = 32;
 
-const LR_RANGE: RangeInclusive<f64> = 1e-30..=1e38;
+/// Range of `lr`. Within it, the first step's `lr / (1 - beta1)` is a finite f32 for every `beta1` in its range.
+const LR_RANGE: RangeInclusive<f64> = 1e-30..=1e33;
 /// Range of a moment's decay. Above it, `1 - beta` is off by more than 0.2% in f32.
 const BETA_RANGE: RangeInclusive<f64> = 0.0..=0.99999;
 /// Range of `eps`. Its start is 10,000 times the root of the least second moment that f32 holds.
@@ -55,7 +56,7 @@ pub fn step_floor(parameter: f64, eps: f64) -> f64 {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AdamSettings {
-    /// Learning rate, the change of a parameter per update, from 1e-30 to 1e38.
+    /// Learning rate, the change of a parameter per update, from 1e-30 to 1e33.
     pub lr: f64,
     /// Decay of the first moment per update, in [0, 0.99999].
     pub beta1: f64,
@@ -117,23 +118,17 @@ impl Adam {
     /// Source: PyTorch's `Adam` without weight decay.
     ///
     /// # Errors
-    /// A gradient whose shape or type is not its parameter's; a step size that is not finite, before anything has changed;
-    /// [`UpdateError::Diverged`] for a parameter or moment that is not finite after the step. Only the CPU's fused kernels check that, as
-    /// it costs nothing there; on other devices, [`Parameters::to_safetensors`] rejects such a parameter.
+    /// A gradient whose shape or type is not its parameter's; [`UpdateError::Diverged`] for a parameter or moment that is not finite after
+    /// the step. Only the CPU's fused kernels check that, as it costs nothing there; on other devices, [`Parameters::to_safetensors`]
+    /// rejects such a parameter.
     pub fn step(
         &mut self,
         parameters: &Parameters,
         gradients: &Gradients,
         factor: f64,
     ) -> Result<(), UpdateError> {
-        let step = self.step + 1;
-        let lr = self.settings.lr;
-        let coefficients = StepCoefficients::new(self.settings, step, factor);
-        if !coefficients.step_size.is_finite() {
-            let what = format!("a step of Adam with lr = {lr:e}");
-            return Err(UpdateError::NonFinite(what));
-        }
-        self.step = step;
+        self.step += 1;
+        let coefficients = StepCoefficients::new(self.settings, self.step, factor);
         for (name, moments) in &mut self.moments {
             let (Some(var), Some(gradient)) = (parameters.get(name), gradients.get(name)) else {
                 continue;
@@ -142,7 +137,7 @@ impl Adam {
                 Kernels::Fused(_) => {
                     if !coefficients.apply_in_place(var, gradient, moments)? {
                         let name = name.clone();
-                        let update = self.step;
+                        let (update, lr) = (self.step, self.settings.lr);
                         return Err(UpdateError::Diverged { name, update, lr });
                     }
                 }

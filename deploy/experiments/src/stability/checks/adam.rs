@@ -19,7 +19,7 @@ const GRADIENT_MAX: f32 = 1e15;
 /// The error of a step that follows from the errors of the moments. The square root halves the relative error of the second moment.
 const MOMENTS_ERROR: f64 = moment_error(PRESET.beta1) + moment_error(PRESET.beta2) / 2.0;
 /// The inputs. Errors are shares of a parameter's way, the sum of its step sizes, beyond half of its last place for each step.
-const RANGE: &str = "gradients within 1e15; lr 1e-30 to 1e38, beta 0 to 0.99999, eps 1e-15 to 1e30";
+const RANGE: &str = "gradients within 1e15; lr 1e-30 to 1e33, beta 0 to 0.99999, eps 1e-15 to 1e30";
 const OF_WAY: &str = "a parameter, as a share of its way";
 
 const EQUAL: &str = "up to 120 equal gradients of 0, 1e-45, 1e-38, 1e-19, 1, 1e15; eps 1e-15, 1e-8, 1, 1e30; beta 0, 0.9, 0.99999";
