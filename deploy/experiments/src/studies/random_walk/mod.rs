@@ -242,7 +242,13 @@ fn inverse_gap_panel(results: &Results) -> Panel {
 
 fn convergence_figure(results: &Results) -> Figure {
     let settings = &results.settings;
-    let times = |title: String, measure: UpdatesTo| {
+    let times = |mut title: String, measure: UpdatesTo| {
+        // A training that never comes that far has no point.
+        let never = results.trained.iter().filter(|it| measure(it).is_none());
+        let never = never.count();
+        if never > 0 {
+            title += &format!("; never by {}", count(never, "training"));
+        }
         let at = |chain: &Chain, x_offset: f64| (1.0 + 0.035 * x_offset) / chain.spectral_gap();
         let series = sampling_series(results, at, |one| measure(one).map(|time| time as f64));
         let x = Axis::log("1 / (1 - \u{3bb}\u{2082}) [steps]");
