@@ -19,7 +19,7 @@ pub trait SingleEnv: Send + Sized {
     type State: Serialize + DeserializeOwned;
 
     /// Creates environment number `env` of a world with this seed, at its first frame. The settings must be valid.
-    fn new(config: &Self::Config, seed: u64, env: usize) -> Result<Self, EnvError>;
+    fn new(config: &Self::Config, seed: u64, env: usize) -> Self;
 
     /// Writes the current frame [H, W, C].
     fn render(&self, config: &Self::Config, frame: &mut [u8]);
@@ -50,7 +50,7 @@ impl<E: SingleEnv> SerialWorld<E> {
         check_num_envs(num_envs)?;
         let envs = (0..num_envs).map(|env| E::new(config, seed, env));
         Ok(Self {
-            envs: envs.collect::<Result<_, _>>()?,
+            envs: envs.collect(),
             config: config.clone(),
         })
     }

@@ -71,6 +71,6 @@ pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{BuildResult, Levels, Variants, WorldSettings};
 pub use worlds::chain::{ChainConfig, ChainWorld};
 pub use worlds::exec::{ExecConfig, ExecWorld, probe_command as probe_exec_command};
-pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
+pub use worlds::ising::{Boundary, IsingConfig, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};
 pub use worlds::procgen::{ProcgenConfig, ProcgenWorld, visible_actions};

@@ -90,8 +90,8 @@ impl SingleEnv for Corridor {
     type Config = ChainConfig;
     type State = Self;
 
-    fn new(_: &ChainConfig, _seed: u64, _env: usize) -> Result<Self, EnvError> {
-        Ok(Self::START)
+    fn new(_: &ChainConfig, _seed: u64, _env: usize) -> Self {
+        Self::START
     }
 
     fn render(&self, config: &ChainConfig, frame: &mut [u8]) {

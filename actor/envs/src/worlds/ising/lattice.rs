@@ -10,9 +10,6 @@ use crate::saved;
 /// Neighbours of one site: up, down, left, right.
 const NEIGHBOURS: usize = 4;
 
-/// Longest side of a lattice, in sites; a longer one is rejected.
-const SIDE_MAX: usize = 4096;
-
 /// The neighbours beyond the rim of a lattice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -27,8 +24,7 @@ pub enum Boundary {
 ///
 /// The stationary law of its sweeps is p(s) proportional to exp(-E / T). Sites may be absent (see `masked`); an
 /// absent site has spin 0 and no bonds.
-#[derive(Clone, Debug)]
-pub struct IsingLattice {
+pub(crate) struct IsingLattice {
     /// Spins [H * W], then one absent site, which stands for all sites beyond the rim.
     spins: Vec<i8>,
     neighbours: Vec<[u32; NEIGHBOURS]>,
@@ -39,45 +35,29 @@ pub struct IsingLattice {
 }
 
 impl IsingLattice {
-    /// A lattice of `height` x `width` sites at `temperature` (in units of J / k_B), each spin uniform on {-1, +1}.
-    ///
-    /// # Errors
-    /// A temperature that is not above 0 and at most 5, a side of 0 or above 4096 sites, or a periodic side below 3.
-    pub fn random(
+    /// A lattice of `height` x `width` sites at `temperature` (in units of J / k_B), each spin uniform on {-1, +1}. Worlds check their
+    /// settings before: the temperature by [`check_temperature`], and the sides of a periodic lattice.
+    pub(crate) fn random(
         height: usize,
         width: usize,
         temperature: f64,
         boundary: Boundary,
         rng: &mut impl Rng,
-    ) -> Result<Self, EnvError> {
-        let all = vec![true; height.min(SIDE_MAX) * width.min(SIDE_MAX)];
+    ) -> Self {
+        let all = vec![true; height * width];
         Self::masked(height, width, &all, temperature, boundary, rng)
     }
 
-    /// As `random`, but only the sites with `present` [H * W] = true exist.
-    ///
-    /// # Errors
-    /// As `random`; also a mask of the wrong length or without a single site.
-    pub fn masked(
+    /// As `random`, but only the sites with `present` [H * W] = true exist, at least one.
+    pub(crate) fn masked(
         height: usize,
         width: usize,
         present: &[bool],
         temperature: f64,
         boundary: Boundary,
         rng: &mut impl Rng,
-    ) -> Result<Self, EnvError> {
-        check_temperature(temperature)?;
-        let side_min = if boundary == Boundary::Periodic { 3 } else { 1 };
-        let mut sides = [height, width].into_iter();
-        let why = format!(
-            "an Ising lattice with {boundary:?} boundary needs sides of {side_min} to {SIDE_MAX} sites, got {height} x {width}"
-        );
-        require(sides.all(|side| (side_min..=SIDE_MAX).contains(&side)), why)?;
-        let (expected, found) = (height * width, present.len());
-        let why = format!(
-            "the mask of a {height} x {width} Ising lattice needs {expected} entries and at least one site, got {found} entries"
-        );
-        require(found == expected && present.contains(&true), why)?;
+    ) -> Self {
+        assert_eq!(present.len(), height * width, "present must be [H * W]");
         let sites_of = |colour: usize| {
             (0..height * width)
                 .filter(move |i| present[*i] && (i / width + i % width) % 2 == colour)
@@ -92,11 +72,11 @@ impl IsingLattice {
             accept_below: accept_below(temperature),
         };
         lattice.randomise(rng);
-        Ok(lattice)
+        lattice
     }
 
     /// Draws every spin afresh, uniform on {-1, +1}.
-    pub fn randomise(&mut self, rng: &mut impl Rng) {
+    pub(crate) fn randomise(&mut self, rng: &mut impl Rng) {
         for chunk in self.sites.chunks(64) {
             let bits: u64 = rng.random();
             for (bit, &site) in chunk.iter().enumerate() {
@@ -109,7 +89,7 @@ impl IsingLattice {
     ///
     /// # Errors
     /// Spins that are not -1 or +1 exactly where there is a site, and 0 elsewhere.
-    pub fn set_spins(&mut self, spins: &[i8]) -> Result<(), EnvError> {
+    pub(crate) fn set_spins(&mut self, spins: &[i8]) -> Result<(), EnvError> {
         let current = &mut self.spins[..self.neighbours.len()];
         // 1 where there is a site, else 0.
         let mask = |spin: &i8| spin.unsigned_abs();
@@ -125,7 +105,7 @@ impl IsingLattice {
     /// the spins: at T = 0.4 an inner site's smallest rise, 4, is taken with probability exp(-10). The last proposal is
     /// there because the others alone can be trapped: on a 3 x 3 periodic lattice 8 of the 512 states are never left or
     /// entered without it.
-    pub fn sweep(&mut self, rng: &mut impl Rng) {
+    pub(crate) fn sweep(&mut self, rng: &mut impl Rng) {
         for index in 0..self.sites.len() {
             self.propose(self.sites[index], rng);
         }
@@ -134,7 +114,7 @@ impl IsingLattice {
     }
 
     /// Spins [H, W] in row order; 0 where there is no site.
-    pub fn spins(&self) -> &[i8] {
+    pub(crate) fn spins(&self) -> &[i8] {
         &self.spins[..self.neighbours.len()]
     }
 

@@ -57,7 +57,7 @@ fn assert_mean(samples: &[f64], exact: f64, what: &str) {
 
 fn assert_samples_law(height: usize, width: usize, temperature: f64, boundary: Boundary) {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut lattice = IsingLattice::random(height, width, temperature, boundary, &mut rng).unwrap();
+    let mut lattice = IsingLattice::random(height, width, temperature, boundary, &mut rng);
     let (p, mean_energy, mean_m) = enumerate(height, width, temperature, boundary);
     let samples = 60_000;
     let (mut counts, mut energies, mut ms) = (vec![0u32; p.len()], vec![], vec![]);
@@ -116,8 +116,7 @@ fn near_temperature_0_no_sweep_raises_the_energy() {
     let mut rng = ChaCha8Rng::seed_from_u64(6);
     for (temperature, side) in [(1e-300, 3), (1e-9, 7), (0.02, 64)] {
         for boundary in [Boundary::Free, Boundary::Periodic] {
-            let mut lattice =
-                IsingLattice::random(side, side, temperature, boundary, &mut rng).unwrap();
+            let mut lattice = IsingLattice::random(side, side, temperature, boundary, &mut rng);
             for _ in 0..100 {
                 let before = lattice.energy();
                 lattice.sweep(&mut rng);
@@ -132,7 +131,7 @@ fn absent_sites_stay_absent_and_have_no_bonds() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     // Two columns apart: 2 bonds in each, none between them.
     let present = [true, false, true].repeat(3);
-    let mut lattice = IsingLattice::masked(3, 3, &present, 0.1, Boundary::Free, &mut rng).unwrap();
+    let mut lattice = IsingLattice::masked(3, 3, &present, 0.1, Boundary::Free, &mut rng);
     for _ in 0..1_000 {
         lattice.sweep(&mut rng);
         let mut spins = lattice.spins().iter().zip(&present);
@@ -148,24 +147,11 @@ fn absent_sites_stay_absent_and_have_no_bonds() {
     }
 }
 
-#[test]
-fn unusable_settings_are_errors() {
-    let mut rng = ChaCha8Rng::seed_from_u64(5);
-    for temperature in [0.0, -1.0, 5.1, 100.0, 1e300, f64::NAN, f64::INFINITY] {
-        assert!(IsingLattice::random(3, 3, temperature, Boundary::Free, &mut rng).is_err());
-    }
-    assert!(IsingLattice::random(0, 3, 1.0, Boundary::Free, &mut rng).is_err());
-    assert!(IsingLattice::random(2, 3, 1.0, Boundary::Periodic, &mut rng).is_err());
-    assert!(IsingLattice::random(usize::MAX, usize::MAX, 1.0, Boundary::Free, &mut rng).is_err());
-    assert!(IsingLattice::masked(3, 3, &[true; 4], 1.0, Boundary::Free, &mut rng).is_err());
-    assert!(IsingLattice::masked(3, 3, &[false; 9], 1.0, Boundary::Free, &mut rng).is_err());
-}
-
 /// Mean of s(now) s(earlier) over the sites of a large lattice, for states one and two sweeps apart.
 fn mean_overlaps(temperature: f64) -> [f64; 2] {
     let rng = &mut ChaCha8Rng::seed_from_u64(9);
     let periodic = Boundary::Periodic;
-    let mut lattice = IsingLattice::random(64, 64, temperature, periodic, rng).unwrap();
+    let mut lattice = IsingLattice::random(64, 64, temperature, periodic, rng);
     let mut states: Vec<Vec<i8>> = Vec::new();
     for _ in 0..120 {
         lattice.sweep(rng);

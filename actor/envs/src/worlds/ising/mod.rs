@@ -6,8 +6,8 @@ mod lattice;
 mod lattice_tests;
 mod world;
 
-pub use lattice::{Boundary, IsingLattice};
-pub(crate) use lattice::{check_temperature, neighbours_of};
+pub use lattice::Boundary;
+pub(crate) use lattice::{IsingLattice, check_temperature, neighbours_of};
 #[cfg(test)]
 pub(crate) use world::tests;
 pub use world::{IsingConfig, IsingWorld};

@@ -98,11 +98,11 @@ impl SingleEnv for SpinField {
     /// The state and the patch's spins.
     type State = (FieldState, Vec<i8>);
 
-    fn new(config: &IsingConfig, seed: u64, env: usize) -> Result<Self, EnvError> {
+    fn new(config: &IsingConfig, seed: u64, env: usize) -> Self {
         let mut rng = env_rng(seed, env, RngUse::Game);
         let (side, temperature, boundary) =
             (config.patch_size, config.temperature, config.boundary);
-        let patch = IsingLattice::random(side, side, temperature, boundary, &mut rng)?;
+        let patch = IsingLattice::random(side, side, temperature, boundary, &mut rng);
         let state = FieldState {
             rng,
             origin: (0, 0),
@@ -111,7 +111,7 @@ impl SingleEnv for SpinField {
         };
         let mut field = Self { state, patch };
         field.reset(config);
-        Ok(field)
+        field
     }
 
     fn render(&self, _: &IsingConfig, frame: &mut [u8]) {

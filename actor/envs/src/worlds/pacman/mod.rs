@@ -71,18 +71,18 @@ impl SingleEnv for Board {
     /// A game; and, if walls flicker, the spins in its walls with their generator.
     type State = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
 
-    fn new(config: &PacmanConfig, seed: u64, env: usize) -> Result<Self, EnvError> {
+    fn new(config: &PacmanConfig, seed: u64, env: usize) -> Self {
         let mut wall_spins = None;
         if let Some(overlay) = &config.ising {
             let (sites, temperature, free) = (MAZE.walls(), overlay.temperature, Boundary::Free);
             let mut rng = env_rng(seed, env, RngUse::Overlay);
             let mut lattice =
-                IsingLattice::masked(HEIGHT, WIDTH, &sites, temperature, free, &mut rng)?;
+                IsingLattice::masked(HEIGHT, WIDTH, &sites, temperature, free, &mut rng);
             lattice.randomise(&mut rng);
             wall_spins = Some((lattice, rng));
         }
         let game = Game::start(config, env_rng(seed, env, RngUse::Game), 0);
-        Ok(Self { game, wall_spins })
+        Self { game, wall_spins }
     }
 
     fn render(&self, _: &PacmanConfig, frame: &mut [u8]) {
