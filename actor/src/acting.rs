@@ -46,14 +46,10 @@ pub struct ActingState {
 
 impl ActingLoop {
     /// Starts `world` with stacks of `frame_stack` frames; `rng` is for exploration alone.
-    pub fn new(
-        world: Box<dyn Environment>,
-        frame_stack: usize,
-        rng: ChaCha8Rng,
-    ) -> Result<Self, EnvError> {
+    pub fn new(world: Box<dyn Environment>, frame_stack: usize, rng: ChaCha8Rng) -> Self {
         let (envs, shape) = (world.num_envs(), world.frame_shape());
-        Ok(Self {
-            stack: FrameStack::new(shape, frame_stack, envs)?,
+        Self {
+            stack: FrameStack::new(shape, frame_stack, envs),
             rng,
             frames: vec![0; envs * shape.bytes()],
             actions: vec![0; envs],
@@ -61,7 +57,7 @@ impl ActingLoop {
             ends: vec![StepEnd::Running; envs],
             first: vec![true; envs],
             world,
-        })
+        }
     }
 
     /// Steps every environment once with an action from `policy`. After an error the world must not be stepped again.

@@ -108,7 +108,7 @@ impl Collector {
         let enlarge = settings.input.resizer(sent_size, &settings.model)?;
         let policy = NetworkPolicy::new(&settings.model, enlarge, safetensors, config.precision)?;
         Ok(Self {
-            acting: ActingLoop::new(world, spec.frame_stack as usize, rng)?,
+            acting: ActingLoop::new(world, spec.frame_stack as usize, rng),
             recorder: ChunkRecorder::new(pool, actor, id, config.envs, spec.frame_bytes() as u32),
             policy: policy.with_noise(),
             weights_version,

@@ -46,7 +46,7 @@ pub fn episode_returns(
     let (episodes, steps_max) = (evaluation.episodes, evaluation.steps_max);
     let envs = world.num_envs();
     let quota = |env: usize| episodes / envs + usize::from(env < episodes % envs);
-    let mut acting = ActingLoop::new(world, evaluation.frame_stack, rng)?;
+    let mut acting = ActingLoop::new(world, evaluation.frame_stack, rng);
     let mut episode_return = vec![0.0; envs];
     let mut episodes_ended = vec![0; envs];
     let mut returns = Vec::with_capacity(episodes);

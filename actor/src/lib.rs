@@ -13,7 +13,7 @@
 //! let chain = WorldConfig::Chain(ChainConfig {
 //!     cells: 8, height: 1, width: 8, step_limit: 30, reward_left: 0.1, reward_right: 1.0,
 //! });
-//! let mut acting = ActingLoop::new(chain.build(2, 7, 0)?, 1, ChaCha8Rng::seed_from_u64(1))?;
+//! let mut acting = ActingLoop::new(chain.build(2, 7, 0)?, 1, ChaCha8Rng::seed_from_u64(1));
 //! // Chunks of actor 7's incarnation 1, from two environments with frames of eight bytes.
 //! let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 1, 2, 8);
 //! recorder.begin_chunk(0, 3);

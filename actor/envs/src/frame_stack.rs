@@ -2,11 +2,8 @@
 //! It keeps no history beyond the stack, and it does not enlarge or convert pixels.
 
 use crate::environment::FrameShape;
-use crate::error::{EnvError, require};
+use crate::error::EnvError;
 use crate::saved;
-
-/// The most frames in a stack; more are rejected.
-const STACK_MAX: usize = 64;
 
 /// For each of N environments the newest `stack` frames, [N, H, W, C * stack].
 ///
@@ -20,19 +17,15 @@ pub struct FrameStack {
 }
 
 impl FrameStack {
-    /// An empty (all 0) stack of `stack` frames of `shape` for `num_envs` environments; the first push of an environment must be `first`.
-    ///
-    /// # Errors
-    /// A stack of 0 or above 64 frames.
-    pub fn new(shape: FrameShape, stack: usize, num_envs: usize) -> Result<Self, EnvError> {
-        let why = format!("a frame stack holds 1 to {STACK_MAX} frames, got {stack}");
-        require((1..=STACK_MAX).contains(&stack), why)?;
-        Ok(Self {
+    /// An empty (all 0) stack of `stack` frames of `shape`, at least one, for `num_envs` environments; the first push of an environment
+    /// must be `first`.
+    pub fn new(shape: FrameShape, stack: usize, num_envs: usize) -> Self {
+        Self {
             shape,
             stack,
             num_envs,
             stacked: vec![0; shape.bytes() * stack * num_envs],
-        })
+        }
     }
 
     /// Adds the current `frames` [N, H, W, C]; `first` [N] says which are the first of an episode or level.
@@ -117,7 +110,7 @@ mod tests {
             use rand::{Rng, SeedableRng};
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
             let shape = FrameShape::new(height, width, channels);
-            let mut frames = FrameStack::new(shape, stack, num_envs).unwrap();
+            let mut frames = FrameStack::new(shape, stack, num_envs);
             let mut history = vec![];
             for t in 0..steps {
                 let frame: Vec<u8> = (0..shape.bytes() * num_envs).map(|_| rng.random()).collect();
@@ -129,12 +122,5 @@ mod tests {
                 prop_assert_eq!(frames.stacked(), &expected[..]);
             }
         }
-    }
-
-    #[test]
-    fn a_stack_of_none_is_an_error() {
-        let shape = FrameShape::new(1, 1, 1);
-        assert!(FrameStack::new(shape, 0, 1).is_err());
-        assert!(FrameStack::new(shape, 65, 1).is_err());
     }
 }

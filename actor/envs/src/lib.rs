@@ -30,7 +30,7 @@
 //! });
 //! let num_envs = 2;
 //! let mut world = config.build(num_envs, 7, 1)?;
-//! let mut stack = FrameStack::new(world.frame_shape(), 4, num_envs)?;
+//! let mut stack = FrameStack::new(world.frame_shape(), 4, num_envs);
 //! let mut frames = vec![0; num_envs * world.frame_shape().bytes()];
 //! let (mut rewards, mut ends) = (vec![0.0; num_envs], vec![StepEnd::Running; num_envs]);
 //! let mut first = vec![true; num_envs];

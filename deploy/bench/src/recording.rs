@@ -70,7 +70,7 @@ impl Recording {
         let world = RestrictedWorld::wrap(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut policy = RandomPolicy::new(world.num_actions() as u8);
-        let mut acting = ActingLoop::new(world, 1, ChaCha8Rng::seed_from_u64(1))?;
+        let mut acting = ActingLoop::new(world, 1, ChaCha8Rng::seed_from_u64(1));
         let mut steps = Vec::with_capacity(STEPS);
         for _ in 0..STEPS {
             let step = acting.step(&mut policy, 0.0)?;
