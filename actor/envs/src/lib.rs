@@ -19,7 +19,7 @@
 //!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
 //! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`],
-//! and the world itself, which implements [`Environment`] (or, if its environments are stepped one by one, `SingleEnv` for one of them);
+//! and the world itself, which implements [`Environment`] (or, if its environments are stepped one by one, [`SingleEnv`] for one of them);
 //! then give it a line in `registry.rs`.
 //!
 //! ```
@@ -62,6 +62,7 @@ mod settings;
 mod worlds;
 
 pub use environment::{Environment, FrameShape, StepEnd, StepResult};
+pub use envs::{SerialWorld, SingleEnv};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};

@@ -1,11 +1,11 @@
 //! A custom world: an island with a treasure on it, at another place in each episode.
 
 use driml_envs::{
-    BuildResult, EnvError, Environment, FrameShape, StepEnd, StepResult, WorldSettings,
+    BuildResult, EnvError, FrameShape, SerialWorld, SingleEnv, StepEnd, WorldSettings,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// What each action adds to row and column.
 const MOVES: [(isize, isize); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
@@ -41,16 +41,12 @@ impl WorldSettings for IslandConfig {
     }
 
     fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> BuildResult {
-        self.validate()?;
-        let islands = (0..num_envs).map(|env| Island::new(seed, env, self.side));
-        Ok(Box::new(Islands {
-            config: self.clone(),
-            islands: islands.collect(),
-        }))
+        Ok(Box::new(SerialWorld::<Island>::new(self, num_envs, seed)?))
     }
 }
 
-/// One island: where its agent and its treasure are.
+/// One island: where its agent and its treasure are. The saved state is this struct.
+#[derive(Clone, Serialize, Deserialize)]
 struct Island {
     rng: ChaCha8Rng,
     agent: (usize, usize),
@@ -59,20 +55,6 @@ struct Island {
 }
 
 impl Island {
-    /// Makes the island number `env`. It depends on the seed and this number alone, whatever the other islands are.
-    fn new(seed: u64, env: usize, side: usize) -> Self {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(env as u64);
-        let mut island = Self {
-            rng,
-            agent: (0, 0),
-            treasure: (0, 0),
-            steps: 0,
-        };
-        island.begin_episode(side);
-        island
-    }
-
     fn begin_episode(&mut self, side: usize) {
         let mut random_place = || {
             let (row, column) = (0..side, 0..side);
@@ -86,61 +68,63 @@ impl Island {
     }
 }
 
-struct Islands {
-    config: IslandConfig,
-    islands: Vec<Island>,
-}
+impl SingleEnv for Island {
+    type Config = IslandConfig;
+    type State = Self;
 
-impl Environment for Islands {
-    fn frame_shape(&self) -> FrameShape {
-        self.config.frame_shape()
+    /// Makes the island number `env`. It depends on the seed and this number alone, whatever the other islands are.
+    fn new(config: &IslandConfig, seed: u64, env: usize) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(env as u64);
+        let mut island = Self {
+            rng,
+            agent: (0, 0),
+            treasure: (0, 0),
+            steps: 0,
+        };
+        island.begin_episode(config.side);
+        island
     }
 
-    fn num_actions(&self) -> usize {
-        MOVES.len()
-    }
-
-    fn num_envs(&self) -> usize {
-        self.islands.len()
-    }
-
-    fn observe(&mut self, frames: &mut [u8]) {
-        frames.fill(0);
-        let side = self.config.side;
-        for (frame, island) in frames.chunks_exact_mut(side * side).zip(&self.islands) {
-            for ((row, column), shade) in [(island.treasure, 128), (island.agent, 255)] {
-                frame[row * side + column] = shade;
-            }
+    fn render(&self, config: &IslandConfig, frame: &mut [u8]) {
+        frame.fill(0);
+        for ((row, column), shade) in [(self.treasure, 128), (self.agent, 255)] {
+            frame[row * config.side + column] = shade;
         }
     }
 
-    fn step(&mut self, actions: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> StepResult {
-        let config = &self.config;
+    fn act(&mut self, config: &IslandConfig, action: u8) -> (f32, StepEnd) {
+        let (down, right) = MOVES[usize::from(action)];
+        let (row, column) = self.agent;
         let last = config.side - 1;
-        for (env, (island, &action)) in self.islands.iter_mut().zip(actions).enumerate() {
-            let Some((down, right)) = MOVES.get(usize::from(action)) else {
-                return Err(EnvError::Step(format!(
-                    "action {action} of environment {env} is out of range: this world has {} actions",
-                    MOVES.len()
-                )));
-            };
-            let (row, column) = island.agent;
-            island.agent = (
-                row.saturating_add_signed(*down).min(last),
-                column.saturating_add_signed(*right).min(last),
-            );
-            island.steps += 1;
-            (rewards[env], ends[env]) = if island.agent == island.treasure {
-                (config.reward, StepEnd::Terminal)
-            } else if island.steps >= config.step_limit {
-                (0.0, StepEnd::TimedOut)
-            } else {
-                (0.0, StepEnd::Running)
-            };
-            if ends[env] != StepEnd::Running {
-                island.begin_episode(config.side);
-            }
+        self.agent = (
+            row.saturating_add_signed(down).min(last),
+            column.saturating_add_signed(right).min(last),
+        );
+        self.steps += 1;
+        let (reward, end) = if self.agent == self.treasure {
+            (config.reward, StepEnd::Terminal)
+        } else if self.steps >= config.step_limit {
+            (0.0, StepEnd::TimedOut)
+        } else {
+            (0.0, StepEnd::Running)
+        };
+        if end != StepEnd::Running {
+            self.begin_episode(config.side);
         }
+        (reward, end)
+    }
+
+    fn state(&self) -> Self {
+        self.clone()
+    }
+
+    fn restore(&mut self, config: &IslandConfig, state: Self) -> Result<(), EnvError> {
+        let is_outside = |(row, column): (usize, usize)| row.max(column) >= config.side;
+        if is_outside(state.agent) || is_outside(state.treasure) {
+            return Err(EnvError::State("a place beyond the island".into()));
+        }
+        *self = state;
         Ok(())
     }
 }
