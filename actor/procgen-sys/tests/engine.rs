@@ -1,10 +1,12 @@
 //! Checks what the real engine does, call by call: the facts on which `driml-envs` builds its worlds.
-//! The engine is fetched into the cache folder once; with `DRIML_OFFLINE=1` every test here is skipped.
+//! The engine is fetched into the cache folder once; with `DRIML_OFFLINE=1` every test that needs it is skipped.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use std::{io::Write, sync::OnceLock};
 
-use procgen_sys::{DistributionMode, Engine, Game, NUM_ACTIONS, Options, State, VecGame};
+use procgen_sys::{
+    DistributionMode, Engine, Game, NUM_ACTIONS, NUM_ENVS_MAX, Options, State, VecGame,
+};
 
 /// The installed engine, or a line that says the test was skipped.
 fn engine() -> Option<&'static Engine> {
@@ -45,6 +47,29 @@ fn actions(t: usize, num_envs: usize) -> Vec<i32> {
     (0..num_envs)
         .map(|env| (draw(env) % NUM_ACTIONS as u64) as i32)
         .collect()
+}
+
+#[test]
+fn what_would_end_the_process_is_rejected_with_the_value() {
+    options(Game::Coinrun).validate().unwrap();
+    let rejected = |change: fn(&mut Options), text: &str| {
+        let mut options = options(Game::Coinrun);
+        change(&mut options);
+        let error = options.validate().unwrap_err().to_string();
+        assert!(error.contains(text), "{error}");
+    };
+    rejected(|o| o.num_envs = 0, "0 environments");
+    rejected(|o| o.num_envs = NUM_ENVS_MAX + 1, "4097 environments");
+    rejected(|o| o.num_threads = 1000, "1000 threads");
+    rejected(|o| o.num_levels = -1, "num_levels = -1");
+    rejected(|o| o.start_level = -1, "start_level = -1");
+    rejected(|o| o.start_level = i32::MAX, "past the last level");
+    rejected(|o| (o.num_levels, o.start_level) = (0, 7), "no effect");
+    let extreme = "coinrun has no distribution mode \"extreme\"; easy and hard work, and these games have that one: \
+        chaser, dodgeball, leaper, starpilot";
+    rejected(|o| o.distribution_mode = DistributionMode::Extreme, extreme);
+    let memory = "caveflyer, dodgeball, heist, jumper, maze, miner";
+    rejected(|o| o.distribution_mode = DistributionMode::Memory, memory);
 }
 
 #[test]
