@@ -175,51 +175,26 @@ mod tests {
 
     use super::*;
 
-    fn listening(endpoint: &str, tls: bool, allow_insecure: bool) -> Result<(), String> {
-        check_listen_endpoints(&[endpoint.into()], tls, allow_insecure).map_err(|e| e.to_string())
-    }
-
-    /// Each case is an endpoint to connect to, whether certificates are used, and a part of the error; empty for a valid endpoint.
+    /// Each case is an endpoint to listen on, whether certificates are used, and whether insecure endpoints are allowed. The program's
+    /// tests have the endpoints that are rejected.
     #[test]
-    fn endpoints_that_zenoh_cannot_open_are_refused() {
-        let none = "not an endpoint";
-        let quic = "with --tls-dir it is quic/host:1";
-        let too_long = "107 bytes, and this one has 108: choose a shorter one";
-        let socket = |bytes: usize| format!("unixsock-stream//{}", "x".repeat(bytes - 1));
-        let [short, long] = [107, 108].map(socket);
-        for (endpoint, tls, said) in [
-            ("tcp/127.0.0.1:7447", false, ""),
-            ("tcp/[::1]:7447", false, ""),
-            ("unixsock-stream//tmp/driml.sock", false, ""),
-            (&*short, false, ""),
-            (&*long, false, too_long),
-            ("quic/host:1", true, ""),
-            ("unixsock-stream//tmp/s", true, ""),
-            ("", false, none),
-            ("localhost:7447", false, none),
-            ("tcp/localhost", false, none),
-            ("tcp/:1", false, none),
-            ("tcp/127.0.0.1:0", false, none),
-            ("tcp/127.0.0.1:7447#so_sndbuf=1", false, none),
-            ("tcp/127.0.0.1:70000", false, none),
-            ("udp/1.2.3.4:5", false, none),
-            ("unixsock-stream/", false, none),
-            ("unixsock-stream//tmp/a#b", false, none),
-            ("unixsock-stream//tmp/a?b", false, none),
-            ("quic/host:1#enable_mtls=false", true, none),
-            ("quic/host:1", false, "add --tls-dir DIR"),
-            ("quic/[::1]:1", true, "connect by a name"),
-            ("tcp/host:1", true, "it is quic/host:1"),
-            ("tls/host:1", false, quic),
-            ("tls/host:1", true, quic),
-            ("tls/host:1", true, "issues/2557"),
+    fn endpoints_that_zenoh_can_open_and_that_are_guarded_are_taken() {
+        let longest = format!("unixsock-stream//{}", "x".repeat(106));
+        for (endpoint, tls, allow_insecure) in [
+            (&*longest, false, false),
+            ("unixsock-stream//tmp/driml.sock", true, false),
+            ("tcp/127.0.0.1:7447", false, false),
+            ("tcp/127.9.9.9:1", false, false),
+            ("tcp/[::1]:7447", false, false),
+            ("tcp/localhost:1", false, false),
+            ("tcp/0.0.0.0:7447", false, true),
+            ("quic/[::]:1", true, false),
+            ("quic/192.0.2.1:1", true, false),
         ] {
-            let checked = check_connect_endpoints(&[endpoint.into()], tls);
-            let found = checked.map_or_else(|e| e.to_string(), |()| String::new());
-            let fits = found.is_empty() == said.is_empty() && found.contains(said);
-            assert!(fits, "{endpoint}: {found}");
+            let checked = check_listen_endpoints(&[endpoint.into()], tls, allow_insecure);
+            assert!(checked.is_ok(), "{endpoint}: {checked:?}");
         }
-        assert_eq!(listening("quic/[::]:1", true, false), Ok(()));
+        assert!(check_connect_endpoints(&["quic/host:1".into()], true).is_ok());
     }
 
     #[test]
@@ -242,33 +217,5 @@ mod tests {
         }
         drop((tcp, udp, socket));
         assert!(check_unused(&endpoints).is_ok());
-        fs::remove_file(&path).unwrap();
-        fs::write(&path, "a thesis").unwrap();
-        let said = check_unused(&endpoints).unwrap_err().0;
-        assert!(said.contains("that path is not a socket"), "{said}");
-    }
-
-    #[test]
-    fn what_other_machines_reach_is_guarded() {
-        for closed in [
-            "tcp/127.0.0.1:1",
-            "tcp/127.9.9.9:1",
-            "tcp/[::1]:1",
-            "tcp/localhost:1",
-            "unixsock-stream//tmp/s",
-        ] {
-            assert_eq!(listening(closed, false, false), Ok(()), "{closed}");
-        }
-        for open in ["tcp/0.0.0.0:7447", "tcp/[::]:1", "tcp/192.0.2.1:1"] {
-            let said = listening(open, false, false).unwrap_err();
-            let words = [
-                "--tls-dir DIR",
-                "--allow-insecure",
-                "change and stop the run",
-            ];
-            assert!(words.iter().all(|it| said.contains(it)), "{said}");
-            assert_eq!(listening(open, false, true), Ok(()), "{open}");
-            assert_eq!(listening(&open.replace("tcp", "quic"), true, false), Ok(()));
-        }
     }
 }

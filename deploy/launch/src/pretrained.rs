@@ -127,12 +127,6 @@ mod tests {
             let player = load_bytes(game, bytes).unwrap();
             assert_eq!(player.config.run.world, format!("procgen:{game}"));
         }
-        let said = load(Path::new("pretrained:bigfsh")).map(drop).unwrap_err();
-        assert_eq!(
-            said.to_string(),
-            "no pretrained weights of \"bigfsh\" (did you mean \"bigfish\"?); there are pretrained:bigfish, pretrained:coinrun, \
-             pretrained:fruitbot, pretrained:starpilot"
-        );
     }
 
     #[test]

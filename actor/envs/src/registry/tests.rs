@@ -18,42 +18,6 @@ fn names_go_there_and_back() {
 }
 
 #[test]
-fn a_wrong_name_is_answered_with_the_nearest_and_the_list() {
-    let wrong = |text: &str, words: &[&str]| fails(text.parse::<WorldName>(), words);
-    for (text, meant) in [
-        ("MsPacman", "mspacman"),
-        ("ms-pacman", "mspacman"),
-        ("pacman", "mspacman"),
-        ("coinrun", "procgen:coinrun"),
-        ("procgen:starpillot", "procgen:starpilot"),
-        ("izing", "ising"),
-        ("chian", "chain"),
-    ] {
-        wrong(text, &[&format!("did you mean \"{meant}\"?")]);
-    }
-    let list = "procgen:GAME, mspacman, ising, chain, exec:COMMAND, libenv:PATH:GAME";
-    for text in ["montezuma_revenge", &"x".repeat(10_000), "pong"] {
-        assert!(!wrong(text, &[list]).contains("did you mean"), "{text}");
-    }
-}
-
-#[test]
-fn a_world_of_gymnasium_is_reached_by_exec() {
-    let wrong = |text: &str, words: &[&str]| fails(text.parse::<WorldName>(), words);
-    for (text, flags) in [
-        ("ALE/Pong-v5", "--atari"),
-        ("CartPole-v1", "--pixels --size 64 --grey"),
-        ("my/world", "--pixels --size 64 --grey"),
-    ] {
-        let command = format!("\"exec:python3 deploy/python/driml_env.py {text} {flags}\"");
-        wrong(text, &[&command]);
-    }
-    for text in ["pong", "pong-v", "pong-vX", "libenv:/a.so:pong"] {
-        assert!(!wrong(text, &[]).contains("Gymnasium"), "{text}");
-    }
-}
-
-#[test]
 fn names_may_hold_a_person_s_own_code() {
     let command = "python3 my world.py --at 'a:b'";
     let name: WorldName = format!("exec:{command}").parse().unwrap();

@@ -101,11 +101,3 @@ fn every_layer_says_what_it_is_for_and_names_worlds_that_exist() {
         }
     }
 }
-
-#[test]
-fn worlds_go_by_their_games_name_too() {
-    assert_eq!(world("bigfish").unwrap(), world("procgen:bigfish").unwrap());
-    assert!(world("mspacman").is_ok());
-    let said = world("bigfihs").unwrap_err().to_string();
-    assert!(said.contains("did you mean"), "{said}");
-}
