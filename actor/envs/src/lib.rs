@@ -69,7 +69,7 @@ pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
 pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
 pub use registry::{WorldConfig, WorldName};
 pub use restricted::{ActionSet, RestrictedWorld};
-pub use settings::{BuildResult, Levels, Variants, WorldSettings};
+pub use settings::{BuildResult, Variants, WorldSettings};
 pub use worlds::chain::{ChainConfig, ChainWorld};
 pub use worlds::exec::{ExecConfig, ExecWorld, probe_command as probe_exec_command};
 pub use worlds::ising::{Boundary, IsingConfig, IsingWorld};

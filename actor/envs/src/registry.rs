@@ -15,7 +15,7 @@ use toml::Table;
 use crate::error::{EnvError, require};
 use crate::plugin::{self, CustomWorld};
 use crate::restricted::ActionSet;
-use crate::settings::{Levels, Variants, WorldSettings};
+use crate::settings::{Variants, WorldSettings};
 use crate::worlds::chain::ChainConfig;
 use crate::worlds::exec::ExecConfig;
 use crate::worlds::ising::IsingConfig;
@@ -123,17 +123,16 @@ impl WorldConfig {
         actions
     }
 
-    /// Returns the same world with other levels.
+    /// Returns the same world with one level per episode: a level of training, or one that training has not seen.
     ///
     /// # Errors
     /// The world has no levels, or no unseen ones; the message says what to use instead.
-    pub fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
+    pub fn with_single_levels(&self, unseen: bool) -> Result<Self, EnvError> {
         match self {
-            Self::Procgen(config) => config.with_levels(levels).map(Self::Procgen),
+            Self::Procgen(config) => config.with_single_levels(unseen).map(Self::Procgen),
             _ => {
                 let why = "this run's world has no levels: use --levels train";
-                require(levels == Levels::Train, why)?;
-                Ok(self.clone())
+                Err(EnvError::Config(why.into()))
             }
         }
     }

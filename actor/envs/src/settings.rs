@@ -6,17 +6,6 @@ use std::time::Duration;
 use crate::environment::{Environment, FrameShape};
 use crate::error::EnvError;
 
-/// The levels on which a trained policy is evaluated.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Levels {
-    /// As in training.
-    Train,
-    /// The levels of training, with one level per episode.
-    TrainSingle,
-    /// Levels that training has not seen, with one level per episode.
-    Unseen,
-}
-
 /// The result of [`WorldSettings::build`].
 pub type BuildResult = Result<Box<dyn Environment>, EnvError>;
 

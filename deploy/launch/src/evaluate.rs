@@ -237,12 +237,12 @@ fn policy_rng(seed: u64) -> ChaCha8Rng {
 
 /// The world with the given levels.
 pub fn world_with_levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
-    let levels = match levels {
-        Levels::Train => driml_envs::Levels::Train,
-        Levels::TrainSingle => driml_envs::Levels::TrainSingle,
-        Levels::Unseen => driml_envs::Levels::Unseen,
+    let changed = match levels {
+        Levels::Train => Ok(world.clone()),
+        Levels::TrainSingle => world.with_single_levels(false),
+        Levels::Unseen => world.with_single_levels(true),
     };
-    world.with_levels(levels).map_err(|e| usage!("{e}"))
+    changed.map_err(|e| usage!("{e}"))
 }
 
 #[cfg(test)]

@@ -97,8 +97,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     assert_eq!(config.frame_shape().height, 3);
     assert!(config.validate().is_ok() && config.build(1, 1, 0).is_err());
     check_round_trip(&config);
-    assert!(config.with_levels(Levels::Train).is_ok());
-    assert!(config.with_levels(Levels::Unseen).is_err());
+    assert!(config.with_single_levels(true).is_err());
     assert_eq!(plugin::preset("flat"), Some("# preset"));
     let wrong = text.replace("3.5", "3.5\ncolour = 1");
     fails(toml::from_str::<WorldConfig>(&wrong), &["colour"]);
@@ -220,41 +219,39 @@ fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
     })
 }
 
-/// The levels of a world, and whether an episode continues from one to the next.
-fn levels_of(world: &WorldConfig, which: Levels) -> (std::ops::Range<u32>, bool) {
-    match world.with_levels(which).unwrap() {
-        WorldConfig::Procgen(it) => {
-            let levels = it.start_level..it.start_level + it.num_levels;
-            (levels, it.use_sequential_levels)
-        }
+/// The levels of a world.
+fn levels_of(world: &WorldConfig) -> std::ops::Range<u32> {
+    match world {
+        WorldConfig::Procgen(it) => it.start_level..it.start_level + it.num_levels,
         other => panic!("{other:?}"),
     }
+}
+
+/// Whether an episode of a world continues from one level to the next.
+fn continues(world: &WorldConfig) -> bool {
+    matches!(world, WorldConfig::Procgen(it) if it.use_sequential_levels)
 }
 
 #[test]
 fn unseen_levels_are_none_of_those_trained_on() {
     for (start, count) in [(0, 500), (70, 1), (1000, 200)] {
         let world = procgen(start, count);
-        let (train, continues) = levels_of(&world, Levels::Train);
-        assert_eq!((train.clone(), continues), (start..start + count, true));
-        let (single, continues) = levels_of(&world, Levels::TrainSingle);
-        assert_eq!((single, continues), (train.clone(), false));
-        let (unseen, continues) = levels_of(&world, Levels::Unseen);
+        let [single, unseen] = [false, true].map(|it| world.with_single_levels(it).unwrap());
+        assert!(continues(&world) && !continues(&single) && !continues(&unseen));
+        assert_eq!(levels_of(&single), start..start + count);
+        let unseen = levels_of(&unseen);
         assert!(
-            unseen.start >= train.end && unseen.len() == 100_000,
+            unseen.start >= start + count && unseen.len() == 100_000,
             "{unseen:?}"
         );
-        assert!(!continues);
     }
 }
 
 #[test]
 fn levels_that_a_world_does_not_have_are_refused() {
-    let all = procgen(0, 0).with_levels(Levels::Unseen);
-    fails(all, &["none is unseen"]);
+    fails(procgen(0, 0).with_single_levels(true), &["none is unseen"]);
     let [_, chain, ..] = configs();
-    assert!(chain.with_levels(Levels::Train).is_ok());
-    for which in [Levels::TrainSingle, Levels::Unseen] {
-        fails(chain.with_levels(which), &["has no levels"]);
+    for unseen in [false, true] {
+        fails(chain.with_single_levels(unseen), &["has no levels"]);
     }
 }

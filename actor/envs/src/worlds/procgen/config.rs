@@ -5,8 +5,7 @@ use std::path::Path;
 
 use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options};
 
-use crate::error::EnvError;
-use crate::settings::Levels;
+use crate::error::{EnvError, require};
 
 /// The number of unseen levels to draw from; they follow the levels of training.
 const UNSEEN_LEVELS: u32 = 100_000;
@@ -66,22 +65,16 @@ impl ProcgenConfig {
         Ok(engine?)
     }
 
-    /// Returns the same game with other levels.
-    pub(crate) fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
+    /// Returns the same game with one level per episode.
+    pub(crate) fn with_single_levels(&self, unseen: bool) -> Result<Self, EnvError> {
         let mut changed = self.clone();
-        match levels {
-            Levels::Train => return Ok(changed),
-            Levels::TrainSingle => {}
-            Levels::Unseen if self.num_levels == 0 => {
-                let why = "this run trained on all levels, so none is unseen";
-                return Err(EnvError::Config(why.into()));
-            }
-            Levels::Unseen => {
-                changed.start_level += self.num_levels;
-                changed.num_levels = UNSEEN_LEVELS;
-            }
-        }
         changed.use_sequential_levels = false;
+        if unseen {
+            let why = "this run trained on all levels, so none is unseen";
+            require(self.num_levels > 0, why)?;
+            changed.start_level += self.num_levels;
+            changed.num_levels = UNSEEN_LEVELS;
+        }
         Ok(changed)
     }
 
