@@ -61,7 +61,7 @@ pub(crate) fn fill_in_declaration(table: &mut Table, command: &str) -> Result<()
     let declared = declared.map_err(|e| usage!("--env: {e}"))?;
     insert_missing(table, "input.height", (declared.height as i64).into());
     insert_missing(table, "input.width", (declared.width as i64).into());
-    insert(table, "world", as_toml(declared)?);
+    insert(table, "world", as_toml(declared));
     Ok(())
 }
 
@@ -125,7 +125,7 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
     let mut area = ReadArea { input, frame };
     if find(table, FRAME_PATH).is_some() {
         let (height, width) = (shape.height as u32, shape.width as u32);
-        insert(table, FRAME_PATH, as_toml(FrameSize { height, width })?);
+        insert(table, FRAME_PATH, as_toml(FrameSize { height, width }));
         // Augmentation crops the frame and reads the borders too.
         if find(table, "learner.augment").is_none() {
             let input: InputSize = read(table, "input")?;
@@ -147,11 +147,11 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
         ("model.width", size(area.input.1)),
         ("model.input_channels", Value::Integer(channels)),
         ("model.num_actions", size(num_actions)),
-        ("model.dim", as_toml(update.dim_heads(num_actions))?),
+        ("model.dim", as_toml(update.dim_heads(num_actions))),
     ] {
         insert(table, path, value);
     }
-    fill_in_loss_layers(table, &update)?;
+    fill_in_loss_layers(table, &update);
     fill_in_visible_actions(table, &config, set);
     fill_in_ladder_actors(table);
     fill_in_beta_updates(table);
@@ -159,18 +159,16 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
 }
 
 /// Fills in the layers of the auxiliary loss, if it has any. If the model or the loss is invalid, later checks report why.
-fn fill_in_loss_layers(table: &mut Table, update: &UpdateSettings) -> Result<(), Usage> {
+fn fill_in_loss_layers(table: &mut Table, update: &UpdateSettings) {
     if let Ok(model) = read::<ModelConfig>(table, "model")
         && let Ok(loss) = update.make_auxiliary_loss()
     {
-        let layers = loss.layers(&model).into_iter().map(as_toml);
-        let layers = layers.collect::<Result<Vec<_>, _>>()?;
+        let layers: Vec<_> = loss.layers(&model).into_iter().map(as_toml).collect();
         match table.get_mut("model").and_then(Value::as_table_mut) {
             Some(model) if layers.is_empty() => _ = model.remove("loss_layers"),
             _ => insert(table, "model.loss_layers", layers.into()),
         }
     }
-    Ok(())
 }
 
 /// Fills in the number of actors on the epsilon ladder, if there is a ladder and the number is not set.
@@ -240,8 +238,8 @@ pub(crate) fn parse_file(name: &str, text: &str) -> Result<Table, Usage> {
     Ok(read)
 }
 
-fn as_toml(value: impl serde::Serialize) -> Result<Value, Usage> {
-    Value::try_from(value).map_err(|e| usage!("a setting as TOML: {e}"))
+fn as_toml(value: impl serde::Serialize) -> Value {
+    Value::try_from(value).expect("settings are numbers, words, lists and tables")
 }
 
 fn missing(what: &str) -> Usage {
