@@ -19,13 +19,10 @@ pub struct AffinityUpdate {
 impl AffinityUpdate {
     /// Checks the size and that every entry is a probability.
     pub fn validate(&self, num_actions: u32) -> Result<(), CodecError> {
-        let n = num_actions as usize;
-        if self.matrix.len() != n * n {
-            return Err(CodecError::Header(format!(
-                "an affinity with {} entries; this run has {num_actions} actions",
-                self.matrix.len()
-            )));
-        }
+        let (n, len) = (num_actions as usize, self.matrix.len());
+        let why =
+            format_args!("an affinity with {len} entries; this run has {num_actions} actions");
+        CodecError::check(len == n * n, why)?;
         match self.matrix.iter().position(|p| !(0.0..=1.0).contains(p)) {
             Some(at) => Err(CodecError::Header(format!(
                 "entry ({}, {}) of the affinity is {}, not a probability",

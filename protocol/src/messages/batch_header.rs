@@ -94,12 +94,12 @@ impl BatchHeader {
                 stacked: None,
                 ..*self
             };
-            if whole.bytes().is_none_or(|bytes| bytes > PAYLOAD_BYTES_MAX) {
-                return Err(CodecError::Header(format!(
-                    "{} rows whose states would fill more than {PAYLOAD_BYTES_MAX} bytes",
-                    self.rows
-                )));
-            }
+            let fits = whole.bytes().is_some_and(|it| it <= PAYLOAD_BYTES_MAX);
+            let why = format_args!(
+                "{} rows whose states would fill more than {PAYLOAD_BYTES_MAX} bytes",
+                self.rows
+            );
+            CodecError::check(fits, why)?;
             if let Some(number) = stacked.first_unknown(&payload[self.state_range()]) {
                 return Err(CodecError::Header(format!(
                     "a state has frame {number}, but the batch has {} frames",
@@ -109,16 +109,14 @@ impl BatchHeader {
         }
         let valid = payload[self.range(Column::PositiveValid)].iter();
         let discounts = self.f32s(Column::BootstrapDiscount, payload);
-        let counted = (
-            valid.filter(|valid| **valid != 0).count(),
-            discounts.filter(|discount| *discount != 0.0).count(),
+        let positives = valid.filter(|valid| **valid != 0).count();
+        let bootstraps = discounts.filter(|discount| *discount != 0.0).count();
+        let states = (self.states_k as usize, self.states_n as usize);
+        let why = format_args!(
+            "rows with {positives} positives and {bootstraps} bootstraps come with {} and {} states",
+            states.0, states.1
         );
-        if counted != (self.states_k as usize, self.states_n as usize) {
-            return Err(CodecError::Header(format!(
-                "rows with {} positives and {} bootstraps come with {} and {} states",
-                counted.0, counted.1, self.states_k, self.states_n
-            )));
-        }
+        CodecError::check((positives, bootstraps) == states, why)?;
         let mut chances = self.f32s(Column::Probability, payload);
         if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
             return Err(CodecError::Header(format!(

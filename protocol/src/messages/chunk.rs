@@ -79,16 +79,13 @@ impl ChunkHeader {
     }
 
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
-        if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
-            return Ok(());
-        }
-        Err(CodecError::Header(format!(
-            "{} streams of {} steps of {} bytes do not fill {} bytes of payload",
-            self.streams,
-            self.steps,
-            self.frame_bytes,
+        let (streams, steps, bytes) = (self.streams, self.steps, self.frame_bytes);
+        let fits = self.payload_bytes() == Some(payload.len()) && self.transitions() > 0;
+        let why = format_args!(
+            "{streams} streams of {steps} steps of {bytes} bytes do not fill {} bytes of payload",
             payload.len()
-        )))
+        );
+        CodecError::check(fits, why)
     }
 }
 

@@ -58,14 +58,10 @@ impl EpisodesReply {
     }
 
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
-        if self.next_since() > self.ended || self.episodes.len() > EPISODES_MAX {
-            return Err(CodecError::Header(format!(
-                "{} episodes after {}, but only {} have ended",
-                self.episodes.len(),
-                self.before,
-                self.ended
-            )));
-        }
+        let (count, before, ended) = (self.episodes.len(), self.before, self.ended);
+        let fits = self.next_since() <= ended && count <= EPISODES_MAX;
+        let why = format_args!("{count} episodes after {before}, but only {ended} have ended");
+        CodecError::check(fits, why)?;
         check_no_payload(payload)
     }
 }

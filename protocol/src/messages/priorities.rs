@@ -46,11 +46,8 @@ impl PriorityUpdate {
         check_no_payload(payload)?;
         for part in &self.parts {
             let (transitions, priorities) = (part.transitions.len(), part.priorities.len());
-            if transitions != priorities {
-                return Err(CodecError::Header(format!(
-                    "{priorities} priorities of {transitions} transitions"
-                )));
-            }
+            let why = format_args!("{priorities} priorities of {transitions} transitions");
+            CodecError::check(transitions == priorities, why)?;
             let good = |priority: &f32| priority.is_finite() && *priority >= 0.0;
             if let Some(at) = part.priorities.iter().position(|it| !good(it)) {
                 return Err(CodecError::Header(format!(

@@ -54,11 +54,9 @@ impl fmt::Display for Recovering {
 impl Recovering {
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         let since_s = self.progress.since_s;
-        if !since_s.is_finite() || since_s < 0.0 {
-            return Err(CodecError::Header(format!(
-                "the recovery began {since_s} s ago, which is not possible"
-            )));
-        }
+        let is_possible = since_s.is_finite() && since_s >= 0.0;
+        let why = format_args!("the recovery began {since_s} s ago, which is not possible");
+        CodecError::check(is_possible, why)?;
         check_no_payload(payload)
     }
 }

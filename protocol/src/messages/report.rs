@@ -85,19 +85,16 @@ impl Report {
 
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         let warning = self.last_warning.as_ref();
-        let is_too_long = self.doing.len() > DOING_BYTES_MAX
-            || warning.is_some_and(|warning| warning.text.len() > WARNING_BYTES_MAX);
-        if is_too_long {
-            return Err(CodecError::Header(format!(
-                "a report of more than {DOING_BYTES_MAX} bytes, or a warning of more than {WARNING_BYTES_MAX}"
-            )));
-        }
+        let are_short = self.doing.len() <= DOING_BYTES_MAX
+            && warning.is_none_or(|warning| warning.text.len() <= WARNING_BYTES_MAX);
+        let why = format_args!(
+            "a report of more than {DOING_BYTES_MAX} bytes, or a warning of more than {WARNING_BYTES_MAX}"
+        );
+        CodecError::check(are_short, why)?;
         let times = [self.since_s, warning.map_or(0.0, |warning| warning.age_s)];
-        if times.iter().any(|it| !it.is_finite() || *it < 0.0) {
-            return Err(CodecError::Header(format!(
-                "the report gives {times:?} s, which are not possible times"
-            )));
-        }
+        let are_possible = times.iter().all(|it| it.is_finite() && *it >= 0.0);
+        let why = format_args!("the report gives {times:?} s, which are not possible times");
+        CodecError::check(are_possible, why)?;
         check_no_payload(payload)
     }
 

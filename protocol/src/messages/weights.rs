@@ -112,12 +112,8 @@ impl WeightsHeader {
 
     /// Checks that `safetensors` has the hash of this description.
     pub fn check_hash(&self, safetensors: &[u8]) -> Result<(), CodecError> {
-        if self.sha256 == <[u8; 32]>::from(Sha256::digest(safetensors)) {
-            Ok(())
-        } else {
-            Err(CodecError::Header(
-                "the weights' SHA-256 is not the one announced".into(),
-            ))
-        }
+        let is_announced = self.sha256 == <[u8; 32]>::from(Sha256::digest(safetensors));
+        let why = "the weights' SHA-256 is not the one announced";
+        CodecError::check(is_announced, why)
     }
 }

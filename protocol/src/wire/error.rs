@@ -1,6 +1,8 @@
 //! Why bytes from another process were rejected: each fault with a sentence, and a remedy if there is one.
 //! Rejected bytes never cause a panic.
 
+use std::fmt::Display;
+
 /// Why a message was rejected, by its receiver or before it was sent.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[allow(missing_docs, reason = "each message says it")]
@@ -39,6 +41,14 @@ pub enum CodecError {
 }
 
 impl CodecError {
+    /// Returns [`CodecError::Header`] with the reason `why`, unless `is_valid`.
+    pub(crate) fn check(is_valid: bool, why: impl Display) -> Result<(), Self> {
+        match is_valid {
+            true => Ok(()),
+            false => Err(Self::Header(why.to_string())),
+        }
+    }
+
     pub(crate) const fn check_size(have: usize, max: usize) -> Result<(), Self> {
         match have > max {
             true => Err(Self::TooLarge { have, max }),

@@ -43,10 +43,7 @@ pub trait Request: Keyed {
 }
 
 pub(crate) fn check_no_payload(payload: &[u8]) -> Result<(), CodecError> {
-    match payload.len() {
-        0 => Ok(()),
-        bytes => Err(CodecError::Header(format!(
-            "{bytes} bytes of payload follow a message that has none"
-        ))),
-    }
+    let bytes = payload.len();
+    let why = format_args!("{bytes} bytes of payload follow a message that has none");
+    CodecError::check(bytes == 0, why)
 }
