@@ -15,7 +15,6 @@ mod messages;
 mod replay;
 mod segments;
 
-pub use messages::messages_input;
 pub use segments::{log_with_highest_ordinal, logs, transitions_held};
 
 /// One decoder: its name, and the function that tries it on some bytes.
@@ -23,7 +22,6 @@ pub type Decoder = (&'static str, fn(&[u8]));
 
 /// Every decoder.
 pub const DECODERS: &[Decoder] = &[
-    ("wire", messages::wire),
     ("messages", messages::messages),
     ("replay", replay::replay),
     ("state", files::state),

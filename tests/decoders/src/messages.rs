@@ -1,4 +1,4 @@
-//! Messages: arbitrary bytes, and bytes after a valid prefix, so that the code behind the checksum is reached.
+//! Messages: arbitrary bytes, and the same bytes with a valid prefix, so that the code behind the checksum is reached.
 
 use std::{fmt::Debug, io::Read as _};
 
@@ -72,7 +72,7 @@ fn read_batch(bytes: &[u8]) {
     }
 }
 
-/// Every kind of message and how it is read.
+/// Every kind of message and how it is read, in the order of their numbers.
 const KINDS: [(Kind, ReadFn); 24] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
@@ -94,9 +94,9 @@ const KINDS: [(Kind, ReadFn); 24] = [
     (Kind::WeightsRequest, read::<WeightsRequest>),
     (Kind::Report, read::<Report>),
     (Kind::ProcessesStatus, read::<ProcessesStatus>),
+    (Kind::Priorities, read::<PriorityUpdate>),
     (Kind::EpisodesRequest, read::<EpisodesRequest>),
     (Kind::EpisodesReply, read::<EpisodesReply>),
-    (Kind::Priorities, read::<PriorityUpdate>),
     (Kind::Recovering, read::<Recovering>),
 ];
 
@@ -115,36 +115,19 @@ fn read_status(bytes: &[u8]) {
     }
 }
 
-/// Reads arbitrary bytes as each kind of message.
-pub(crate) fn wire(bytes: &[u8]) {
-    KINDS.iter().for_each(|(_, read)| read(bytes));
-}
-
-/// Reads a message with a valid prefix: one byte chooses the kind, two are the header's length, the rest is header and payload.
+/// Reads arbitrary bytes as each kind of message. Then reads them with a valid prefix, as the kind that the prefix names.
 pub(crate) fn messages(bytes: &[u8]) {
-    let Some((&[kind, low, high], rest)) = bytes.split_first_chunk() else {
+    KINDS.iter().for_each(|(_, read)| read(bytes));
+    let mut message = bytes.to_vec();
+    let Some(prefix) = message.first_chunk_mut::<{ codec::PREFIX_BYTES }>() else {
         return;
     };
-    let (kind, read) = KINDS[usize::from(kind) % KINDS.len()];
-    let header = u32::from(u16::from_le_bytes([low, high]));
-    let mut message = b"DRML".to_vec();
-    message.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
-    message.extend_from_slice(&(kind as u16).to_le_bytes());
-    message.extend_from_slice(&SPEC_HASH.to_le_bytes());
-    message.extend_from_slice(&header.to_le_bytes());
-    message.resize(codec::PREFIX_BYTES, 0);
-    message.extend_from_slice(rest);
+    let number = u16::from_le_bytes([prefix[6], prefix[7]]);
+    let (kind, read) = KINDS[usize::from(number.wrapping_sub(1)) % KINDS.len()];
+    prefix[..4].copy_from_slice(b"DRML");
+    prefix[4..6].copy_from_slice(&PROTOCOL_VERSION.to_le_bytes());
+    prefix[6..8].copy_from_slice(&(kind as u16).to_le_bytes());
+    prefix[8..16].copy_from_slice(&SPEC_HASH.to_le_bytes());
     repair_message(&mut message);
     read(&message);
-}
-
-/// Converts the bytes of a message to input of the decoder `messages`.
-pub fn messages_input(message: &[u8]) -> Vec<u8> {
-    let kind = u16::from_le_bytes([message[6], message[7]]);
-    let at = KINDS.iter().position(|(known, _)| *known as u16 == kind);
-    let header = u16::from_le_bytes([message[16], message[17]]);
-    let mut bytes = vec![at.unwrap() as u8];
-    bytes.extend_from_slice(&header.to_le_bytes());
-    bytes.extend_from_slice(&message[codec::PREFIX_BYTES..]);
-    bytes
 }

@@ -1,12 +1,7 @@
 //! The replay's segments on disk, in any state: the server starts or reports why not, serves only what was stored, and starts again.
 //! The replay server's own tests check every field of a row. Here the bytes decide what was stored.
 
-use std::{
-    collections::HashSet,
-    fs,
-    ops::Range,
-    path::{Path, PathBuf},
-};
+use std::{collections::HashSet, fs, ops::Range, path::Path};
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, InsertReply, LearnerJoin, Leave,
@@ -70,26 +65,32 @@ fn temp_folder() -> tempfile::TempDir {
     memory.or_else(|_| tempfile::tempdir()).unwrap()
 }
 
-/// Returns the file of segment `number`.
-fn path(dir: &Path, number: usize) -> PathBuf {
-    dir.join(format!("segment-{number:012}.log"))
+/// Writes segments into a new folder, numbered from `first`.
+fn write_segments(first: u8, segments: &[Vec<u8>]) -> tempfile::TempDir {
+    let dir = temp_folder();
+    for (number, segment) in (usize::from(first)..).zip(segments) {
+        let name = format!("segment-{number:012}.log");
+        fs::write(dir.path().join(name), segment).unwrap();
+    }
+    dir
 }
 
-/// Opens a replay from the segments in `bytes`. The lowest bit of the first byte says whether to repair the checksums. Then come the number
-/// of the first segment, and each segment after its length in two bytes.
+/// Opens a replay from the segments in `bytes`, as they are and with repaired checksums. The first byte is the number of the first segment.
+/// Then comes each segment, after its length in two bytes.
 pub(crate) fn segments(bytes: &[u8]) {
-    let Some((&[mode, first], rest)) = bytes.split_first_chunk() else {
+    let Some((&first, rest)) = bytes.split_first() else {
         return;
     };
-    let dir = temp_folder();
+    let mut segments = split_segments(rest);
+    check_log(first, &segments);
+    segments.iter_mut().for_each(|it| repair_segment(it));
+    check_log(first, &segments);
+}
+
+fn check_log(first: u8, segments: &[Vec<u8>]) {
+    let dir = write_segments(first, segments);
     let mut stored = HashSet::new();
-    for (number, mut segment) in split_segments(rest).into_iter().enumerate() {
-        if mode % 2 == 1 {
-            repair_segment(&mut segment);
-        }
-        add_stored(&segment, &mut stored);
-        fs::write(path(dir.path(), usize::from(first) + number), segment).unwrap();
-    }
+    segments.iter().for_each(|it| add_stored(it, &mut stored));
     let Ok(mut replay) = open_replay(dir.path()) else {
         return;
     };
@@ -248,20 +249,12 @@ fn fill_chunk(chunk: &mut Chunk, frame: &mut u32) {
     }
 }
 
-/// Returns input of the decoder `segments`: a log of a single segment and one of several, each intact and to be repaired.
-pub fn logs() -> Vec<(String, Vec<u8>)> {
-    let mut all = Vec::new();
-    for (name, chunks) in [("short", 2), ("long", 12)] {
-        let log = write_log(chunks);
-        for (mode, suffix) in [(0, ""), (1, "-mended")] {
-            let bytes = [vec![mode], log.clone()].concat();
-            all.push((format!("{name}{suffix}"), bytes));
-        }
-    }
-    all
+/// Returns input of the decoder `segments`: a log of a single segment and one of several.
+pub fn logs() -> [(&'static str, Vec<u8>); 2] {
+    [("short", 2), ("long", 12)].map(|(name, chunks)| (name, write_log(chunks)))
 }
 
-/// Returns the segments of a replay in which every kind of record was written.
+/// Returns the segments of a replay in which every kind of record was written, after the number of the first.
 fn write_log(chunks: u64) -> Vec<u8> {
     let dir = temp_folder();
     let mut replay = open_replay(dir.path()).unwrap();
@@ -312,8 +305,8 @@ fn write_log(chunks: u64) -> Vec<u8> {
 
 /// Returns the first of [`logs`] with a number in its first record that no replay reaches.
 pub fn log_with_highest_ordinal() -> Vec<u8> {
-    let mut log = logs().swap_remove(0).1;
-    let segment = &mut log[4..];
+    let [(_, mut log), _] = logs();
+    let segment = &mut log[3..];
     segment[8..16].copy_from_slice(&(1u64 << 60).to_le_bytes());
     repair_segment(segment);
     log
@@ -321,9 +314,6 @@ pub fn log_with_highest_ordinal() -> Vec<u8> {
 
 /// Returns the number of transitions held in a log from [`logs`], or why the log is rejected.
 pub fn transitions_held(log: &[u8]) -> Result<u64, String> {
-    let dir = temp_folder();
-    for (number, segment) in split_segments(&log[2..]).iter().enumerate() {
-        fs::write(path(dir.path(), usize::from(log[1]) + number), segment).unwrap();
-    }
+    let dir = write_segments(log[0], &split_segments(&log[1..]));
     open_replay(dir.path()).map(|replay| replay.status().transitions_held)
 }
