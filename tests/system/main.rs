@@ -8,7 +8,6 @@ mod circles;
 mod cli;
 mod closed_terminal;
 mod disk_full;
-mod diverging;
 mod durable;
 mod evaluate;
 mod experiments;
