@@ -57,30 +57,27 @@ fn so_they_do_over_tls() {
     }
 }
 
+/// Two shards; a run of one replay server is in `watch`.
 #[test]
 fn processes_end_by_themselves_when_the_run_is_over() {
-    for shards in [1, 2] {
-        let system = system();
-        let endpoints: Vec<_> = (0..shards)
-            .map(|shard| system.socket_endpoint(&format!("e\u{301}{shard}")))
-            .collect();
-        let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
-        let mut calls = Vec::new();
-        for (shard, endpoint) in endpoints.iter().enumerate() {
-            calls.push(format!(
-                "replay-server --listen {endpoint} --shard {shard} {flags}"
-            ));
-            calls.push(format!("actor --connect {endpoint} --id {shard}"));
-        }
-        let all = endpoints.join(" --connect ");
-        calls.push(format!("learner --connect {all} --run-dir run"));
-        let processes: Vec<_> = calls.iter().map(|it| system.start_process(it)).collect();
-        for process in processes {
-            process.wait_ok();
-        }
-        assert_eq!(system.running_processes(), []);
-        system.run_ok("evaluate --run run --episodes 2");
+    let system = system();
+    let endpoints = [0, 1].map(|shard| system.socket_endpoint(&format!("e\u{301}{shard}")));
+    let flags = format!("--agent driml-ada --replay-shards 2 --actors 2 {SHORT}");
+    let mut calls = Vec::new();
+    for (shard, endpoint) in endpoints.iter().enumerate() {
+        calls.push(format!(
+            "replay-server --listen {endpoint} --shard {shard} {flags}"
+        ));
+        calls.push(format!("actor --connect {endpoint} --id {shard}"));
     }
+    let all = endpoints.join(" --connect ");
+    calls.push(format!("learner --connect {all} --run-dir run"));
+    let processes: Vec<_> = calls.iter().map(|it| system.start_process(it)).collect();
+    for process in processes {
+        process.wait_ok();
+    }
+    assert_eq!(system.running_processes(), []);
+    system.run_ok("evaluate --run run --episodes 2");
 }
 
 #[test]

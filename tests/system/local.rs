@@ -162,20 +162,3 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
         assert!(last > 0.0 && last < 0.75 * 64f64.ln(), "{agent}: {last}");
     }
 }
-
-/// With two actors, a replay server for each, and one learner, the counts equal those of a single replay server.
-#[test]
-fn two_replay_shards_are_one_replay() {
-    let system = system();
-    system.run_ok(&format!(
-        "local --agent driml-ada {SHORT} --actors 2 --replay-shards 2 --run-dir run"
-    ));
-    assert_eq!(system.running_processes(), []);
-    let summary = system.run_folder("run").check(Outcome::Finished);
-    // Each of the two limiters admits chunks until it learns the other's count: up to the slack of 256, two batches' worth and a chunk.
-    let frames = 1280..1280 + 2 * (256 + 2 * 16 / 8 + 32);
-    assert!(frames.contains(&summary.frames), "{summary:#?}");
-    assert_eq!(summary.updates * 16, summary.replay.rows_sampled);
-    let updates_due = (summary.frames - 200) * 8 / 16;
-    assert!(updates_due - summary.updates <= 1, "{summary:#?}");
-}

@@ -22,27 +22,6 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
         .expect_stdout("procgen:bigfish on unseen levels, 2 episodes each");
 }
 
-/// N updates, saved and resumed for N more, equal a run of 2 N: the engine's state is restored.
-#[test]
-fn a_run_that_is_prolonged_is_a_longer_one() {
-    let Some(system) = with_engine() else { return };
-    for game in ["coinrun", "maze"] {
-        let flags = format!("--lockstep --env procgen:{game} --agent driml-ada --preset smoke");
-        let [whole, half] = [1216, 608].map(|frames| {
-            let run_dir = format!("{game}-{frames}");
-            system.train(&format!("{flags} --frames {frames}"), &run_dir)
-        });
-        assert_ne!(half.weights_sha256, whole.weights_sha256);
-        system
-            .run_ok(&format!("local --resume {game}-608"))
-            .expect_stdout("nothing is left to do");
-        system.run_ok(&format!("local --resume {game}-608 --frames 1216"));
-        let resumed = system.run_folder(&format!("{game}-608")).check_finished();
-        assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{game}");
-        assert_eq!(resumed.mean_return, whole.mean_return, "{game}");
-    }
-}
-
 #[test]
 fn an_agent_chooses_among_the_actions_that_differ() {
     let Some(system) = with_engine() else { return };

@@ -2,7 +2,6 @@
 
 use std::fs;
 
-use driml_settings::config::RunConfig;
 use driml_tests::{Outcome, Summary, TestSystem, check_has};
 
 use crate::{SHORT, start_run, system};
@@ -63,26 +62,6 @@ fn an_interrupt_saves_and_ends_all_processes_and_the_run_continues() {
     system
         .run_ok("local --resume run")
         .expect_stdout("nothing is left to do");
-}
-
-/// Runs of earlier versions recorded whole frames; today a border of the frames is cut off.
-#[test]
-fn a_run_with_whole_frames_continues_and_is_evaluated() {
-    let system = system();
-    let border =
-        "--set world.height=15 --set world.width=17 --set input.height=15 --set input.width=17";
-    system.run_ok(&format!("local --lockstep {SHORT} {border} --run-dir cut"));
-    let cut = RunConfig::parse("config.toml", &system.read("cut/config.toml")).unwrap();
-    assert_eq!((cut.run.frame_height, cut.run.frame_width), (14, 16));
-    let old = cut.with_whole_frames().unwrap();
-    fs::write(system.path("old.toml"), old.to_toml()).unwrap();
-    system.run_ok("local --config old.toml --run-dir run");
-    resume_and_check(&system);
-    let config = system.run_folder("run").config();
-    assert_eq!(config["run"]["frame_height"].as_integer(), Some(15));
-    for run in ["run", "cut"] {
-        system.run_ok(&format!("evaluate --run {run} --episodes 3"));
-    }
 }
 
 #[test]
