@@ -2,11 +2,10 @@
 //! This module does not know the role of the process.
 
 use std::{
-    io::{ErrorKind, Read},
-    os::unix::process::ExitStatusExt,
-    process::{Child, Command, Stdio},
-    sync::{Arc, Mutex},
-    thread::{self, JoinHandle},
+    fs::File,
+    os::unix::{fs::FileExt, process::ExitStatusExt},
+    process::{Child, Command},
+    thread,
 };
 
 use nix::{
@@ -21,8 +20,9 @@ use crate::waiting::{wait_for, wait_until};
 pub struct Process {
     name: String,
     child: Child,
-    stdout: PipeReader,
-    stderr: PipeReader,
+    /// Files without a name, to which the process writes.
+    stdout: File,
+    stderr: File,
 }
 
 /// How a process ended, and all its output.
@@ -38,33 +38,11 @@ pub struct Exit {
     pub stderr: String,
 }
 
-/// The bytes read from one pipe so far, and the thread that keeps reading.
-#[derive(Debug)]
-struct PipeReader {
-    bytes: Arc<Mutex<Vec<u8>>>,
-    reader: JoinHandle<()>,
-}
-
-impl PipeReader {
-    fn start(mut pipe: impl Read + Send + 'static) -> Self {
-        let bytes = Arc::<Mutex<Vec<u8>>>::default();
-        let sink = bytes.clone();
-        let reader = thread::spawn(move || {
-            let mut buffer = [0; 4096];
-            loop {
-                match pipe.read(&mut buffer) {
-                    Ok(count @ 1..) => sink.lock().unwrap().extend_from_slice(&buffer[..count]),
-                    Err(e) if e.kind() == ErrorKind::Interrupted => {}
-                    _ => return,
-                }
-            }
-        });
-        Self { bytes, reader }
-    }
-
-    fn text_so_far(&self) -> String {
-        String::from_utf8_lossy(&self.bytes.lock().unwrap()).into_owned()
-    }
+/// Returns what was written to a file so far. The offset at which the process writes does not move.
+fn text_so_far(file: &File) -> String {
+    let mut bytes = vec![0; file.metadata().unwrap().len() as usize];
+    file.read_exact_at(&mut bytes, 0).unwrap();
+    String::from_utf8_lossy(&bytes).into_owned()
 }
 
 /// Checks that a text contains every string in `all`.
@@ -86,12 +64,11 @@ pub(crate) fn run(command: &mut Command) -> String {
 impl Process {
     /// Starts a command that a test has built, with the standard input that it has; `name` identifies the process in messages.
     pub fn start(name: String, mut command: Command) -> Self {
-        command.stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut child = command
-            .spawn()
-            .unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
-        let stdout = PipeReader::start(child.stdout.take().expect("it is piped"));
-        let stderr = PipeReader::start(child.stderr.take().expect("it is piped"));
+        let [stdout, stderr] = [(); 2].map(|()| tempfile::tempfile().unwrap());
+        command.stdout(stdout.try_clone().unwrap());
+        command.stderr(stderr.try_clone().unwrap());
+        let child = command.spawn();
+        let child = child.unwrap_or_else(|e| panic!("starting {command:?}: {e}"));
         Self {
             name,
             child,
@@ -112,21 +89,20 @@ impl Process {
 
     /// Standard output so far.
     pub fn stdout(&self) -> String {
-        self.stdout.text_so_far()
+        text_so_far(&self.stdout)
     }
 
     /// Standard error so far.
     pub fn stderr(&self) -> String {
-        self.stderr.text_so_far()
+        text_so_far(&self.stderr)
     }
 
     /// Waits until standard error holds `words`.
     pub fn wait_for_stderr(&mut self, words: &str) {
         wait_until(&format!("{}: {words:?} on stderr", self.name), || {
             // Check for the end first, so that output written just before the end is not missed.
-            let ended =
-                self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
-            let stderr = self.stderr.text_so_far();
+            let ended = self.child.try_wait().unwrap().is_some();
+            let stderr = text_so_far(&self.stderr);
             let found = stderr.contains(words);
             assert!(
                 found || !ended,
@@ -146,15 +122,11 @@ impl Process {
     pub fn wait(mut self) -> Exit {
         let what = format!("the end of {}", self.name);
         let status = wait_for(&what, || self.child.try_wait().unwrap());
-        // The pipes close when the process ends, because no child of the process holds them.
-        wait_until(&format!("the last output of {}", self.name), || {
-            self.stdout.reader.is_finished() && self.stderr.reader.is_finished()
-        });
         Exit {
             code: status.code(),
             signal: status.signal(),
-            stdout: self.stdout.text_so_far(),
-            stderr: self.stderr.text_so_far(),
+            stdout: self.stdout(),
+            stderr: self.stderr(),
         }
     }
 
@@ -196,12 +168,7 @@ impl Drop for Process {
         let _ = self.child.wait();
         if thread::panicking() {
             // The test runner shows this beside the failure.
-            println!(
-                "--- {}\n{}{}",
-                self.name,
-                self.stdout.text_so_far(),
-                self.stderr.text_so_far()
-            );
+            println!("--- {}\n{}{}", self.name, self.stdout(), self.stderr());
         }
     }
 }
