@@ -190,12 +190,18 @@ mod tests {
         let late = statistics.episodes_since(0);
         assert_eq!((late.before, late.episodes[0].frames), (7, 7));
         assert_eq!(statistics.counted.episodes, all);
+        // Once the launcher records, it alone says which episodes need not be kept.
         for (recorded, logged) in [
             (None, 0),
-            (Some(9), EPISODES_SNAPSHOT_MAX),
-            (Some(all - 3), 3),
+            (Some((9, false)), EPISODES_SNAPSHOT_MAX),
+            (Some((all - 3, false)), 3),
+            (Some((all - 4, true)), 4),
+            (Some((all, false)), 4),
+            (Some((all, true)), 0),
         ] {
-            statistics.recorded_episodes = recorded;
+            if let Some((episodes, is_launcher)) = recorded {
+                statistics.set_recorded(episodes, is_launcher);
+            }
             let reply = statistics.for_snapshot().episodes_since(0);
             assert_eq!((reply.next_since(), reply.episodes.len()), (all, logged));
         }

@@ -2,7 +2,7 @@
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Horizon, InsertReply, LearnerJoin,
-    LearnerProgress, Leave, RunSpec, ShardCounts,
+    LearnerProgress, Leave, RunSpec, Sampling, ShardCounts,
 };
 use driml_replay_server::{Config, Replay};
 
@@ -15,6 +15,19 @@ pub(crate) fn small_spec() -> RunSpec {
 /// Creates a replay of `small_spec`, for batches of 8 rows.
 pub(crate) fn small_replay(config: &Config) -> Replay {
     Replay::new(&small_spec(), config, 8).unwrap()
+}
+
+/// Returns settings with priorities, and with limits at which neither side ever waits.
+pub(crate) fn prioritised(capacity: u64, alpha: f64) -> Config {
+    Config {
+        sampling: Sampling::Prioritised {
+            alpha,
+            beta_start: 0.4,
+            beta_end: 1.0,
+            beta_updates: 100,
+        },
+        ..Config::unlimited(capacity)
+    }
 }
 
 /// Returns the header of a chunk with frames as in `small_spec` and other runs of three channels.

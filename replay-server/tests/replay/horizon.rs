@@ -8,10 +8,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{Actor, affinity, join},
+    calls::{Actor, affinity, join, prioritised},
     history::{History, identity, spec},
     law::ChiSquare,
-    rows::prioritised,
 };
 
 /// Returns the row-wise softmax of random scores of the given spread.

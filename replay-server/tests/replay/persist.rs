@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_batch,
-    calls::{Actor, affinity, is_stored, join, learned, learner},
+    calls::{Actor, affinity, is_stored, join, learned, learner, prioritised},
     history::{History, spec},
 };
 
@@ -302,22 +302,28 @@ fn a_log_tells_its_capacity() {
 
 #[test]
 fn segments_go_with_their_transitions_and_the_budget_is_kept() {
-    let root = tempfile::tempdir().unwrap();
-    let config = Config::unlimited(100);
-    let mut setup = StoredReplay::begin(&root.path().join("ring"), config, 2_000, 5);
-    for _ in 0..600 {
-        setup.store(0);
+    // Transitions of 36 + 6 bytes each are held. With priorities, a snapshot has 8 bytes for each, so that it is larger than a segment.
+    let rings = [
+        (Config::unlimited(100), 2_000, 600, 20_000),
+        (prioritised(2_000, 0.5), 4_000, 1_500, 400_000),
+    ];
+    for (config, segment_bytes, chunks, most) in rings {
+        let root = tempfile::tempdir().unwrap();
+        let mut setup = StoredReplay::begin(root.path(), config, segment_bytes, 5);
+        for _ in 0..chunks {
+            setup.store(0);
+        }
+        let bytes = bytes_in(root.path());
+        assert!(bytes < most, "{bytes}");
     }
-    // 100 transitions of 36 + 6 bytes each are held, and the newest segments are not full.
-    let bytes = bytes_in(&setup.args.dir);
-    assert!(bytes < 20_000, "{bytes}");
 
     // The ring is larger than the budget: the oldest transitions leave the ring too.
+    let root = tempfile::tempdir().unwrap();
     let config = Config {
         disk_bytes_max: Some(4 << 20),
         ..Config::unlimited(1_000_000)
     };
-    let mut setup = StoredReplay::begin(&root.path().join("budget"), config, 200_000, 5);
+    let mut setup = StoredReplay::begin(root.path(), config, 200_000, 5);
     while setup.history.inserted < 150_000 {
         setup.store(1);
         // A checkpoint every 2,000 transitions: no segment is ever full.

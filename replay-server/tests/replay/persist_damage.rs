@@ -8,14 +8,16 @@ use std::{
 use driml_protocol::{
     Buffer, Chunk, ChunkHeader, InsertReply, PROTOCOL_VERSION, RequestId, RunSpec,
 };
-use driml_replay_server::{Config, PersistArgs, RecoveryReport, Replay};
+use driml_replay_server::{
+    Config, PersistArgs, PersistError, RecoveryReport, Replay, ReplayFolder,
+};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::{check_batch, check_rows},
-    calls::{header, is_stored},
+    calls::{header, is_stored, learned, prioritised},
     history::History,
     persist::{ROWS, StoredReplay, args, open, segments, stored, test_spec},
 };
@@ -90,6 +92,15 @@ fn flip(path: &Path, at: impl FnOnce(usize) -> usize) {
     let at = at(bytes.len());
     bytes[at] ^= 4;
     fs::write(path, bytes).unwrap();
+}
+
+/// Drops the replay and opens its folder again: all that was stored must be restored.
+fn check_comes_back(setup: StoredReplay) {
+    let before = stored(&setup.replay);
+    let (args, config) = setup.end();
+    let (replay, recovery) = open(&args, &config).unwrap();
+    assert_eq!(recovery.warnings, [""; 0]);
+    assert!(stored(&replay) == before);
 }
 
 /// Damages a log in any way at any place: a bit, a range, a cut, a missing file, a file in the place of another.
@@ -325,6 +336,10 @@ fn a_folder_is_one_servers_and_one_runs() {
     check_refused(own, spec, config, words);
     drop(replay);
 
+    // A snapshot with more priorities could not be written.
+    let fits = |capacity| ReplayFolder::open(own, spec, &prioritised(capacity, 0.5)).is_ok();
+    assert!(fits(31_000_000) && !fits(32_000_000));
+
     let mut shard = kept.args.clone();
     shard.shard = 1;
     let mut shards = kept.config.clone();
@@ -345,6 +360,46 @@ fn a_folder_is_one_servers_and_one_runs() {
     fs::write(&file, text.replace(&ours, "format = 4")).unwrap();
     let words = "holds a replay of format 4, this version reads 600";
     check_refused(own, spec, config, words);
+}
+
+#[test]
+fn what_cannot_be_read_is_rejected_until_it_is_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let begin = || StoredReplay::begin(folder.path(), Config::unlimited(100), 4_000, 5);
+    let (args, config) = begin().end();
+    let segment = segments(folder.path()).remove(0);
+    flip(&segment, |_| 40);
+    let damaged = fs::read(&segment).unwrap();
+    for _ in 0..2 {
+        let Err(PersistError::Unusable(unusable, why)) = open(&args, &config) else {
+            panic!("a damaged segment")
+        };
+        assert_eq!(unusable, folder.path());
+        assert!(why.contains("remove its segments"), "{why}");
+        assert_eq!(fs::read(&segment).unwrap(), damaged);
+    }
+    remove(&segment);
+    let mut setup = begin();
+    setup.store(0);
+    check_comes_back(setup);
+}
+
+#[test]
+fn a_segment_that_cannot_be_begun_stops_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut setup = StoredReplay::begin(folder.path(), Config::unlimited(2_000), 4_000, 5);
+    let next = folder.path().join("segment-000000000001.log");
+    fs::create_dir(&next).unwrap();
+    for _ in 0..80 {
+        setup.store(0);
+        assert!(!setup.replay.is_disk_failing(), "what is stored is written");
+    }
+    fs::remove_dir(&next).unwrap();
+    // The learner's checkpoint begins a segment.
+    setup.replay.set_progress(learned(1, 1, 0)).unwrap();
+    assert!(next.is_file());
+    setup.store(0);
+    check_comes_back(setup);
 }
 
 /// Opens the log with other settings of the same run, which determine what is held.

@@ -7,8 +7,8 @@ use driml_protocol::Batch;
 use driml_replay_server::{Config, Mark, PersistArgs, PersistError, Replay};
 
 use crate::{
+    calls::prioritised,
     persist::{ROWS, StoredReplay, copy, open, segments},
-    rows::prioritised,
 };
 
 fn state(replay: &Replay) -> Vec<u8> {

@@ -3,9 +3,7 @@
 
 use std::collections::HashMap;
 
-use driml_protocol::{
-    Batch, Horizon, Origin, PriorityPart, PriorityUpdate, RunSpec, Sampling, TimeoutRule,
-};
+use driml_protocol::{Batch, Horizon, Origin, PriorityPart, PriorityUpdate, RunSpec, TimeoutRule};
 use driml_replay_server::{Config, PRIORITY_MIN, PriorityCounts, Replay};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -13,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_rows,
-    calls::{Actor, join},
+    calls::{Actor, join, prioritised},
     history::{History, StreamKey, identity, spec},
     law::ChiSquare,
     persist::args,
@@ -21,18 +19,6 @@ use crate::{
 
 const ROWS: u32 = 64;
 const LEARNER: u64 = 5;
-
-pub(crate) fn prioritised(capacity: u64, alpha: f64) -> Config {
-    Config {
-        sampling: Sampling::Prioritised {
-            alpha,
-            beta_start: 0.4,
-            beta_end: 1.0,
-            beta_updates: 100,
-        },
-        ..Config::unlimited(capacity)
-    }
-}
 
 /// A replay, all transitions that it ever stored, and their expected priorities.
 struct Setup {
