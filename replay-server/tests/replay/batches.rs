@@ -12,7 +12,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{Actor, is_refused, join, stored},
+    calls::{Actor, is_refused, join, prioritised, stored},
     history::{History, identity, spec},
 };
 
@@ -141,8 +141,7 @@ proptest! {
         channels in 1u32..6,
         n_step in 1u32..8,
         horizon in horizons(),
-        bootstrap in any::<bool>(),
-        lz4 in any::<bool>(),
+        (bootstrap, lz4, is_prioritised) in any::<(bool, bool, bool)>(),
         capacity in 24u64..160,
         (actors, streams) in (1u32..4, 1u32..4),
     ) {
@@ -151,7 +150,10 @@ proptest! {
         if bootstrap {
             spec.timeout = TimeoutRule::Bootstrap;
         }
-        let mut config = Config::unlimited(capacity);
+        let mut config = match is_prioritised {
+            true => prioritised(capacity, 0.5),
+            false => Config::unlimited(capacity),
+        };
         if lz4 {
             config.compression = Compression::Lz4;
         }
@@ -219,6 +221,10 @@ proptest! {
                     Ok(batch) => {
                         check_batch(&batch, &history);
                         rows_sampled += 8;
+                        let found = rng.random::<[f32; 8]>().map(|it| 100.0 * it);
+                        if let Some(update) = batch.priority_update(1, rows_sampled, &found) {
+                            replay.set_priorities(&update).unwrap();
+                        }
                     }
                     Err(not_ready) => {
                         prop_assert_eq!(not_ready, NotReady::Wait(Waiting::LearnerWaitsForActors));

@@ -3,9 +3,8 @@
 
 use std::collections::HashMap;
 
-use driml_protocol::{Batch, Horizon, Origin, PriorityPart, PriorityUpdate, RunSpec, TimeoutRule};
+use driml_protocol::{Batch, Horizon, Origin, PriorityPart, PriorityUpdate};
 use driml_replay_server::{Config, PRIORITY_MIN, PriorityCounts, Replay};
-use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -37,11 +36,8 @@ struct Setup {
 }
 
 impl Setup {
-    fn new(capacity: u64, alpha: Option<f64>, frame_stack: u32, timeout: TimeoutRule) -> Self {
-        let spec = RunSpec {
-            timeout,
-            ..spec(3, frame_stack, 4, Horizon::Uniform { k_max: 6 })
-        };
+    fn new(capacity: u64, alpha: Option<f64>, frame_stack: u32) -> Self {
+        let spec = spec(3, frame_stack, 4, Horizon::Uniform { k_max: 6 });
         let config = alpha.map_or(Config::unlimited(capacity), |alpha| {
             prioritised(capacity, alpha)
         });
@@ -169,7 +165,7 @@ fn draws_follow_the_law_of_their_rule() {
         (Some(1.0), 1),
     ];
     for (alpha, frame_stack) in cases {
-        let mut setup = Setup::new(200, alpha, frame_stack, TimeoutRule::Terminal);
+        let mut setup = Setup::new(200, alpha, frame_stack);
         for (rounds, what) in [(12, "a ring that is not full"), (20, "a full ring")] {
             for _ in 0..rounds {
                 setup.insert(0, 2, 5);
@@ -186,7 +182,7 @@ fn draws_follow_the_law_of_their_rule() {
 #[test]
 fn priorities_that_were_kept_follow_the_law_of_another_alpha() {
     for (before, now) in [(0.5, 0.5), (0.5, 1.0), (1.0, 0.3), (0.4, 0.0), (0.0, 0.6)] {
-        let mut setup = Setup::new(200, Some(before), 1, TimeoutRule::Terminal);
+        let mut setup = Setup::new(200, Some(before), 1);
         let (folder, spec) = (tempfile::tempdir().unwrap(), setup.history.spec.clone());
         let args = args(folder.path(), 1 << 20);
         let open = |alpha| Replay::open(&args, &spec, &prioritised(200, alpha), ROWS).unwrap();
@@ -212,7 +208,7 @@ fn priorities_that_were_kept_follow_the_law_of_another_alpha() {
 #[test]
 fn few_anchors_follow_the_law_too() {
     for alpha in [None, Some(0.5)] {
-        let mut setup = Setup::new(2000, alpha, 1, TimeoutRule::Terminal);
+        let mut setup = Setup::new(2000, alpha, 1);
         setup.history.ends = false;
         setup.insert(0, 1, 20);
         setup.insert(1, 900, 1);
@@ -229,7 +225,7 @@ fn counts(replay: &Replay) -> PriorityCounts {
 
 #[test]
 fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
-    let mut setup = Setup::new(100, Some(1.0), 1, TimeoutRule::Terminal);
+    let mut setup = Setup::new(100, Some(1.0), 1);
     setup.insert(0, 1, 60);
     let first = setup.learn().unwrap();
     let rows = u64::from(ROWS);
@@ -289,7 +285,7 @@ fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
 
 #[test]
 fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
-    let mut setup = Setup::new(100, Some(0.5), 1, TimeoutRule::Terminal);
+    let mut setup = Setup::new(100, Some(0.5), 1);
     setup.insert(0, 1, 60);
     let mut update = setup.learn().unwrap();
     update.number += 1;
@@ -310,26 +306,4 @@ fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
     let refused = uniform.set_priorities(&update).unwrap_err();
     assert_eq!(refused, "priorities, in a run that draws uniformly");
     assert_eq!(uniform.priority_counts(), None);
-}
-
-proptest! {
-    /// Stores chunks of several actors and shapes, with updates in between. After each step exactly the anchors have a mass, and rows equal
-    /// the reference.
-    #[test]
-    fn exactly_the_anchors_can_be_drawn(
-        steps in prop::collection::vec((0u32..4, 1u32..9, any::<bool>()), 1..40),
-        capacity in 30u64..90,
-        frame_stack in 1u32..5,
-        bootstraps in any::<bool>(),
-    ) {
-        let timeout = if bootstraps { TimeoutRule::Bootstrap } else { TimeoutRule::Terminal };
-        let mut setup = Setup::new(capacity, Some(0.5), frame_stack, timeout);
-        for (actor, steps, learns) in steps {
-            setup.insert(actor, 1 + actor % 2, steps.min(capacity as u32 / 2));
-            if learns && !setup.anchors().is_empty() {
-                setup.learn();
-                setup.replay.check_valid();
-            }
-        }
-    }
 }
