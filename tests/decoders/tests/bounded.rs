@@ -5,7 +5,6 @@
 
 use std::{
     fs,
-    io::Write,
     path::{Path, PathBuf},
 };
 
@@ -88,35 +87,11 @@ fn run_decoder(name: &str) {
     for number in 0..runs {
         let mut bytes = seeds.choose(&mut rng).unwrap().clone();
         mutate(&mut bytes, &seeds, &mut rng);
-        let report = ReportOnPanic {
-            name,
-            number,
-            bytes: &bytes,
-        };
-        decoder(report.bytes);
-        std::mem::forget(report);
-    }
-}
-
-/// Reports the bytes of an execution if the decoder panics.
-struct ReportOnPanic<'a> {
-    name: &'a str,
-    number: u64,
-    bytes: &'a [u8],
-}
-
-impl Drop for ReportOnPanic<'_> {
-    fn drop(&mut self) {
-        let Self {
-            name,
-            number,
-            bytes,
-        } = self;
-        let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
-        // The panic fails the test; the file with its bytes is only a help.
-        let _ = fs::write(&file, bytes);
-        let message = format!("{name}, execution {number}: {}\n", file.display());
-        let _ = std::io::stderr().write_all(message.as_bytes());
+        if std::panic::catch_unwind(|| decoder(&bytes)).is_err() {
+            let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
+            fs::write(&file, &bytes).unwrap();
+            panic!("{name}, execution {number}: {}", file.display());
+        }
     }
 }
 
