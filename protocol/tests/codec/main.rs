@@ -81,7 +81,8 @@ fn every_kind_has_a_sample_that_is_read() {
 /// Fuzzers of the decoders start with today's messages: `UPDATE_CORPUS=1` writes them.
 #[test]
 fn the_fuzzers_seeds_are_the_samples() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/decoders/fuzz/corpus/messages");
+    let folder =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/decoders/fuzz/corpus/messages");
     for (number, sample) in samples().iter().enumerate() {
         let file = folder.join(format!("sample-{number:02}"));
         if std::env::var_os("UPDATE_CORPUS").is_some() {
