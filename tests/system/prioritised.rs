@@ -1,4 +1,4 @@
-//! Rows drawn by priority, in whole runs with one and several replay servers. Servers that die are in `durable`, lockstep in `lockstep`.
+//! Rows drawn by priority, in a whole run with two replay servers. Servers that die are in `durable`, lockstep in `lockstep`.
 //! The distribution of the draws is tested beside the code.
 
 use driml_tests::Outcome;
@@ -21,30 +21,28 @@ pub(crate) const ROWS_WERE_SET: &str = "rows were set";
 /// The servers got the priorities of all updates that the learner counts as arrived. On a busy machine it exits before some arrive.
 #[test]
 fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
-    for flags in ["", "--actors 2 --replay-shards 2"] {
-        let system = system();
-        system.run_ok(&format!(
-            "local --agent driml-ada {SHORT} {PRIORITISED} {flags} --run-dir run"
-        ));
-        let run = system.run_folder("run");
-        let summary = run.check(Outcome::Finished);
-        let mut logs = system.file_names("run/logs");
-        logs.retain(|name| name.starts_with("replay-server"));
-        let all = logs.iter().map(|name| {
-            let log = system.read(&format!("run/logs/{name}"));
-            logged_counts::<3>(&log, ROWS_WERE_SET)
-        });
-        let sums = all.fold([0; 3], |sums, counts| {
-            std::array::from_fn(|at| sums[at] + counts[at])
-        });
-        let [set, gone, repeated] = sums;
-        let rows = summary.replay.rows_sampled;
-        let [arrived] = logged_counts(&run.log("learner"), "updates have arrived");
-        assert!(set + gone <= rows, "{sums:?} of {rows}");
-        assert!(arrived * 4 > summary.updates, "{arrived}");
-        let least = arrived * u64::from(ROWS);
-        assert!(set + gone >= least, "{sums:?}, {arrived} updates");
-        assert_eq!(repeated, 0);
-        assert!(gone * 10 < rows, "{sums:?} of {rows}");
-    }
+    let system = system();
+    system.run_ok(&format!(
+        "local --agent driml-ada {SHORT} {PRIORITISED} --actors 2 --replay-shards 2 --run-dir run"
+    ));
+    let run = system.run_folder("run");
+    let summary = run.check(Outcome::Finished);
+    let mut logs = system.file_names("run/logs");
+    logs.retain(|name| name.starts_with("replay-server"));
+    let all = logs.iter().map(|name| {
+        let log = system.read(&format!("run/logs/{name}"));
+        logged_counts::<3>(&log, ROWS_WERE_SET)
+    });
+    let sums = all.fold([0; 3], |sums, counts| {
+        std::array::from_fn(|at| sums[at] + counts[at])
+    });
+    let [set, gone, repeated] = sums;
+    let rows = summary.replay.rows_sampled;
+    let [arrived] = logged_counts(&run.log("learner"), "updates have arrived");
+    assert!(set + gone <= rows, "{sums:?} of {rows}");
+    assert!(arrived * 4 > summary.updates, "{arrived}");
+    let least = arrived * u64::from(ROWS);
+    assert!(set + gone >= least, "{sums:?}, {arrived} updates");
+    assert_eq!(repeated, 0);
+    assert!(gone * 10 < rows, "{sums:?} of {rows}");
 }
