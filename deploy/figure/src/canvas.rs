@@ -12,16 +12,16 @@ const FONTS: &str = "DejaVu Sans, Verdana, Segoe UI, Helvetica, Arial, sans-seri
 /// A point (x, y): x points to the right, y downwards.
 pub(super) type Point = (f64, f64);
 
-/// An axis-aligned rectangle, given by its upper left corner and its size.
+/// An axis-aligned rectangle, given by its upper left corner and its size: in pixels of a picture, or in cells of a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rect {
-    /// The distance of the left edge from the left edge of the picture, in pixels.
+    /// The distance of the left edge from that of the whole.
     pub x: f64,
-    /// The distance of the upper edge from the upper edge of the picture, in pixels.
+    /// The distance of the upper edge from that of the whole.
     pub y: f64,
-    /// The width in pixels.
+    /// The distance between left and right edge.
     pub width: f64,
-    /// The height in pixels.
+    /// The distance between upper and lower edge.
     pub height: f64,
 }
 

@@ -14,17 +14,6 @@ const BAR_WIDTH: f64 = 12.0;
 const CELL_TEXT_MIN: f64 = 25.0;
 const BAR_STEPS: usize = 64;
 
-/// A square frame that marks part of a map. Lengths are in cells, or in units of the [`Field`] if the map has one.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Outline {
-    /// Cells to the left of the square.
-    pub left: f64,
-    /// Cells above the square.
-    pub top: f64,
-    /// Cells along a side of the square.
-    pub side: f64,
-}
-
 /// The position of the cells in a larger square, such as the locations of a feature map in the input frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Field {
@@ -57,8 +46,8 @@ pub struct Heat {
     pub decimals: Option<usize>,
     /// The larger square in which the cells lie; `None` if the cells fill the map.
     pub field: Option<Field>,
-    /// A square frame that marks part of the map.
-    pub outline: Option<Outline>,
+    /// A frame that marks part of the map, in cells, or in units of the field if there is one.
+    pub outline: Option<Rect>,
 }
 
 impl Heat {
@@ -180,10 +169,10 @@ impl Heat {
 }
 
 /// Draws a marking frame over a map of square cells. `cell` is the drawn length of a unit of the outline.
-pub(super) fn draw_outline(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
-    let Outline { left, top, side } = outline;
-    let [left, top, side] = [left, top, side].map(|length| length * cell);
-    let rect = Rect::new(map.x + left, map.y + top, side, side);
+pub(super) fn draw_outline(canvas: &mut Canvas, map: Rect, cell: f64, outline: Rect) {
+    let lengths = [outline.x, outline.y, outline.width, outline.height];
+    let [left, top, width, height] = lengths.map(|length| length * cell);
+    let rect = Rect::new(map.x + left, map.y + top, width, height);
     canvas.frame(rect, CARD, 4.0);
     canvas.frame(rect, OUTLINE, 2.2);
 }

@@ -4,7 +4,7 @@
 use super::{
     canvas::{Canvas, Rect, draw_title},
     colours::{CARD_BORDER, CELL_DARK, CELL_LIGHT},
-    heat::{Outline, draw_outline},
+    heat::draw_outline,
 };
 
 /// A square grid of cells.
@@ -16,8 +16,8 @@ pub struct Lattice {
     pub side: usize,
     /// Whether each cell is dark, row by row.
     pub dark: Vec<bool>,
-    /// A square frame that marks part of the lattice.
-    pub outline: Option<Outline>,
+    /// A frame that marks part of the lattice, in cells.
+    pub outline: Option<Rect>,
 }
 
 impl Lattice {

@@ -46,7 +46,7 @@ pub use crate::{
     colours::{Colour, GREY},
     figure::{Figure, Format, Look, Panel},
     film::Film,
-    heat::{Field, Heat, Outline},
+    heat::{Field, Heat},
     lattice::Lattice,
     picture::{Ink, Picture},
     render::FigureError,

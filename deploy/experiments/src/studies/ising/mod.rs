@@ -4,7 +4,7 @@
 mod training;
 
 use driml_envs::WorldConfig;
-use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Outline, Panel, Series};
+use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Panel, Rect, Series};
 use driml_launch::metrics::rounded;
 use driml_machine::{error::usage, resources::Machine};
 use driml_settings::flags::resolve_names;
@@ -98,11 +98,8 @@ fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
     let shown = first.maps.len();
     let outline = |episode: usize| {
         let (top, left) = played.origins[episode];
-        Outline {
-            left: left as f64,
-            top: top as f64,
-            side: patch as f64,
-        }
+        let [left, top, side] = [left, top, patch].map(|it| it as f64);
+        Rect::new(left, top, side, side)
     };
     let lattice = |episode: usize, t: u32| {
         let bytes = side * side;
@@ -135,14 +132,12 @@ fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
         .map(|episode| lattice(episode, early_t))
         .chain((0..shown).map(|episode| lattice(episode, settings.late_t)))
         .chain((0..shown).map(scores));
+    let (rows, places) = (settings.batch_size, fields.columns * fields.columns);
     Ok(Figure {
         title: format!("Local DIM on a {patch} x {patch} Ising patch in noise"),
         notes: vec![format!(
             "Seed 1; episodes that were not trained on; the patch is outlined. Score: log-softmax of the true pair among \
-             {} episodes, plus ln {}, at each of the {} places of the last convolution.",
-            settings.batch_size,
-            settings.batch_size,
-            fields.columns * fields.columns,
+             {rows} episodes, plus ln {rows}, at each of the {places} places of the last convolution.",
         )],
         columns: shown,
         panel_size: (336.0, 280.0),
