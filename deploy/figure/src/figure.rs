@@ -96,28 +96,24 @@ impl Figure {
     /// Returns the series of one legend for all charts, each name once, if a chart's legend would take too much of its panel, or if the
     /// only legend would lack a series.
     fn shared_legend(&self, look: Look) -> Vec<&Series> {
-        let charts = || {
-            let panels = self.panels.iter();
-            panels.filter_map(|panel| match panel {
-                Panel::Chart(chart) => Some(chart),
-                Panel::Heat(_) | Panel::Lattice(_) => None,
-            })
-        };
+        let legends = self.panels.iter().map(|panel| match panel {
+            Panel::Chart(chart) => chart.named_series().collect(),
+            Panel::Heat(_) | Panel::Lattice(_) => Vec::new(),
+        });
+        let legends: Vec<Vec<&Series>> = legends.collect();
         let (width, height) = self.panel_size;
+        let height_max = LEGEND_SHARE_MAX * height;
+        let is_large = |it: &Vec<&Series>| legend_height(width, it.clone()) > height_max;
         let mut shared: Vec<&Series> = Vec::new();
-        let mut heights = charts().map(|chart| legend_height(width, chart.named_series()));
-        let first: Vec<&str> = match self.panels.first() {
-            Some(Panel::Chart(chart)) => chart.named_series().map(|it| &*it.name).collect(),
-            _ => Vec::new(),
-        };
-        let mut all = charts().flat_map(Chart::named_series);
-        let lacks_a_name = look == Look::Plain && all.any(|it| !first.contains(&&*it.name));
-        if lacks_a_name || heights.any(|it| it > LEGEND_SHARE_MAX * height) {
-            for series in charts().flat_map(Chart::named_series) {
-                if shared.iter().all(|it| it.name != series.name) {
-                    shared.push(series);
-                }
+        for series in legends.iter().flatten() {
+            if shared.iter().all(|it| it.name != series.name) {
+                shared.push(series);
             }
+        }
+        let is_in_first = |it: &&Series| legends[0].iter().any(|first| first.name == it.name);
+        let lacks_a_name = look == Look::Plain && !shared.iter().all(is_in_first);
+        if !lacks_a_name && !legends.iter().any(is_large) {
+            shared.clear();
         }
         shared
     }
