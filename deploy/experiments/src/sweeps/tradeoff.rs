@@ -208,7 +208,6 @@ impl Tradeoff<'_> {
         let seeds = self.settings.seed_count(point == base) as usize;
         let unfinished = seeds - finished.map_or(0, |it| it.count);
         let each = match finished {
-            _ if unfinished == 0 => 0.0,
             Some(finished) => finished.mean,
             // The time of finished base runs corrects the estimate from the benchmark.
             None => match taken(base) {

@@ -24,10 +24,8 @@ const EPSILON: f64 = 0.1;
 
 struct TimedWork {
     update: Work<'static>,
-    rows: usize,
-    /// Choosing an action for one frame of each of `envs` environments, as an actor does.
+    /// Choosing an action for one frame of each environment, as an actor does.
     act: Work<'static>,
-    envs: usize,
     weights_bytes: usize,
 }
 
@@ -46,8 +44,6 @@ fn timed_work(config: &RunConfig) -> anyhow::Result<TimedWork> {
     let frames: Vec<u8> = frames.take(envs * config.model.frame_len()).collect();
     let mut actions = vec![0; envs];
     Ok(TimedWork {
-        rows: fixed.action.len(),
-        envs,
         weights_bytes: weights.len(),
         update: Box::new(move || {
             agent.update(&fixed.batch())?;
@@ -63,18 +59,20 @@ pub(super) fn speeds(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow
     let (from, to) = (timed_work(base)?, timed_work(level)?);
     let updates = meter.rates_in_turn(&mut [from.update, to.update])?;
     let acts = meter.rates_in_turn(&mut [from.act, to.act])?;
-    let gain =
-        |rates: &[f64], from: usize, to: usize| rates[1] * to as f64 / (rates[0] * from as f64);
+    let gain = |rates: &[f64], size: fn(&RunConfig) -> u32| {
+        let [from, to] = [base, level].map(|it| f64::from(size(it)));
+        rates[1] * to / (rates[0] * from)
+    };
     let run = &level.run;
     let frame_bytes = run.frame_height * run.frame_width * run.frame_channels;
     let measured = [
         // The time of an update of the whole batch, and the rows learned per second as a multiple of the base's.
         ("update_seconds", 1.0 / updates[1]),
-        ("rows_gain", gain(&updates, from.rows, to.rows)),
+        ("rows_gain", gain(&updates, |it| it.learner.batch_size)),
         // The time of an action for one frame, in a batch of as many frames as an actor has environments, and the frames acted on per
         // second as a multiple of the base's.
-        ("act_seconds", 1.0 / (acts[1] * to.envs as f64)),
-        ("act_gain", gain(&acts, from.envs, to.envs)),
+        ("act_seconds", 1.0 / (acts[1] * f64::from(level.actor.envs))),
+        ("act_gain", gain(&acts, |it| it.actor.envs)),
         // The size of one broadcast of the weights, and of one uncompressed frame as the actor sends it and the replay stores it.
         ("weights_bytes", to.weights_bytes as f64),
         ("frame_bytes", f64::from(frame_bytes)),

@@ -201,44 +201,34 @@ fn false_positives(results: &Results) -> (usize, f64) {
 const PANEL_COLUMNS: usize = 3;
 const PANEL_SIZE: (f64, f64) = (330.0, 250.0);
 
-struct Marker {
-    speed: f64,
-    value: f64,
-    ends: [f64; 2],
-}
-
 /// Draws return against frames per second: a panel for each dial with its base, all with the same axes. A dashed line joins the Pareto
 /// front of all dials. `returns` selects the return, and `name` is its name.
 fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
     let of_runs = results.points.values().flat_map(|it| it.values(returns));
     let all = Spread::of(of_runs);
     let (least, greatest) = all.map_or((0.0, 0.0), |it| (it.min, it.max));
+    // Returns the point of a result and the bar of its interval.
     let place = |point: &PointResult| {
-        let value = point.mean(returns)?;
+        let (value, speed) = (point.mean(returns)?, point.mean(FRAMES_PER_SECOND)?.mean);
         let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
-        Some(Marker {
-            speed: point.mean(FRAMES_PER_SECOND)?.mean,
-            value: value.mean,
-            // Few seeds may give an interval that is far wider than the range of all returns.
-            ends: [low.max(least), high.min(greatest)],
-        })
+        // Few seeds may give an interval that is far wider than the range of all returns.
+        let bar = (speed, low.max(least), high.min(greatest));
+        Some(((speed, value.mean), bar))
     };
-    let placed: Vec<Marker> = results.points.values().filter_map(place).collect();
+    let placed = results.points.values().filter_map(place);
+    let (placed, bars): (Vec<_>, Vec<_>) = placed.unzip();
     let front = front(&placed);
-    let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();
-    let values: Vec<f64> = placed.iter().flat_map(|it| it.ends).collect();
+    let speeds: Vec<f64> = placed.iter().map(|it| it.0).collect();
+    let values: Vec<f64> = bars.iter().flat_map(|it| [it.1, it.2]).collect();
     let label = format!("{name} return");
     let panels = results.rows_by_dial().map(|rows| {
         let line = Series::line("", 0, front.clone());
         let mut series = vec![line.with_colour(GREY).with_mark(Mark::Dashed)];
-        for (index, row) in rows.iter().enumerate() {
-            let Some(it) = place(row.result) else {
-                continue;
-            };
-            let point = Series::line(row.name, index, vec![(it.speed, it.value)]);
-            let bar = vec![(it.speed, it.ends[0], it.ends[1])];
-            series.push(point.with_band(bar).with_mark(Mark::Bars));
-        }
+        series.extend(rows.iter().enumerate().filter_map(|(index, row)| {
+            let (point, bar) = place(row.result)?;
+            let point = Series::line(row.name, index, vec![point]);
+            Some(point.with_band(vec![bar]).with_mark(Mark::Bars))
+        }));
         let (x, y) = (Axis::linear("frames/s"), Axis::linear(&label));
         let (x, y) = (x.covering(&speeds), y.covering(&values));
         Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series))
@@ -259,16 +249,13 @@ fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
 }
 
 /// Returns speed and value of the Pareto front, the slowest point first: no other point is faster and no worse, or better and no slower.
-fn front(placed: &[Marker]) -> Vec<(f64, f64)> {
-    let beaten = |it: &Marker| {
-        placed.iter().any(|other| {
-            other.speed >= it.speed
-                && other.value >= it.value
-                && (other.speed > it.speed || other.value > it.value)
-        })
+fn front(placed: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let is_beaten = |it: &(f64, f64)| {
+        let mut others = placed.iter().filter(|other| *other != it);
+        others.any(|other| other.0 >= it.0 && other.1 >= it.1)
     };
-    let front = placed.iter().filter(|it| !beaten(it));
-    let mut front: Vec<_> = front.map(|it| (it.speed, it.value)).collect();
+    let mut front = placed.to_vec();
+    front.retain(|it| !is_beaten(it));
     front.sort_by(|a, b| a.0.total_cmp(&b.0));
     front
 }
@@ -311,11 +298,6 @@ mod tests {
         let (slow_and_good, slow_and_bad) = ((1.0, 9.0), (1.0, 2.0));
         let (between, beaten, fast_and_bad) = ((3.0, 5.0), (2.0, 4.9), (5.0, 3.0));
         let all = [slow_and_good, slow_and_bad, fast_and_bad, between, beaten];
-        let all = all.map(|(speed, value)| Marker {
-            speed,
-            value,
-            ends: [value; 2],
-        });
         assert_eq!(front(&all), [slow_and_good, between, fast_and_bad]);
     }
 }
