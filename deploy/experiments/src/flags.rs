@@ -160,11 +160,7 @@ pub struct SweepArgs {
 }
 
 /// Reads an experiment's built-in settings: the table `full`, over it the table `smoke` for that length, and `--seeds`.
-pub(crate) fn read_settings<T: DeserializeOwned>(
-    name: &str,
-    text: &str,
-    flags: &ExperimentFlags,
-) -> T {
+pub(crate) fn read_settings<T: DeserializeOwned>(text: &str, flags: &ExperimentFlags) -> T {
     let read = || -> Result<T, toml::de::Error> {
         let mut lengths: BTreeMap<String, toml::Table> = toml::from_str(text)?;
         let mut settings = lengths.remove("full").unwrap_or_default();
@@ -174,9 +170,7 @@ pub(crate) fn read_settings<T: DeserializeOwned>(
         settings.extend(seeds);
         settings.try_into()
     };
-    read().unwrap_or_else(|e| {
-        panic!("the settings of {name} are built in, and a test reads them: {e}")
-    })
+    read().unwrap_or_else(|e| panic!("the settings are built in, and a test reads them: {e}"))
 }
 
 /// Expands each name with `expand` and drops duplicates, because runs of the same name would share a folder.

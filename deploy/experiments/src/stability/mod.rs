@@ -23,15 +23,14 @@ use crate::{
     flags::{self, ExperimentFlags},
 };
 
-const NAME: &str = "stability";
 const SETTINGS: &str = include_str!("config.toml");
 const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,input";
 
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
+    let settings: Settings = flags::read_settings(SETTINGS, args);
     let table = checks::table(&settings);
     let units = table.len() as u64 * u64::from(settings.seeds);
-    let mut session = Session::open(NAME, args, &settings, units, false)?;
+    let mut session = Session::open("stability", args, &settings, units, false)?;
     let mut rows: Vec<Row> = Vec::new();
     for (at, property) in table.iter().enumerate() {
         let mut seeds = Vec::new();
@@ -190,7 +189,7 @@ mod tests {
     fn the_page_and_the_verdict_name_what_is_broken() {
         let reported = |worst: f64, input: &str| {
             let rows = [row(1, worst, input)];
-            let settings = flags::read_settings(NAME, SETTINGS, &parse("--smoke"));
+            let settings = flags::read_settings(SETTINGS, &parse("--smoke"));
             let values = page_values(&rows, &settings);
             let page = crate::page::render_page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)

@@ -283,7 +283,7 @@ mod tests {
     use super::*;
     use crate::{
         flags::{self, tests::parse},
-        stability::{NAME, SETTINGS},
+        stability::SETTINGS,
     };
 
     #[test]
@@ -304,7 +304,7 @@ mod tests {
                 cases.record_errors(format_args!("4"), [Some(f64::NAN), None])
             })
             .check("failing", Listed, |_| anyhow::bail!("no memory"));
-        let settings = flags::read_settings(NAME, SETTINGS, &parse("--smoke"));
+        let settings = flags::read_settings(SETTINGS, &parse("--smoke"));
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
         let tallies = halving.run(&settings, rng, progress).unwrap();

@@ -11,7 +11,7 @@ use minijinja::{Value, context};
 
 use self::{
     results::{LOSSES, Results, Trace},
-    settings::{EPISODE_FRAMES_MAX, NAME, PART_NAMES, PARTS},
+    settings::{EPISODE_FRAMES_MAX, PART_NAMES, PARTS},
 };
 use crate::{
     cache::Session,
@@ -29,7 +29,7 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let plans: Vec<_> = plans.collect();
     let report = args.queue.report;
     install_worlds(&plans, report)?;
-    let mut session = Session::open(NAME, &args.flags, &settings, 0, report)?;
+    let mut session = Session::open("pacman", &args.flags, &settings, 0, report)?;
     let made = queue::run_all(&mut session, plans, settings.jobs)?;
     session.check_has_runs(&made)?;
     let results = Results::read(settings, made)?;

@@ -13,7 +13,7 @@ use driml_protocol::RETURNS_MAX;
 use minijinja::{Value, context};
 use serde::Serialize;
 
-use self::settings::{CHECKPOINTS_PLAYED, NAME, Point, Settings};
+use self::settings::{CHECKPOINTS_PLAYED, Point, Settings};
 use crate::{
     cache::Session,
     flags::ProcgenArgs,
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let units = plans.len() as u64 * 2 * play.units;
     let report = args.queue.report;
     install_worlds(&plans, report)?;
-    let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;
+    let mut session = Session::open("procgen", &args.flags, &settings, units, report)?;
     let made = queue::run_all(&mut session, plans, settings.jobs)?;
     session.check_has_runs(&made)?;
     let mut scored = Vec::new();

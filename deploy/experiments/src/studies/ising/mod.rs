@@ -18,7 +18,6 @@ use crate::{
     stats::Spread,
 };
 
-const NAME: &str = "ising";
 const SETTINGS: &str = include_str!("config.toml");
 /// The number of updates over which the drawn loss is averaged.
 const LOSS_WINDOW: usize = 10;
@@ -42,10 +41,10 @@ fn new_task(settings: &Settings) -> anyhow::Result<Task> {
 }
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
+    let settings: Settings = flags::read_settings(SETTINGS, args);
     let task = new_task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
-    let mut session = Session::open(NAME, args, &task, units, false)?;
+    let mut session = Session::open("ising", args, &task, units, false)?;
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
         let piece =
@@ -209,13 +208,13 @@ mod tests {
     use crate::flags::tests::parse;
 
     pub(super) fn smoke() -> Settings {
-        flags::read_settings(NAME, SETTINGS, &parse("--smoke"))
+        flags::read_settings(SETTINGS, &parse("--smoke"))
     }
 
     #[test]
     fn both_lengths_read_and_ask_for_local_dim_alone() {
         for length in ["", "--smoke"] {
-            let settings = flags::read_settings(NAME, SETTINGS, &parse(length));
+            let settings = flags::read_settings(SETTINGS, &parse(length));
             let task = new_task(&settings).unwrap();
             // From the paper's table of parameters.
             let local = [true, false, false, false];

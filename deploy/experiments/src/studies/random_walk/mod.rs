@@ -23,14 +23,13 @@ use crate::{
     stats::{Spread, mean},
 };
 
-const NAME: &str = "random-walk";
 const SETTINGS: &str = include_str!("config.toml");
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let settings: Settings = flags::read_settings(NAME, SETTINGS, args);
+    let settings: Settings = flags::read_settings(SETTINGS, args);
     let pieces = settings.alphas.len() * Sampling::ALL.len() * settings.seeds as usize;
     let units = pieces as u64 * settings.updates;
-    let mut session = Session::open(NAME, args, &settings, units, false)?;
+    let mut session = Session::open("random-walk", args, &settings, units, false)?;
 
     let mut trained = Vec::with_capacity(pieces);
     let grid = Sampling::ALL.into_iter().flat_map(|sampling| {
@@ -316,7 +315,7 @@ mod tests {
     #[test]
     fn both_lengths_read_and_have_the_figure_s_alpha() {
         for length in ["", "--smoke"] {
-            let settings: Settings = flags::read_settings(NAME, SETTINGS, &parse(length));
+            let settings: Settings = flags::read_settings(SETTINGS, &parse(length));
             assert!(settings.alphas.contains(&settings.figure_alpha));
             assert!(settings.alphas.iter().all(|a| 0.0 < *a && *a < 1.0));
             assert!(settings.states >= 2 && settings.seeds > 0 && settings.updates > 0);

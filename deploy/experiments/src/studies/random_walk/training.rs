@@ -238,12 +238,12 @@ mod tests {
     use super::*;
     use crate::{
         flags::{self, ExperimentFlags},
-        studies::random_walk::{NAME, SETTINGS},
+        studies::random_walk::SETTINGS,
     };
     use driml_protocol::GracefulShutdown;
 
     fn settings() -> Settings {
-        flags::read_settings(NAME, SETTINGS, &ExperimentFlags::default())
+        flags::read_settings(SETTINGS, &ExperimentFlags::default())
     }
 
     #[test]

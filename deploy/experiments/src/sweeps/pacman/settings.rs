@@ -9,8 +9,6 @@ use crate::{
     sweep::plan::{PlannedRun, PointPlan, TrainCall},
 };
 
-pub(super) const NAME: &str = "pacman";
-
 /// The approximate number of frames of an episode, used only to estimate the time left.
 const EPISODE_FRAMES: u64 = 190;
 /// The most frames of an episode: the step limit of the world. With this many frames per episode a run has all its episodes.
@@ -136,7 +134,7 @@ impl Settings {
 
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
-    let mut settings: Settings = flags::read_settings(NAME, text, &args.flags);
+    let mut settings: Settings = flags::read_settings(text, &args.flags);
     if !args.agents.is_empty() {
         settings.agents = expand_unique(&args.agents, |name| {
             Ok(vec![presets::agent(name)?.name.to_owned()])

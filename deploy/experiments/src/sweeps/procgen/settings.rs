@@ -14,7 +14,7 @@ use crate::{
     },
 };
 
-pub(super) const NAME: &str = "procgen";
+const SETTINGS: &str = include_str!("../procgen.toml");
 /// The number of newest checkpoints of a run that play.
 pub(super) const CHECKPOINTS_PLAYED: u32 = 3;
 /// Playing counts as 1 / this of the work of a run, used only to estimate the time left.
@@ -52,8 +52,7 @@ pub(super) struct Point {
 
 impl Settings {
     pub(super) fn from_args(args: &ProcgenArgs) -> Result<Self, Usage> {
-        let mut settings: Self =
-            flags::read_settings(NAME, include_str!("../procgen.toml"), &args.flags);
+        let mut settings: Self = flags::read_settings(SETTINGS, &args.flags);
         if !args.games.is_empty() {
             settings.games.clone_from(&args.games);
         }
@@ -146,7 +145,7 @@ mod tests {
     use crate::flags::tests::parse;
 
     fn settings(length: &str) -> Settings {
-        flags::read_settings(NAME, include_str!("../procgen.toml"), &parse(length))
+        flags::read_settings(SETTINGS, &parse(length))
     }
 
     #[test]
