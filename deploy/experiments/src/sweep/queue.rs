@@ -334,18 +334,16 @@ impl Queue {
             ask_to_stop(&running.child, &running.job.plan.name);
         }
         let deadline = Instant::now() + DRAIN_MAX;
-        while !self.running.is_empty() {
-            if progress.shutdown().immediate.is_set() || Instant::now() > deadline {
-                for running in &mut self.running {
-                    // The child may have exited by itself in the meantime.
-                    let _ = running.child.kill();
-                    let _ = running.child.wait();
-                }
-                return;
-            }
-            self.running
-                .retain_mut(|running| matches!(running.child.try_wait(), Ok(None)));
+        let is_over = || progress.shutdown().immediate.is_set() || Instant::now() > deadline;
+        while !self.running.is_empty() && !is_over() {
+            let is_running = |it: &mut RunningJob| matches!(it.child.try_wait(), Ok(None));
+            self.running.retain_mut(is_running);
             std::thread::sleep(POLL);
+        }
+        for running in &mut self.running {
+            // The child may have exited by itself in the meantime.
+            let _ = running.child.kill();
+            let _ = running.child.wait();
         }
     }
 }
