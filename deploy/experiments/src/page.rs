@@ -7,7 +7,7 @@ use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context
 
 use crate::{
     flags::this_command_line,
-    stats::{Spread, difference, interval, mean},
+    stats::{Spread, difference, interval, mean, verdict},
 };
 
 const SMOKE_WARNING: &str =
@@ -82,12 +82,12 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     });
     environment.add_filter("minus", |to: Value, from: Value| {
         let (to, from) = (numbers_of(&to)?, numbers_of(&from)?);
-        let found = difference(&from, &to).map(|it| format!("{:+}", it.interval));
+        let found = difference(&from, &to).map(|it| format!("{it:+}"));
         Ok::<_, Error>(found.unwrap_or_else(|| "-".into()))
     });
     environment.add_filter("verdict", |to: Value, from: Value| {
         let (to, from) = (numbers_of(&to)?, numbers_of(&from)?);
-        Ok::<_, Error>(difference(&from, &to).map_or("", |it| it.verdict()))
+        Ok::<_, Error>(verdict(&from, &to))
     });
     let text = environment.render_str(template, values)?;
     let blocks = text.split("\n\n").map(str::trim);

@@ -40,36 +40,9 @@ pub(crate) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| mean_and_deviation(values).0)
 }
 
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Difference {
-    /// Welch's 95% interval, with the degrees of freedom rounded down. It has no ends if either side has a single value.
-    pub(crate) interval: Interval,
-    /// Whether 0 is outside the interval and the exact permutation test gives p <= 5%. The second condition is needed because a few values
-    /// may nearly coincide, and then the interval is too narrow. With more than 20 values the interval alone decides.
-    pub(crate) differs: bool,
-}
-
-impl Difference {
-    /// Returns the verdict as the end of a sentence.
-    pub(crate) const fn verdict(&self) -> &'static str {
-        match (self.differs, self.interval.mean > 0.0) {
-            (false, _) => "",
-            (true, true) => ", better than its base",
-            (true, false) => ", worse than its base",
-        }
-    }
-}
-
-/// Returns the mean of `to` minus the mean of `from`; `None` if either is empty.
-pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
-    let interval = welch_interval(from, to)?;
-    let excludes_zero = |(low, high)| low > 0.0 || high < 0.0;
-    let differs = interval.ends.is_some_and(excludes_zero)
-        && permutation_p_value(from, to).is_none_or(|it| it <= P_VALUE_MAX);
-    Some(Difference { interval, differs })
-}
-
-fn welch_interval(from: &[f64], to: &[f64]) -> Option<Interval> {
+/// Returns the mean of `to` minus the mean of `from` with Welch's 95% interval, for which the degrees of freedom are rounded down. It has
+/// no ends if either side has a single value. `None` if either is empty.
+pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Interval> {
     let [from, to] = [from, to].map(|it| Spread::of(it.iter().copied()));
     let (from, to) = from.zip(to)?;
     let mean = to.mean - from.mean;
@@ -89,18 +62,33 @@ fn welch_interval(from: &[f64], to: &[f64]) -> Option<Interval> {
     Some(Interval { mean, ends })
 }
 
+/// Whether the means differ: 0 is outside the interval of their difference, and the exact permutation test gives p <= 5%. The second
+/// condition is needed because a few values may nearly coincide, and then the interval is too narrow. With more than 20 values the interval
+/// alone decides.
+fn differ(from: &[f64], to: &[f64]) -> bool {
+    let ends = difference(from, to).and_then(|it| it.ends);
+    ends.is_some_and(|(low, high)| low > 0.0 || high < 0.0)
+        && permutation_p_value(from, to).is_none_or(|it| it <= P_VALUE_MAX)
+}
+
+/// Returns as the end of a sentence whether `to` is better than its base `from`.
+pub(crate) fn verdict(from: &[f64], to: &[f64]) -> &'static str {
+    match difference(from, to) {
+        Some(it) if differ(from, to) && it.mean > 0.0 => ", better than its base",
+        Some(_) if differ(from, to) => ", worse than its base",
+        _ => "",
+    }
+}
+
 /// The number of simulated pairs of samples in [`false_positive_rate`].
 const SIMULATIONS: usize = 2_000;
 
-/// Returns the share of pairs of samples of these sizes that [`difference`] calls apart although both have the same normal distribution.
+/// Returns the share of pairs of samples of these sizes of which [`differ`] is true although both have the same normal distribution.
 pub(crate) fn false_positive_rate(from: usize, to: usize) -> f64 {
     // The seed is fixed, so that the same sizes give the same page.
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let mut sample = |n: usize| -> Vec<f64> { (0..n).map(|_| draw_normal(&mut rng)).collect() };
-    let apart = (0..SIMULATIONS).filter(|_| {
-        let found = difference(&sample(from), &sample(to));
-        found.is_some_and(|it| it.differs)
-    });
+    let apart = (0..SIMULATIONS).filter(|_| differ(&sample(from), &sample(to)));
     apart.count() as f64 / SIMULATIONS as f64
 }
 
@@ -185,13 +173,14 @@ mod tests {
     fn a_difference_is_welchs() {
         // By hand: both sides have variance 1 and three values, so 4 degrees of freedom; 2.776 * sqrt(2 / 3) = 2.267.
         let found = difference(&[1.0, 2.0, 3.0], &[4.0, 5.0, 6.0]).unwrap();
-        let (low, high) = found.interval.ends.unwrap();
+        let (low, high) = found.ends.unwrap();
         assert!((low - 0.733).abs() < 1e-3 && (high - 5.267).abs() < 1e-3);
-        assert_eq!(found.interval.mean, 3.0);
-        let one = difference(&[1.0], &[4.0, 5.0]).unwrap();
-        assert_eq!((one.interval.ends, one.differs), (None, false));
+        assert_eq!(found.mean, 3.0);
+        let (one, two) = (&[1.0], &[4.0, 5.0]);
+        assert_eq!(difference(one, two).unwrap().ends, None);
+        assert!(!differ(one, two));
         let equal = difference(&[1.0; 2], &[2.0; 2]).unwrap();
-        assert_eq!(equal.interval.ends, Some((1.0, 1.0)));
+        assert_eq!(equal.ends, Some((1.0, 1.0)));
         assert_eq!(difference(&[], &[1.0]), None);
     }
 
@@ -243,8 +232,8 @@ mod tests {
         assert!(is(found, 1.0 / 84.0), "{found:?}");
         // Three values that nearly coincide with two of six: Welch's interval excludes 0, but the permutation test finds chance.
         let (from, to) = ([2.0, 2.02, 0.0, 0.0, 0.0, 0.02], [2.0, 2.01, 2.04]);
-        let judged = difference(&from, &to).unwrap();
-        assert!(judged.interval.ends.unwrap().0 > 0.0 && !judged.differs);
+        let ends = difference(&from, &to).unwrap().ends;
+        assert!(ends.unwrap().0 > 0.0 && !differ(&from, &to));
         let found = permutation_p_value(&from, &to);
         assert!(is(found, 9.0 / 84.0), "{found:?}");
         assert_eq!(permutation_p_value(&[1.0], &[]), None);

@@ -70,8 +70,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
         let measured = |name: &str| row.result.measured.get(name).copied().map(rounded);
         let of_runs = MEASURES.map(|measure| {
             let difference = row.difference(measure).filter(|_| !row.is_base);
-            let both = [row.result.mean(measure), difference.map(|it| it.interval)];
-            both.map(interval_cells)
+            [row.result.mean(measure), difference].map(interval_cells)
         });
         (
             (&row.dial.name, row.name, &row.dial.base),
@@ -129,10 +128,8 @@ impl EqualTime {
     }
 
     fn cells(&self) -> impl Serialize {
-        let minus_base = [&self.end, &self.then].map(|[base, level]| {
-            let difference = difference(base, level);
-            interval_cells(difference.map(|it| it.interval))
-        });
+        let returns = [&self.end, &self.then];
+        let minus_base = returns.map(|[base, level]| interval_cells(difference(base, level)));
         (&self.agent, &self.base, rounded(self.seconds), minus_base)
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::menu::{Common, Dial, DialLevel, Point};
 use crate::{
-    stats::{Difference, Interval, difference, interval, mean},
+    stats::{Interval, difference, interval, mean},
     sweep::plan::FinishedRun,
 };
 
@@ -101,7 +101,7 @@ pub(super) struct Row<'a> {
 
 impl Row<'_> {
     /// Returns level minus base, with its interval. Seeds are not paired: with real processes, two runs of one seed differ.
-    pub(super) fn difference(&self, measure: Measure) -> Option<Difference> {
+    pub(super) fn difference(&self, measure: Measure) -> Option<Interval> {
         difference(&self.base.values(measure), &self.result.values(measure))
     }
 
