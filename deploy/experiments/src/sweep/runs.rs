@@ -131,17 +131,14 @@ impl Runs {
         commit: &str,
         resumed: bool,
     ) -> anyhow::Result<()> {
-        let earlier = match resumed {
-            true => self.read_commit(plan),
-            false => String::new(),
-        };
-        let commits = match earlier.split('+').any(|it| it == commit) {
-            true => earlier,
-            false if earlier.is_empty() => commit.to_owned(),
-            false => format!("{earlier}+{commit}"),
-        };
+        let earlier = resumed.then(|| self.read_commit(plan)).unwrap_or_default();
+        let mut commits: Vec<_> = earlier.split('+').filter(|it| !it.is_empty()).collect();
+        if !commits.contains(&commit) {
+            commits.push(commit);
+        }
         let call = serde_json::to_vec(&plan.call.args()).context("encoding a call")?;
         write_atomically(&self.path_beside(plan, "call.json"), &call)?;
+        let commits = commits.join("+");
         write_atomically(&self.path_beside(plan, "commit"), commits.as_bytes())
     }
 

@@ -186,10 +186,8 @@ impl Settings {
     ) -> Result<Self, Usage> {
         let menu: Menu = toml::from_str(include_str!("../tradeoff.toml"))
             .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"));
-        let length = match args.flags.smoke {
-            true => menu.smoke,
-            false => menu.full,
-        };
+        let smoke = args.flags.smoke;
+        let length = if smoke { menu.smoke } else { menu.full };
         let base = world_base(menu.world, world)?;
         let asked = [base.sets, length.sets, args.queue.sets.clone()];
         let (stored_frames, stored_jobs) = stored.map(|it| (it.frames, it.jobs)).unzip();
@@ -222,10 +220,7 @@ impl Settings {
     }
 
     pub(super) const fn seed_count(&self, is_base: bool) -> u32 {
-        match is_base {
-            true => BASE_SEEDS * self.seeds,
-            false => self.seeds,
-        }
+        self.seeds * if is_base { BASE_SEEDS } else { 1 }
     }
 }
 
