@@ -103,13 +103,13 @@ struct FullReplay {
 impl FullReplay {
     /// Fills a replay with the chunks of one actor, until it has stored more than `held` transitions.
     fn new(config: &RunConfig, held: u64, recording: &Recording) -> anyhow::Result<Self> {
-        let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
+        let mut next_chunk = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
         let rows = config.learner.batch_size;
         let mut replay = Replay::new(&config.run, &config.replay, rows)?;
         let join = ActorJoin::new(0, INCARNATION);
         replay.join_actor(join).map_err(anyhow::Error::msg)?;
         while replay.inserted_total() <= held {
-            let reply = replay.insert(&chunks.next_chunk());
+            let reply = replay.insert(&next_chunk());
             ensure!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
         }
         Ok(Self {

@@ -1,7 +1,7 @@
 //! Procgen frames that are recorded once, or black frames, from which benches make transitions.
 //! The loop and the recorder are those of an actor. Recording is not timed.
 
-use std::{iter::Cycle, path::Path, slice};
+use std::path::Path;
 
 use anyhow::Context;
 use driml_actor::{ActingLoop, ChunkRecorder, RandomPolicy};
@@ -105,38 +105,25 @@ impl Recording {
         std::fs::write(path, frames.concat()).with_context(|| format!("writing {}", path.display()))
     }
 
-    /// Returns the chunks of one actor, each of `shape` and in memory of `pool`. The recording repeats endlessly.
-    pub(super) fn chunks(&self, actor: u32, shape: ChunkShape, pool: BufferPool) -> Chunks<'_> {
+    /// Returns a function that fills the next chunk of an actor anew, as real actors do: of `shape`, in memory of `pool`. The recording
+    /// repeats endlessly.
+    pub(super) fn chunks(
+        &self,
+        actor: u32,
+        shape: ChunkShape,
+        pool: BufferPool,
+    ) -> impl FnMut() -> Chunk {
         let (streams, bytes) = (shape.streams, self.frame_bytes);
         let mut recorder = ChunkRecorder::new(pool, actor, INCARNATION, streams, bytes as u32);
         recorder.begin_chunk(1, shape.steps);
-        Chunks {
-            recorder,
-            steps: self.steps.iter().cycle(),
-            step_bytes: streams as usize * bytes,
+        let mut steps = self.steps.iter().cycle();
+        move || {
+            let chunk = steps.find_map(|it| {
+                let frames = &it.frames[..streams as usize * bytes];
+                recorder.record(frames, &it.actions, &it.rewards, &it.ends)
+            });
+            chunk.expect("a recording that plays round and round has no end")
         }
-    }
-}
-
-/// An endless sequence of an actor's chunks, each filled anew as a real actor's chunks are.
-pub(super) struct Chunks<'a> {
-    recorder: ChunkRecorder,
-    steps: Cycle<slice::Iter<'a, Step>>,
-    step_bytes: usize,
-}
-
-impl Chunks<'_> {
-    pub(super) const fn transitions(&self) -> u64 {
-        self.recorder.transitions_recorded()
-    }
-
-    pub(super) fn next_chunk(&mut self) -> Chunk {
-        let chunk = self.steps.find_map(|it| {
-            let frames = &it.frames[..self.step_bytes];
-            let recorder = &mut self.recorder;
-            recorder.record(frames, &it.actions, &it.rewards, &it.ends)
-        });
-        chunk.expect("a recording that plays round and round has no end")
     }
 }
 
@@ -151,11 +138,11 @@ mod tests {
             let frames = (0..STREAMS as u8).flat_map(|stream| [number, stream]);
             step.frames = frames.collect();
         }
-        let mut chunks = recording.chunks(3, ChunkShape::new(2, 3), BufferPool::new(1));
-        let (first, second) = (chunks.next_chunk(), chunks.next_chunk());
+        let mut next_chunk = recording.chunks(3, ChunkShape::new(2, 3), BufferPool::new(1));
+        let (first, second) = (next_chunk(), next_chunk());
         assert_eq!(first.frames(), [0, 0, 1, 0, 2, 0, 0, 1, 1, 1, 2, 1]);
         assert_eq!(second.frames(), [3, 0, 4, 0, 5, 0, 3, 1, 4, 1, 5, 1]);
         let numbers = [first, second].map(|it| (it.header.sequence, it.header.first_transition));
-        assert_eq!((numbers, chunks.transitions()), ([(0, 0), (1, 6)], 12));
+        assert_eq!(numbers, [(0, 0), (1, 6)]);
     }
 }

@@ -99,10 +99,11 @@ impl Server {
         let (client, alive) = self.join_run(Role::Actor(actor), who, &join)?;
         let limits = DeliveryLimits::from_config(&self.actor.actor);
         let delivery = Delivery::start(client, join, 0, limits, pool.clone(), Shutdown::default())?;
-        let mut chunks = recording.chunks(actor, shape, pool);
-        let started = Instant::now();
-        while !is_enough(chunks.transitions(), started) {
-            if !delivery.send(chunks.next_chunk()) {
+        let mut next_chunk = recording.chunks(actor, shape, pool);
+        let (mut sent, started) = (0, Instant::now());
+        while !is_enough(sent, started) {
+            sent += u64::from(shape.transitions());
+            if !delivery.send(next_chunk()) {
                 break;
             }
         }
@@ -113,7 +114,7 @@ impl Server {
             unwanted == 0,
             "transitions that the replay server did not store: {unwanted}"
         );
-        Ok(chunks.transitions() as f64 / seconds)
+        Ok(sent as f64 / seconds)
     }
 
     /// Measures batches per second, each read as a learner would.
