@@ -380,7 +380,7 @@ mod tests {
         // Ctrl-C while a piece is made: the piece is kept first.
         let stopped = session.load_or_make("", "slow", 1, |progress| {
             nix::sys::signal::raise(nix::sys::signal::Signal::SIGINT)?;
-            progress.shutdown().drain.wait();
+            progress.shutdown.drain.wait();
             Ok(5)
         });
         assert!(stopped.unwrap_err().is::<Interrupted>());

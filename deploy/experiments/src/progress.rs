@@ -19,7 +19,8 @@ pub(crate) struct Progress {
     started: Instant,
     task: String,
     screen: Screen,
-    shutdown: GracefulShutdown,
+    /// The flag `drain` is set by the first Ctrl-C or signal, `immediate` by the second.
+    pub(crate) shutdown: GracefulShutdown,
 }
 
 impl Progress {
@@ -78,11 +79,6 @@ impl Progress {
 
     pub(crate) fn line(&self, line: &str) {
         self.screen.print_line(line);
-    }
-
-    /// The shutdown flags: `drain` is set by the first Ctrl-C or signal, `immediate` by the second.
-    pub(crate) const fn shutdown(&self) -> &GracefulShutdown {
-        &self.shutdown
     }
 
     pub(crate) fn clear(&self) {

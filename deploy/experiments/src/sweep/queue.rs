@@ -334,7 +334,7 @@ impl Queue {
             ask_to_stop(&running.child, &running.job.plan.name);
         }
         let deadline = Instant::now() + DRAIN_MAX;
-        let is_over = || progress.shutdown().immediate.is_set() || Instant::now() > deadline;
+        let is_over = || progress.shutdown.immediate.is_set() || Instant::now() > deadline;
         while !self.running.is_empty() && !is_over() {
             let is_running = |it: &mut RunningJob| matches!(it.child.try_wait(), Ok(None));
             self.running.retain_mut(is_running);

@@ -47,8 +47,7 @@ const OVERHEAD: f64 = 1.3;
 /// The seconds that the processes of a run take to start, to save and to exit.
 const START_SECONDS: f64 = 4.0;
 
-struct Tradeoff<'a> {
-    args: &'a TradeoffArgs,
+struct Tradeoff {
     settings: Settings,
     session: Session,
     speeds: BTreeMap<String, Numbers>,
@@ -70,13 +69,12 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         shorten_runs(&mut settings, args.flags.smoke, budget_seconds)?;
     }
     let mut tradeoff = Tradeoff {
-        args,
         session: Session::open(&name, &args.flags, &settings.common, 0, report_only)?,
         settings,
         speeds: BTreeMap::new(),
     };
     let left = || (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
-    let measured = tradeoff.measure_speeds();
+    let measured = tradeoff.measure_speeds(args.flags.smoke);
     let chosen = measured.and_then(|()| tradeoff.choose_levels(left()));
     // The length of the runs is settled once a level fits.
     if is_new && (args.plan || !chosen.as_ref().is_ok_and(|it| it.contains(&true))) {
@@ -124,18 +122,18 @@ fn estimate_seconds(config: &RunConfig, speed: &Numbers) -> f64 {
     START_SECONDS + OVERHEAD * (updates + actions)
 }
 
-impl Tradeoff<'_> {
+impl Tradeoff {
     fn piece_units(&self) -> u64 {
         self.settings.common.frames / PIECE_SHARE
     }
 
     /// Benchmarks every requested level and its base. For other levels, and for a report, it only reads existing benchmarks.
-    fn measure_speeds(&mut self) -> anyhow::Result<()> {
-        let (smoke, settings) = (self.args.flags.smoke, &self.settings);
-        let (units, common) = (self.piece_units(), &settings.common);
+    fn measure_speeds(&mut self, smoke: bool) -> anyhow::Result<()> {
+        let (units, settings) = (self.piece_units(), &self.settings);
+        let (common, report) = (&settings.common, self.session.report_only);
         let inputs = format!("{}, {:?}, {:?}", common.env, common.preset, common.sets);
         let points = || settings.levels.iter().flat_map(DialLevel::points);
-        let is_wanted = |it: &&Point| !self.args.queue.report && settings.requests(it);
+        let is_wanted = |it: &&Point| !report && settings.requests(it);
         let keys = points().filter(is_wanted).map(|it| &it.key);
         let count = keys.collect::<BTreeSet<_>>().len() as u64;
         self.session.progress.add_work(units * count);
@@ -162,7 +160,7 @@ impl Tradeoff<'_> {
     /// Returns for each level whether it is run: it is requested and fits into the `left` seconds. Prints this plan. A report runs nothing.
     fn choose_levels(&self, left: f64) -> anyhow::Result<Vec<bool>> {
         let levels = &self.settings.levels;
-        if self.args.queue.report {
+        if self.session.report_only {
             return Ok(vec![false; levels.len()]);
         }
         let runs = Runs::open(&self.session.folder)?;
@@ -243,7 +241,7 @@ impl Tradeoff<'_> {
     /// Makes the chosen runs, and plays with the weights of these and of the runs that are already finished.
     fn make_runs(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
         let wanted = self.planned_runs(chosen)?;
-        let (units, report) = (self.piece_units(), self.args.queue.report);
+        let (units, report) = (self.piece_units(), self.session.report_only);
         install_worlds(&wanted, report)?;
         // The agent of each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
@@ -315,7 +313,7 @@ impl Tradeoff<'_> {
     fn record_command(&self) -> anyhow::Result<Vec<String>> {
         let mut all: Vec<String> = self.session.read_piece(COMMANDS_KEY).unwrap_or_default();
         let this = this_command_line();
-        if !all.contains(&this) && !self.args.queue.report {
+        if !all.contains(&this) && !self.session.report_only {
             all.push(this);
             self.session.store(COMMANDS_KEY, &all)?;
         }
