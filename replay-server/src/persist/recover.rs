@@ -152,7 +152,8 @@ struct LogReader<'a> {
     recovery: RecoveryReport,
     /// The oldest transition that was held, by the last snapshot.
     oldest: u64,
-    /// Whether the ring has the capacity that it had before and no limit in bytes, so that the number stored tells which are held.
+    /// Whether the ring has the capacity that it had before and no limit in bytes, in memory or on disk, so that the number stored tells
+    /// which are held.
     has_same_capacity: bool,
     /// Segments that cannot be used. They are renamed once it is known that others can.
     unusable: Vec<PathBuf>,
@@ -210,7 +211,8 @@ impl LogReader<'_> {
         let (stored, first_transition) = (self.replay.ring.inserted(), snapshot.inserted);
         self.oldest = snapshot.oldest;
         self.has_same_capacity = snapshot.capacity == self.replay.ring.capacity()
-            && self.replay.config.compressed_bytes_max.is_none();
+            && self.replay.config.compressed_bytes_max.is_none()
+            && self.replay.config.disk_bytes_max.is_none();
         self.replay.restore(snapshot).map_err(unusable)?;
         if !is_first && first_transition > stored {
             self.warn(format!(

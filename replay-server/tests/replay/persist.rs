@@ -340,7 +340,10 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     for _ in 0..12 {
         // Unlocks the folder.
         setup.replay = Replay::new(&test_spec(), &setup.config, ROWS).unwrap();
-        setup.replay = open(&setup.args, &setup.config).unwrap().0;
+        let (replay, recovery) = open(&setup.args, &setup.config).unwrap();
+        // What the budget removed before this start is not missing.
+        assert_eq!(recovery.warnings, [""; 0]);
+        setup.replay = replay;
         (0..300).for_each(|_| setup.store(1));
         let bytes = bytes_in(&setup.args.dir);
         assert!(bytes <= 4 << 20, "{bytes}");
