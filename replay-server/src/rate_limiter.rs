@@ -66,7 +66,9 @@ impl RateLimiter {
         let before = self.counts.other_shards;
         // Tolerance for transitions that a shard stores before the others report.
         let held_max = self.config.capacity_transitions;
+        // Each of them stores up to the end of the run, if no learner reports meanwhile.
         let max = self.config.transitions_max.unwrap_or(u64::MAX);
+        let max = max.saturating_mul(u64::from(self.config.shards) - 1);
         let inserted_max = max.max(before.inserted).saturating_add(held_max);
         if others.inserted > inserted_max {
             return Err(format!(

@@ -222,6 +222,13 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     replay.set_other_shards(most).unwrap();
     assert_eq!(replay.sample(8), Err(NotReady::Wait(HUNGRY)));
     replay.check_valid();
+    // Without a learner, each of two others stored the whole run.
+    let three = Config {
+        shards: 3,
+        ..config
+    };
+    let whole = ShardCounts::new(10_000, 0);
+    small_replay(&three).set_other_shards(whole).unwrap();
 }
 
 proptest! {
