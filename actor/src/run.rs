@@ -1,9 +1,9 @@
 //! Runs one actor process: joins the run, acts, and delivers chunks until it is told to stop or the run has enough transitions.
 //! The acting itself is in `collect`, which uses no network.
 
-use std::{sync::Arc, time::Duration};
+use std::{cell::OnceCell, sync::Arc, time::Duration};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use driml_envs::WorldName;
 use driml_protocol::{
     Activity, ActorJoin, ChunkPoll, InsertReply, Keys, Leave, Participant, RunClient, Shutdown,
@@ -119,7 +119,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         sequence: 0,
         leaving: false,
     };
-    let is_over = || matches!(client.ask(&poll, ASK_MAX), Ok(InsertReply::Finished { .. }));
+    let rejected = OnceCell::new();
+    let is_over = || match client.ask(&poll, ASK_MAX) {
+        Ok(InsertReply::Finished { .. }) => true,
+        Ok(InsertReply::Refused { why }) => rejected.set(why).is_ok(),
+        _ => false,
+    };
     // A world in its own process may take minutes to start. The replay server exits soon after the run.
     let built = {
         let (settings, pool) = (settings.clone(), pool.clone());
@@ -127,6 +132,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
             move || Collector::new(&settings, pool, incarnation, version, &first.safetensors);
         shutdown.run_unless_set("environments", build, is_over)?
     };
+    if let Some(why) = rejected.into_inner() {
+        bail!("the replay server rejected this actor: {why}");
+    }
     let Some(collector) = built else {
         return leave_early(!shutdown.is_set());
     };

@@ -177,6 +177,22 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     system.wait_until_all_have_ended();
 }
 
+/// An actor that its replay server no longer knows does not ask on until its world has started.
+#[test]
+fn an_actor_that_is_unknown_when_its_world_starts_exits() {
+    let system = system();
+    let env = numbered_world("");
+    let flags = format!("{SMALL_WORLD} --agent c51 --frames 1280 --env '{env}'");
+    let server = system.start_replay_server(&flags);
+    let _learner = system.start_learner("run");
+    let slow = "actor --env 'exec:echo starts >&2; exec sleep 1000'";
+    let mut actor = system.start_process(&system.connect_args(slow));
+    actor.wait_for_stderr("starts");
+    server.kill();
+    let _server = system.start_replay_server(&flags);
+    actor.fails("does not know this incarnation of actor 0");
+}
+
 /// Returns a Python with Gymnasium and ALE, installed once into cargo's folder for tests. If pip fails, reports the test as skipped.
 fn gymnasium() -> Option<String> {
     if skipped_offline() {
