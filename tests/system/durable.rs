@@ -149,6 +149,11 @@ fn kill_shards_after_updates(kill_points: impl IntoIterator<Item = u64>) {
     for log in ["shard-0/log.toml", "shard-1/log.toml"] {
         assert!(system.path("run/replay").join(log).exists());
     }
+    let shard = "--agent c51 --replay-dir run/replay --shard 1 --set replay.shards=2";
+    let server = format!("{shard} {} --actors 2", chain(6_400));
+    let mut server = system.start_process(&system.replay_server_args(&server));
+    server.wait_for_stderr("the replay in run/replay holds up to ");
+    server.kill();
 }
 
 #[test]
