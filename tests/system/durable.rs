@@ -249,6 +249,27 @@ fn a_resumed_run_continues_with_its_replay() {
     assert!(!system.path("run/episodes.aside-1.csv").exists());
 }
 
+/// Nothing is learned in a warm-up, but its frames are kept, and so are their rows of metrics.
+#[test]
+fn a_run_that_is_interrupted_in_its_warm_up_continues_there() {
+    let system = system();
+    let long = "--set replay.capacity_transitions=1000000 --set replay.warmup_transitions=1000000";
+    let flags = format!("--durable --agent c51 {} {long}", chain(2_000_000));
+    let process = system.start(&system.local_args(&flags));
+    drop(system.connect());
+    let run = system.run_folder("run");
+    let recorded = || run.table("metrics.csv").last::<u64>("frames");
+    wait_until("a row", || recorded() > Some(500));
+    process.interrupt().expect_code(130);
+    let warmup = run.summary().frames;
+    let frames = warmup + 500;
+    let flags = format!("--frames {frames} --set replay.warmup_transitions={warmup}");
+    system.run_ok(&format!("local --resume run {flags}"));
+    let summary = run.check(Outcome::Finished);
+    assert!(summary.updates >= 250, "{summary:#?}");
+    assert!(!system.path("run/metrics.aside-1.csv").exists());
+}
+
 /// The old processes still exit while the next launcher starts: the replay server waits for a frozen actor, and holds replay and endpoint.
 #[test]
 fn a_run_whose_launcher_was_killed_continues() {

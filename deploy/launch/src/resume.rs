@@ -259,9 +259,12 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
         ));
     }
     check_changes(folder, &before, &config, lockstep)?;
-    // Before the first update, only a run in lockstep keeps its frames and rows.
+    let shards = config.replay.shards;
+    let has_log = |shard| kept_capacity(&folder.replay(), shard, shards).is_some();
+    let replay_is_kept = lockstep || config.local.durable && (0..shards).all(has_log);
+    // Before the first update, a run without its replay begins anew.
     let (frames, rows) = match updates {
-        0 if !lockstep => (0, 0),
+        0 if !replay_is_kept => (0, 0),
         _ => (counts.frames(), counts.rows()),
     };
     let has_pace_changed = before.learner.batch_size != config.learner.batch_size
@@ -286,9 +289,6 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
              `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains it up to N frames"
         )));
     }
-    let shards = config.replay.shards;
-    let has_log = |shard| kept_capacity(&folder.replay(), shard, shards).is_some();
-    let replay_is_kept = lockstep || config.local.durable && (0..shards).all(has_log);
     let alpha = |it: &RunConfig| match it.replay.sampling {
         Sampling::Prioritised { alpha, .. } => Some(alpha),
         Sampling::Uniform {} => None,
@@ -305,7 +305,7 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
         updates,
         rows,
         frames,
-        replay_is_kept: replay_is_kept && (lockstep || updates > 0),
+        replay_is_kept,
         after_updates: updates,
         frames_max: config.frames(),
     };
