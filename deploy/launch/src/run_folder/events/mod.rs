@@ -11,7 +11,6 @@ use std::{
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
-use anyhow::Context;
 use driml_figure::{Ink, Picture, Rect};
 use driml_learner::checkpoint;
 use driml_protocol::ReplayStatus;
@@ -41,21 +40,21 @@ pub(super) struct Events {
 }
 
 impl Events {
-    /// Creates a file, which invalidates what earlier files of the run have beyond `frames_kept`.
+    /// Creates a file, which invalidates what earlier files of the run have beyond `frames_kept`. TensorBoard reads files in the order of
+    /// their names, so the second in this one's name is later than in the others, even if the clock was set back.
     pub(super) fn create(folder: &RunFolder, frames_kept: u64) -> anyhow::Result<Self> {
         let seconds = unix_seconds();
-        let name = |number: u32| match number {
-            0 => format!("{EVENTS_PREFIX}{:010}.driml", seconds as u64),
-            _ => format!("{EVENTS_PREFIX}{:010}.driml.{number}", seconds as u64),
-        };
-        let mut paths = (0..).map(|number| folder.path().join(name(number)));
-        let path = paths.find(|path| !path.exists());
-        let path = path.context("naming an event file")?;
+        let others = fs::read_dir(folder.path())?.flatten().filter_map(|it| {
+            let name = it.file_name().into_string().ok()?;
+            let second = name.strip_prefix(EVENTS_PREFIX)?.get(..10)?;
+            second.parse::<u64>().ok()
+        });
+        let newest = others.max();
+        let second = newest.map_or(0, |it| it + 1).max(seconds as u64);
+        let name = format!("{EVENTS_PREFIX}{second:010}.driml");
+        let path = folder.path().join(name);
         let mut first = encode::version(EventTime { seconds, step: 0 });
-        let is_events =
-            |it: fs::DirEntry| it.file_name().to_string_lossy().starts_with(EVENTS_PREFIX);
-        let mut others = fs::read_dir(folder.path())?.flatten();
-        if others.any(is_events) {
+        if newest.is_some() {
             let step = frames_kept + 1;
             first.extend(encode::restart_record(EventTime { seconds, step }));
         }
@@ -196,5 +195,10 @@ mod tests {
         }
         let what = "version, curves, histogram; version, what is taken back";
         assert_eq!(counts, [3, 2], "{what}");
+        // The clock was set back since the newest file was begun.
+        let named = |second: u64| root.path().join(format!("{EVENTS_PREFIX}{second}.driml"));
+        fs::write(named(5_000_000_000), "").unwrap();
+        Events::create(&folder, 70).unwrap();
+        assert!(named(5_000_000_001).exists());
     }
 }
