@@ -89,8 +89,8 @@ impl PolicyNetwork {
         let task = |frames: &[u8], values: &mut [f32]| {
             let frames = frames.chunks(TILE_FRAMES * frame_len);
             for (frames, values) in frames.zip(values.chunks_mut(TILE_FRAMES * actions)) {
-                let hidden = weights.torso.f4(frames);
-                let logits = weights.head.forward_relu(&hidden);
+                let hidden = (weights.torso)(frames);
+                let logits = (weights.head)(&hidden);
                 expected_returns(&logits, support, values);
             }
         };
@@ -136,8 +136,8 @@ pub fn argmax(values: &[f32]) -> u8 {
 
 /// Weights laid out for the fastest instruction set of this processor.
 struct Weights {
-    torso: Box<dyn ActingTorso>,
-    head: Box<dyn ReluLayer>,
+    torso: ActingTorso,
+    head: ReluLayer,
     /// The layers that `head` is merged from, kept to merge them with new noise. `Some` if the head is noisy.
     noisy_layers: Option<Vec<HeadLayer<Vec<f32>>>>,
 }

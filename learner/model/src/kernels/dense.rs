@@ -15,27 +15,18 @@ pub(crate) struct Dense<S: Simd> {
     inputs: usize,
 }
 
-/// A fully connected layer after a ReLU, for any instruction set.
-pub(crate) trait ReluLayer: Send + Sync {
-    /// Computes [n, out] from relu(`hidden`) [n, in].
-    fn forward_relu(&self, hidden: &[f32]) -> Buffer<f32>;
-}
+/// A fully connected layer after a ReLU, for any instruction set: computes [n, out] from relu(`hidden`) [n, in].
+pub(crate) type ReluLayer = Box<dyn Fn(&[f32]) -> Buffer<f32> + Send + Sync>;
 
 /// Builds the layer for the fastest instruction set of this processor.
 pub(crate) fn build_relu_layer(
     precision: Precision,
     Layer { weight, bias }: Layer<Vec<f32>>,
-) -> Box<dyn ReluLayer> {
-    with_simd!(AnySimd::fastest(precision), simd => Box::new(Dense::new(simd, &weight, bias)))
-}
-
-impl<S: Simd> ReluLayer for Dense<S> {
-    fn forward_relu(&self, hidden: &[f32]) -> Buffer<f32> {
-        let count = hidden.len() / self.inputs;
-        let mut active = Buffer::<S::Element>::new(count * self.row_len());
-        write_relu_rows(self.simd, hidden, self.inputs, &mut active);
-        self.forward(&active, count)
-    }
+) -> ReluLayer {
+    with_simd!(AnySimd::fastest(precision), simd => {
+        let layer = Dense::new(simd, &weight, bias);
+        Box::new(move |hidden: &[f32]| layer.forward_relu(hidden))
+    })
 }
 
 impl<S: Simd> Dense<S> {
@@ -85,6 +76,19 @@ impl<S: Simd> Dense<S> {
             .multiply_rows(simd, count, left, Mode::Add, &mut y, outputs);
         y
     }
+
+    fn forward_relu(&self, hidden: &[f32]) -> Buffer<f32> {
+        let count = hidden.len() / self.inputs;
+        let stride = self.row_len();
+        let mut active = Buffer::<S::Element>::new(count * stride);
+        let rows = active.chunks_exact_mut(stride);
+        for (row, hidden) in rows.zip(hidden.chunks_exact(self.inputs)) {
+            let (begin, end) = row.split_at_mut(self.inputs);
+            store_relu(self.simd, hidden, begin);
+            end.fill(S::Element::default());
+        }
+        self.forward(&active, count)
+    }
 }
 
 /// Pads rows of `len` scalars with zeros to whole steps of `DEPTH`.
@@ -99,14 +103,4 @@ pub(crate) fn pad_rows<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
         padded[len..].fill(E::default());
     }
     padded
-}
-
-/// Writes relu(`hidden`) [rows, cols] into rows padded to whole steps of `DEPTH`.
-fn write_relu_rows<S: Simd>(simd: S, hidden: &[f32], cols: usize, active: &mut [S::Element]) {
-    let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
-    for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
-        let (begin, end) = row.split_at_mut(cols);
-        store_relu(simd, hidden, begin);
-        end.fill(S::Element::default());
-    }
 }

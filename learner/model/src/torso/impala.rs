@@ -90,44 +90,38 @@ impl Torso for Impala {
         &self,
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
-    ) -> Box<dyn ActingTorso> {
+    ) -> ActingTorso {
         let (layers, fc) = (parameters.concatenated(), parameters.fc);
         let (shapes, (_, _, channels)) = stage_shapes(self.input, &self.widths);
-        with_simd!(AnySimd::fastest(precision), simd => Box::new(ActingStages {
-            simd,
-            stages: Stages::new(simd, &shapes, &layers, false),
-            fc: Dense::for_maps(simd, &fc.weight, fc.bias, channels),
-            takes_mean: self.takes_mean,
-        }))
+        let takes_mean = self.takes_mean;
+        with_simd!(AnySimd::fastest(precision), simd => {
+            let stages = Stages::new(simd, &shapes, &layers, false);
+            let fc = Dense::for_maps(simd, &fc.weight, fc.bias, channels);
+            Box::new(move |frames: &[u8]| f4(simd, &stages, takes_mean, &fc, frames))
+        })
     }
 }
 
-struct ActingStages<S: Simd> {
+fn f4<S: Simd>(
     simd: S,
-    stages: Stages<S>,
-    fc: Dense<S>,
+    stages: &Stages<S>,
     takes_mean: bool,
-}
-
-impl<S: Simd> ActingTorso for ActingStages<S> {
-    fn f4(&self, frames: &[u8]) -> Buffer<f32> {
-        let (simd, stages, inputs) = (self.simd, &self.stages, self.fc.inputs());
-        let images = frames.chunks_exact(stages.image_len());
-        let count = images.len();
-        let stride = self.fc.row_len();
-        let mut rows = Buffer::new(count * stride);
-        let (mut tape, mut f3) = (stages.allocate_tape(1), Buffer::new(stages.output_len()));
-        let each = rows.chunks_exact_mut(stride);
-        for (image, row) in images.zip(each) {
-            stages.forward(image, &mut tape, &mut f3);
-            if self.takes_mean {
-                write_rows(simd, &mean_of_locations(&f3, inputs), inputs, stride, row);
-            } else {
-                write_rows(simd, &f3, inputs, stride, row);
-            }
+    fc: &Dense<S>,
+    frames: &[u8],
+) -> Buffer<f32> {
+    let images = frames.chunks_exact(stages.image_len());
+    let (count, inputs, stride) = (images.len(), fc.inputs(), fc.row_len());
+    let mut rows = Buffer::new(count * stride);
+    let (mut tape, mut f3) = (stages.allocate_tape(1), Buffer::new(stages.output_len()));
+    for (image, row) in images.zip(rows.chunks_exact_mut(stride)) {
+        stages.forward(image, &mut tape, &mut f3);
+        if takes_mean {
+            write_rows(simd, &mean_of_locations(&f3, inputs), inputs, stride, row);
+        } else {
+            write_rows(simd, &f3, inputs, stride, row);
         }
-        self.fc.forward(&rows, count)
     }
+    fc.forward(&rows, count)
 }
 
 /// Computes the mean of `map` [locations, channels] over its locations.

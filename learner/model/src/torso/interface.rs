@@ -36,18 +36,12 @@ pub(crate) trait Torso: fmt::Debug + Send + Sync {
     ) -> candle_core::Result<(Option<Tensor>, Tensor)>;
 
     /// Builds the torso for an actor, with products in `precision`.
-    fn for_actor(
-        &self,
-        precision: Precision,
-        parameters: TorsoParameters<Vec<f32>>,
-    ) -> Box<dyn ActingTorso>;
+    fn for_actor(&self, precision: Precision, parameters: TorsoParameters<Vec<f32>>)
+    -> ActingTorso;
 }
 
-/// A torso with its parameters, for inference.
-pub(crate) trait ActingTorso: Send + Sync {
-    /// Computes f4 [n, hidden] before its ReLU, of frames [n, H, W, C], on the calling thread.
-    fn f4(&self, frames: &[u8]) -> Buffer<f32>;
-}
+/// A torso with its parameters, for inference: computes f4 [n, hidden] before its ReLU, of frames [n, H, W, C], on the calling thread.
+pub(crate) type ActingTorso = Box<dyn Fn(&[u8]) -> Buffer<f32> + Send + Sync>;
 
 #[derive(Clone, Debug)]
 pub(crate) struct TorsoParameters<T> {

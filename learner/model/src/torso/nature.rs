@@ -89,26 +89,20 @@ impl Torso for Nature {
         &self,
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
-    ) -> Box<dyn ActingTorso> {
+    ) -> ActingTorso {
         let channels = self.shapes.last().map_or(1, |last| last.channels_out);
         let (layers, fc) = (parameters.concatenated(), parameters.fc);
-        with_simd!(AnySimd::fastest(precision), simd => Box::new(ActingNature {
-            stack: Stack::new(simd, &self.shapes, &layers, false, false),
-            fc: Dense::for_maps(simd, &fc.weight, fc.bias, channels),
-        }))
+        with_simd!(AnySimd::fastest(precision), simd => {
+            let stack = Stack::new(simd, &self.shapes, &layers, false, false);
+            let fc = Dense::for_maps(simd, &fc.weight, fc.bias, channels);
+            Box::new(move |frames: &[u8]| f4(&stack, &fc, frames))
+        })
     }
 }
 
-struct ActingNature<S: Simd> {
-    stack: Stack<S>,
-    fc: Dense<S>,
-}
-
-impl<S: Simd> ActingTorso for ActingNature<S> {
-    fn f4(&self, frames: &[u8]) -> Buffer<f32> {
-        let (count, inputs) = (frames.len() / self.stack.image_len(), self.fc.inputs());
-        let mut maps = Buffer::<S::Element>::new(count * inputs);
-        self.stack.forward(Pixels::Bytes(frames), &mut maps);
-        self.fc.forward(&pad_rows(maps, inputs), count)
-    }
+fn f4<S: Simd>(stack: &Stack<S>, fc: &Dense<S>, frames: &[u8]) -> Buffer<f32> {
+    let (count, inputs) = (frames.len() / stack.image_len(), fc.inputs());
+    let mut maps = Buffer::<S::Element>::new(count * inputs);
+    stack.forward(Pixels::Bytes(frames), &mut maps);
+    fc.forward(&pad_rows(maps, inputs), count)
 }
