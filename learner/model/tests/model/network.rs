@@ -1,80 +1,13 @@
-//! The whole network: the DIM heads against their plain formula, determinism, and errors for wrong inputs.
-//! The learner's `parity` tests compare values with another framework.
+//! The whole network: determinism, and errors for wrong inputs.
+//! The learner's `parity` tests compare values and gradients of this project's kernels and of candle's with another framework.
 
-use candle_core::{DType, Device, Result, Tensor};
+use candle_core::{DType, Device, Tensor};
 use driml_model::{
-    Backward, ConvLayer, DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network,
-    Parameters, Precision, TorsoName,
+    Backward, DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network, Parameters,
+    Precision, TorsoName,
 };
 
-use crate::support::{
-    assert_close, bits, configs, floats, frames, parameters, pool, residual, rng, small,
-    with_biases,
-};
-
-/// Returns every output of the network for a batch, one after the other, and the gradients of their weighted sum.
-fn outputs_and_gradients(
-    config: &ModelConfig,
-    parameters: &Parameters,
-    kernels: Kernels,
-) -> Result<(Vec<Tensor>, Backward)> {
-    let network = Network::new(config, parameters, kernels).unwrap();
-    let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
-    let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
-    let noise = HeadNoise::draw(config, &mut rng(3));
-    let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
-    // Action 0 is taken by two rows that are not neighbours, and two of the five actions by none.
-    let taken = network.taken_logits(&features.f4, &[0, 4, 2, 2, 4, 0], noise.as_ref());
-    let f3 = features.require_f3().unwrap();
-    let outputs = vec![
-        network.q_values(&logits).unwrap(),
-        logits,
-        taken.unwrap(),
-        network.psi3(f3, &actions).unwrap(),
-        network.phi3(f3).unwrap(),
-        network.psi4(&features.f4, &actions).unwrap(),
-        network.phi4(&features.f4).unwrap(),
-        f3.clone(),
-        features.f4,
-    ];
-    let mut total = Tensor::new(0f32, &Device::Cpu)?;
-    for (seed, output) in (10..).zip(&outputs[1..]) {
-        let weights = floats(output.dims(), &mut rng(seed));
-        total = (total + (output * weights)?.sum_all()?)?;
-    }
-    Ok((outputs, Backward::of(&total)?))
-}
-
-#[test]
-fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
-    // The small networks have two strides that divide the kernel and one that does not. In the second layer
-    // of this one, rows are left over but no columns.
-    let uneven = ModelConfig {
-        width: 48,
-        ..small()
-    };
-    let even = ModelConfig {
-        conv: [(5, 8, 4), (7, 4, 2), (6, 1, 1)]
-            .map(|(out, kernel, stride)| ConvLayer::new(out, kernel, stride))
-            .to_vec(),
-        ..small()
-    };
-    for config in configs().chain([uneven, even]) {
-        let parameters = with_biases(&config);
-        let (ours, mut our_gradients) =
-            outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
-        let (theirs, mut their_gradients) =
-            outputs_and_gradients(&config, &parameters, Kernels::Candle)?;
-        for (index, (ours, theirs)) in ours.iter().zip(&theirs).enumerate() {
-            assert_close(&format!("output {index}"), theirs, ours, 1e-6);
-        }
-        for (name, var) in parameters.iter() {
-            let (ours, theirs) = (our_gradients.remove(var)?, their_gradients.remove(var)?);
-            assert_close(name, &theirs.unwrap(), &ours.unwrap(), 2e-6);
-        }
-    }
-    Ok(())
-}
+use crate::support::{bits, configs, floats, frames, parameters, pool, residual, rng, small};
 
 #[test]
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
@@ -85,7 +18,7 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
         let streams = if config.head.dueling { 2 } else { 1 };
         let noise = HeadNoise::draw(&config, &mut rng(3));
         let head = streams * if noise.is_some() { 4 } else { 2 };
-        let parameters = with_biases(&config);
+        let parameters = parameters(&config, 7);
         let kernels = Kernels::Fused(precision);
         let network = Network::new(&config, &parameters, kernels).unwrap();
         let batch = frames(&config, 61, &mut rng(2));

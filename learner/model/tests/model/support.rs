@@ -42,20 +42,6 @@ pub(crate) fn bits(tensor: &Tensor) -> Vec<u32> {
     values.iter().map(|value| value.to_bits()).collect()
 }
 
-/// Asserts equal shapes, and a difference whose 2-norm is at most `tolerance` times that of `wanted`.
-#[track_caller]
-pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, tolerance: f64) {
-    assert_eq!(found.dims(), wanted.dims(), "{what}");
-    let (found, wanted) = (values(found), values(wanted));
-    let norm = wanted.iter().map(|value| value * value).sum::<f64>().sqrt();
-    let squares = found.iter().zip(&wanted).map(|(a, b)| (a - b) * (a - b));
-    let error = squares.sum::<f64>().sqrt();
-    assert!(
-        error <= tolerance * norm,
-        "{what}: error {error}, norm {norm}"
-    );
-}
-
 /// A small network with all heads, whose widths do not fill registers.
 pub(crate) fn small() -> ModelConfig {
     ModelConfig {
@@ -143,18 +129,4 @@ pub(crate) fn q_values(
     let mut values = vec![0.0; frames.len() / config.frame_len() * 5];
     policy.q_values(frames, &mut values).unwrap();
     values
-}
-
-/// Initial parameters with random biases, which would otherwise be 0 and not matter.
-pub(crate) fn with_biases(config: &ModelConfig) -> Parameters {
-    let (parameters, rng) = (parameters(config, 7), &mut rng(8));
-    for (name, var) in parameters
-        .iter()
-        .filter(|(name, _)| name.ends_with(".bias") || name.ends_with(".bias_mu"))
-    {
-        let values = floats(var.dims(), rng);
-        var.set(&values)
-            .unwrap_or_else(|error| panic!("{name}: {error}"));
-    }
-    parameters
 }
