@@ -171,15 +171,8 @@ impl Resizer {
     /// If the two lengths are not whole images of the same number.
     pub fn apply(&self, images: &[u8], enlarged: &mut [u8]) {
         let count = images.len() / self.input_bytes();
-        assert!(
-            images.len() == count * self.input_bytes()
-                && enlarged.len() == count * self.output_bytes(),
-            "resizing {} bytes into {}, {} and {} an image",
-            images.len(),
-            enlarged.len(),
-            self.input_bytes(),
-            self.output_bytes()
-        );
+        let bytes = [self.input_bytes(), self.output_bytes()].map(|bytes| count * bytes);
+        assert_eq!([images.len(), enlarged.len()], bytes, "{count} images");
         let source_line = self.from.1 * self.channels;
         let line = self.source_cols.len() * self.channels;
         let images = images.chunks_exact(self.input_bytes());

@@ -37,20 +37,11 @@ pub fn kl(
     gradient: &mut [f32],
 ) -> f64 {
     let rows = logits.len() / atoms;
-    assert!(
-        rows > 0 && logits.len() == rows * atoms,
-        "whole rows of logits"
-    );
-    assert_eq!(logits.len(), target.len(), "logits and target [B, N]");
-    assert_eq!(
-        logits.len(),
-        gradient.len(),
-        "the gradient has the shape of the logits"
-    );
-    assert!(
-        weights.is_none_or(|it| it.len() == rows),
-        "a weight for each row"
-    );
+    let (len, weighted_rows) = (rows * atoms, weights.map_or(rows, <[f32]>::len));
+    assert!(rows > 0 && logits.len() == len, "whole rows of logits");
+    assert_eq!(target.len(), len, "logits and target [B, N]");
+    assert_eq!(gradient.len(), len, "logits and gradient [B, N]");
+    assert_eq!(weighted_rows, rows, "a weight for each row");
     let mut total = 0.0;
     for (row, ((logits, target), gradient)) in logits
         .chunks_exact(atoms)

@@ -34,16 +34,10 @@ pub fn slope_error(slope: f64, weight: f64, clip: ScoreClip, largest: f64) -> f6
 /// If the lengths disagree: the caller has checked its batch by then.
 pub fn info_nce(dots: &[f32], valid: &[u8], clip: ScoreClip, gradient: &mut [f32]) -> f64 {
     let rows = valid.len();
-    assert!(
-        rows > 0 && dots.len().is_multiple_of(rows * rows),
-        "dots [L, B, B]"
-    );
-    assert_eq!(
-        dots.len(),
-        gradient.len(),
-        "the gradient has the shape of the dots"
-    );
+    assert!(rows > 0, "no rows");
     let locations = dots.len() / (rows * rows);
+    assert_eq!(dots.len(), locations * rows * rows, "dots [L, B, B]");
+    assert_eq!(dots.len(), gradient.len(), "dots and gradient [L, B, B]");
     let candidates: Vec<usize> = (0..rows).filter(|&row| valid[row] != 0).collect();
     if candidates.is_empty() || locations == 0 {
         gradient.fill(0.0);

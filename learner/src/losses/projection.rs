@@ -35,15 +35,11 @@ pub fn project(
     out: &mut [f32],
 ) {
     let rows = reward.len();
-    assert!(
-        rows > 0 && discount.len() == rows,
-        "one reward and one discount a row"
-    );
+    assert!(rows > 0, "no rows");
+    assert_eq!(discount.len(), rows, "one reward and one discount a row");
     let atoms = probs.len() / rows;
-    assert!(
-        atoms >= 2 && probs.len() == rows * atoms,
-        "two atoms or more, whole rows"
-    );
+    assert!(atoms >= 2, "two atoms or more");
+    assert_eq!(probs.len(), rows * atoms, "whole rows");
     assert_eq!(probs.len(), out.len(), "the result has the shape of probs");
     assert!(v_min < v_max, "a support from {v_min} to {v_max}");
 

@@ -14,10 +14,8 @@ use crate::kernels::precision::Precision;
 /// # Panics
 /// If the lengths differ.
 pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slopes: &mut [f64]) {
-    assert!(
-        dots.len() == scores.len() && dots.len() == slopes.len(),
-        "a score and a slope for each dot product"
-    );
+    let lens = [scores.len(), slopes.len()];
+    assert_eq!(lens, [dots.len(); 2], "a score and a slope of each dot");
     with_simd!(AnySimd::fastest(Precision::F32), simd => clip(simd, dots, scale, bound, scores, slopes));
 }
 

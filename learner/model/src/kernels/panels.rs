@@ -24,11 +24,7 @@ pub(crate) struct Matrix<'a> {
 impl<'a> Matrix<'a> {
     /// Creates a matrix of `data` [rows, cols], row after row.
     pub(crate) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
-        assert!(
-            data.len() == rows * cols,
-            "a {rows}x{cols} matrix over {} scalars",
-            data.len()
-        );
+        assert_eq!(data.len(), rows * cols, "a {rows}x{cols} matrix");
         Self {
             data,
             rows,
@@ -275,11 +271,8 @@ impl<'a, E: Element> PackedRows<'a, E> {
     /// # Panics
     /// If the runs of `a` are not adjacent.
     pub(crate) fn pack<S: Simd<Element = E>>(simd: S, a: Matrix<'a>, threads: Threads) -> Self {
-        assert!(
-            a.data.len() == a.rows * a.cols,
-            "some columns of a matrix as a left operand"
-        );
         let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
+        assert_eq!(a.data.len(), m * k, "columns of a matrix as a left operand");
         let steps = k.div_ceil(depth);
         let line = ALIGNMENT / size_of::<E>();
         let (row_stride, step_stride) = match a.transposed && !S::LEFT_STEPS_ADJACENT {

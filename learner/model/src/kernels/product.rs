@@ -35,14 +35,7 @@ impl<'a> Product<'a> {
     /// # Panics
     /// If the shapes do not match.
     pub(crate) fn new(precision: Precision, a: Matrix<'a>, b: Matrix<'a>) -> Self {
-        assert!(
-            a.cols == b.rows,
-            "product of {}x{} and {}x{} matrices",
-            a.rows,
-            a.cols,
-            b.rows,
-            b.cols
-        );
+        assert_eq!(a.cols, b.rows, "the terms of a product's sums");
         Self {
             precision,
             a,
@@ -85,13 +78,8 @@ impl<'a> Product<'a> {
     /// # Panics
     /// If `out` has another length.
     pub(crate) fn write(self, out: &mut [f32], mode: Mode) {
-        assert!(
-            out.len() == self.a.rows * self.b.cols,
-            "a {}x{} product into {} scalars",
-            self.a.rows,
-            self.b.cols,
-            out.len()
-        );
+        let len = self.a.rows * self.b.cols;
+        assert_eq!(out.len(), len, "the scalars of a product");
         self.run(out, self.b.cols, mode);
     }
 
@@ -100,18 +88,11 @@ impl<'a> Product<'a> {
     /// # Panics
     /// If `sums` lacks these columns, or if the product has biases or a function for finished rows.
     pub(crate) fn add_to_columns(self, sums: &mut [f32], stride: usize, first: usize) {
-        let end = first + self.b.cols;
-        assert!(
-            sums.len() == self.a.rows * stride && end <= stride,
-            "a {}x{} product into columns {first}..{end} of {} rows of {stride}",
-            self.a.rows,
-            self.b.cols,
-            sums.len() / stride.max(1)
-        );
-        assert!(
-            self.biases.is_none() && self.after.is_none(),
-            "rows have gaps"
-        );
+        let (rows, end) = (self.a.rows, first + self.b.cols);
+        assert_eq!(sums.len(), rows * stride, "{rows} rows of {stride}");
+        assert!(end <= stride, "columns {first}..{end} of {stride}");
+        let is_plain = self.biases.is_none() && self.after.is_none();
+        assert!(is_plain, "rows have gaps");
         let last = sums.len() - stride + end;
         self.run(&mut sums[first..last], stride, Mode::Add);
     }

@@ -224,10 +224,7 @@ unsafe fn compute_adjacent_rows<S: Simd, T: TileRegisters>(
     rows: usize,
     vecs: usize,
 ) {
-    assert!(
-        tile.row_stride == 2,
-        "neither steps nor rows lie side by side"
-    );
+    assert_eq!(tile.row_stride, 2, "neither steps nor rows are adjacent");
     // The steps of all runs. In the panel they follow each other.
     let steps = tile.runs * tile.steps;
     let (tail, width) = (steps % TILE_STEPS, vecs * LANES);

@@ -44,11 +44,8 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
             };
             multiply_tile(simd, rows, left, &panel, output);
         }
-        assert!(
-            out.iter().all(|&sum| sum == depth as f32),
-            "sums of products of ones are {:?}",
-            &*out
-        );
+        let is_right = out.iter().all(|&sum| sum == depth as f32);
+        assert!(is_right, "sums of products of ones are {:?}", &*out);
     });
     2.0 * (threads * times * rows * cols * depth) as f64
 }
