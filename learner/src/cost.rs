@@ -35,26 +35,9 @@ impl UpdateShape {
     }
 }
 
-/// Operations of one update, for all rows: the multiplications and additions of matrix products alone, each counted as one.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct UpdateCost {
-    /// s_t through the torso, forward and backward.
-    pub online: u64,
-    /// s_t through the C51 head, forward and backward.
-    pub head: u64,
-    /// s_{t+n} through the target network, forward. Rows that do not bootstrap count here, although an update skips them.
-    pub target: u64,
-    /// s_{t+n} through the online network, forward, to choose an action.
-    pub double_dqn: u64,
-    /// States beyond s_t through the torso, forward and backward: augmented ones and positives.
-    pub states: u64,
-    /// States through the key encoder, forward.
-    pub keys: u64,
-    /// The auxiliary heads, forward and backward; a loss's extra layers count once per row.
-    pub heads: u64,
-    /// Dot products of all pairs of rows, and their gradients.
-    pub scores: u64,
-}
+/// Operations of one update, for all rows, by part: the multiplications and additions of matrix products alone, each counted as one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UpdateCost([(&'static str, u64); 8]);
 
 impl UpdateCost {
     /// The cost of an update of `shape` with the network `model`.
@@ -66,13 +49,8 @@ impl UpdateCost {
         };
         let forward = |parts: &[&str]| sum(parts, |layer| layer.forward);
         let learning = |parts: &[&str]| sum(parts, |layer| layer.forward + layer.backward);
-        let UpdateShape {
-            rows,
-            every_action,
-            double_dqn,
-            passes,
-        } = *shape;
-        let actions = if every_action {
+        let (rows, passes) = (shape.rows, shape.passes);
+        let actions = if shape.every_action {
             1
         } else {
             model.num_actions as u64
@@ -81,40 +59,40 @@ impl UpdateCost {
         let matrices = passes.local_scores * (height * width) as u64 + passes.global_scores;
         // The forward product and the gradients of both operands; keys have no gradient.
         let products = if passes.keys > 0 { 2 } else { 3 };
-        let value = forward(&["torso", "head"]);
+        let value = rows * forward(&["torso", "head"]);
+        let choice = value * u64::from(shape.double_dqn);
+        // A loss's extra layers count once per row.
         let loss_layers = model.loss_layers.iter().map(|it| learning(&[&it.prefix()]));
-        Self {
-            online: rows * learning(&["torso"]),
-            head: rows * learning(&["head"]) / actions,
-            target: rows * value,
-            double_dqn: rows * value * u64::from(double_dqn),
-            states: rows * passes.states * learning(&["torso"]),
-            keys: rows * passes.keys * forward(&["torso", "dim.psi4"]),
-            heads: rows
-                * (passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
-                    + passes.phi * learning(&["dim.phi3", "dim.phi4"])
-                    + loss_layers.sum::<u64>()),
-            scores: 2 * products * matrices * rows * rows * model.embedding_dim as u64,
-        }
+        let heads = passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
+            + passes.phi * learning(&["dim.phi3", "dim.phi4"])
+            + loss_layers.sum::<u64>();
+        let states = passes.states * learning(&["torso"]);
+        let keys = passes.keys * forward(&["torso", "dim.psi4"]);
+        let scores = products * matrices * rows * rows * model.embedding_dim as u64;
+        // Forward and backward, but for the target network, the choice of an action by double DQN, and keys.
+        Self([
+            ("s_t, torso", rows * learning(&["torso"])),
+            ("s_t, C51 head", rows * learning(&["head"]) / actions),
+            // Rows that do not bootstrap count here, although an update skips them.
+            ("s_{t+n}, target network", value),
+            ("s_{t+n}, online network", choice),
+            // Augmented states and positives.
+            ("more states, torso", rows * states),
+            ("states, key encoder", rows * keys),
+            ("psi and phi", rows * heads),
+            // Dot products of all pairs of rows, and their gradients.
+            ("scores", 2 * scores),
+        ])
     }
 
     /// All parts, with their names in a table.
     pub const fn parts(&self) -> [(&'static str, u64); 8] {
-        [
-            ("s_t, torso", self.online),
-            ("s_t, C51 head", self.head),
-            ("s_{t+n}, target network", self.target),
-            ("s_{t+n}, online network", self.double_dqn),
-            ("more states, torso", self.states),
-            ("states, key encoder", self.keys),
-            ("psi and phi", self.heads),
-            ("scores", self.scores),
-        ]
+        self.0
     }
 
     /// The sum of all parts.
     pub fn total(&self) -> u64 {
-        self.parts().iter().map(|it| it.1).sum()
+        self.0.iter().map(|it| it.1).sum()
     }
 }
 
@@ -146,15 +124,15 @@ mod tests {
             double_dqn: false,
             passes: Passes::default(),
         };
-        let plain = UpdateCost {
-            // The input needs no gradient.
-            online: 10 * (2 * conv + 3 * fc),
-            // One of the two actions.
-            head: 10 * 3 * head / 2,
-            target: 10 * value,
-            ..UpdateCost::default()
+        let counts = |model: &ModelConfig, shape: &UpdateShape| {
+            let parts = UpdateCost::compute(model, shape).parts();
+            parts.map(|it| it.1)
         };
-        assert_eq!(UpdateCost::compute(&model(DimHeads::NONE), &c51), plain);
+        // The input needs no gradient.
+        let torso = 10 * (2 * conv + 3 * fc);
+        // One of the two actions.
+        let plain = [torso, 10 * 3 * head / 2, 10 * value, 0, 0, 0, 0, 0];
+        assert_eq!(counts(&model(DimHeads::NONE), &c51), plain);
 
         let lambda = Lambda::from_values([1.0, 0.0, 0.0, 1.0]);
         let passes = Passes::for_pairs(lambda, 2, true);
@@ -170,23 +148,16 @@ mod tests {
         let phi3 = 2 * (2 * (4 * 3 * 4) + 4 * 4 * 4);
         let psi4 = 2 * (2 * (5 * 4 + 2 * 4) + 4 * 4);
         let phi4 = 2 * (2 * (5 * 4) + 4 * 4);
-        let expected = UpdateCost {
-            head: 10 * 3 * head,
-            double_dqn: 10 * value,
-            // Two positives and the augmented s_t.
-            states: 10 * 3 * (2 * conv + 3 * fc),
-            heads: 10 * (3 * (action.0 + psi3 + psi4) + 2 * action.1 + 2 * 3 * (phi3 + phi4)),
-            // Two positives, at four locations and of the global features.
-            scores: 3 * 2 * 2 * (4 + 1) * 10 * 10 * 4,
-            ..plain
-        };
-        let found = UpdateCost::compute(&model(lambda.dim_heads(true)), &dim);
-        assert_eq!(found, expected);
-        let c51 = found.online + found.head + found.target + found.double_dqn;
-        assert_eq!(
-            found.total(),
-            c51 + found.states + found.heads + found.scores
-        );
+        let heads = 3 * (action.0 + psi3 + psi4) + 2 * action.1 + 2 * 3 * (phi3 + phi4);
+        // Two positives, at four locations and of the global features.
+        let scores = 3 * 2 * 2 * (4 + 1) * 10 * 10 * 4;
+        let (head, value) = (10 * 3 * head, 10 * value);
+        // Two positives and the augmented s_t.
+        let expected = [torso, head, value, value, 3 * torso, 0, 10 * heads, scores];
+        let model = model(lambda.dim_heads(true));
+        assert_eq!(counts(&model, &dim), expected);
+        let total = UpdateCost::compute(&model, &dim).total();
+        assert_eq!(total, expected.iter().sum::<u64>());
     }
 
     #[test]
@@ -208,9 +179,9 @@ mod tests {
             },
         };
         let psi4 = 2 * (2 * 5 * 4 + 4 * 4);
-        let found = UpdateCost::compute(&model(heads), &shape);
-        assert_eq!(found.keys, 10 * (2 * 4 * 3 * 16 + 2 * 12 * 5 + psi4));
-        assert_eq!(found.heads, 10 * 3 * psi4);
-        assert_eq!(found.scores, 2 * 2 * 10 * 10 * 4);
+        let [.., keys, heads, scores] = UpdateCost::compute(&model(heads), &shape).parts();
+        assert_eq!(keys.1, 10 * (2 * 4 * 3 * 16 + 2 * 12 * 5 + psi4));
+        assert_eq!(heads.1, 10 * 3 * psi4);
+        assert_eq!(scores.1, 2 * 2 * 10 * 10 * 4);
     }
 }
