@@ -72,6 +72,24 @@ pub(crate) enum Threads {
     Pool,
 }
 
+impl Threads {
+    /// Calls `each` with the number of every chunk of `len` scalars, and the chunk. The last chunk may be shorter.
+    fn for_each_chunk<E: Send>(
+        self,
+        values: &mut [E],
+        len: usize,
+        each: impl Fn((usize, &mut [E])) + Sync + Send,
+    ) {
+        match self {
+            Self::Caller => values.chunks_mut(len).enumerate().for_each(each),
+            Self::Pool => {
+                let chunks = values.par_chunks_mut(len).with_max_len(1);
+                chunks.enumerate().for_each(each);
+            }
+        }
+    }
+}
+
 /// A right operand, cut into panels of columns. Each panel is [k / DEPTH, columns, DEPTH], padded with zeros.
 pub(crate) struct Panels<E: Element> {
     values: Buffer<E>,
@@ -109,23 +127,10 @@ impl<E: Element> Panels<E> {
         threads: Threads,
     ) {
         let width = self.vecs * LANES;
-        let pack = |(panel, values): (usize, &mut [E])| {
-            pack_panel(simd, b, rows, panel * width, width, values);
-        };
         let panel_len = self.steps * width * E::DEPTH;
-        match threads {
-            Threads::Caller => self
-                .values
-                .chunks_exact_mut(panel_len)
-                .enumerate()
-                .for_each(pack),
-            Threads::Pool => self
-                .values
-                .par_chunks_exact_mut(panel_len)
-                .with_max_len(1)
-                .enumerate()
-                .for_each(pack),
-        }
+        threads.for_each_chunk(&mut self.values, panel_len, |(panel, values)| {
+            pack_panel(simd, b, rows, panel * width, width, values);
+        });
     }
 
     /// The width of a panel in registers.
@@ -327,16 +332,9 @@ fn pack_rows<S: Simd>(
     threads: Threads,
 ) {
     let rows = (TASK_LEN / stride).max(1);
-    let pack = |values: &mut [S::Element], data: &[f32]| {
-        write_rows(simd, data, cols, stride, values);
-    };
-    match threads {
-        Threads::Caller => pack(values, data),
-        Threads::Pool => values
-            .par_chunks_mut(rows * stride)
-            .zip(data.par_chunks(rows * cols))
-            .for_each(|(values, data)| pack(values, data)),
-    }
+    threads.for_each_chunk(values, rows * stride, |(part, values)| {
+        write_rows(simd, &data[part * rows * cols..], cols, stride, values);
+    });
 }
 
 /// Packs the columns of `a` [k, m] as rows of `stride`, a multiple of `LANES` steps, padded with zeros.
@@ -348,16 +346,9 @@ fn pack_transposed_rows<S: Simd>(
     threads: Threads,
 ) {
     let rows = (TASK_LEN / stride).max(1).next_multiple_of(LANES);
-    let pack = |(part, values): (usize, &mut [S::Element])| {
+    threads.for_each_chunk(values, rows * stride, |(part, values)| {
         transpose_rows(simd, a, part * rows, stride, values);
-    };
-    match threads {
-        Threads::Caller => pack((0, values)),
-        Threads::Pool => values
-            .par_chunks_mut(rows * stride)
-            .enumerate()
-            .for_each(pack),
-    }
+    });
 }
 
 vectorized! {
@@ -401,16 +392,10 @@ vectorized! {
 /// Packs all columns of `b` as one panel. On the pool, each task packs a share of the steps.
 fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], threads: Threads) {
     let (depth, cols) = (S::Element::DEPTH, b.cols);
-    let steps = (TASK_LEN / (cols * depth)).max(1);
-    let pack = |values: &mut [S::Element], data: &[f32]| {
+    let len = (TASK_LEN / (cols * depth)).max(1) * cols * depth;
+    threads.for_each_chunk(values, len, |(part, values)| {
+        let data = &b.data[part * len..b.data.len().min((part + 1) * len)];
         let part = Matrix::new(data, data.len() / cols, cols);
         pack_panel(simd, part, part.rows, 0, cols, values);
-    };
-    match threads {
-        Threads::Caller => pack(values, b.data),
-        Threads::Pool => values
-            .par_chunks_mut(steps * cols * depth)
-            .zip(b.data.par_chunks(steps * cols * depth))
-            .for_each(|(values, data)| pack(values, data)),
-    }
+    });
 }
