@@ -1,6 +1,8 @@
 //! 3 x 3 convolutions with padding 1, forward and backward, as unpadded convolutions of images stored with their border of zeros.
 //! This module knows neither tensors nor threads, and nothing of what comes between two convolutions.
 
+use std::ops::Range;
+
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::{ALIGNMENT, Buffer};
 use crate::kernels::convolution::{
@@ -9,18 +11,7 @@ use crate::kernels::convolution::{
 use crate::kernels::images::{Images, ScratchBuffer};
 use crate::kernels::isa::{Element, Mode, Simd, vectorized};
 use crate::kernels::linear::relu_scalar;
-use crate::kernels::rounding::{store, store_bytes};
-
-/// The content that is written inside a border.
-#[derive(Clone, Copy)]
-pub(crate) enum Interior<'a> {
-    /// Pixels. Products with them are scaled afterwards, by `Element::BYTE_SCALE`.
-    Bytes(&'a [u8]),
-    /// Maps, unchanged.
-    Maps(&'a [f32]),
-    /// max(x, 0) of maps.
-    Relu(&'a [f32]),
-}
+use crate::kernels::rounding::store;
 
 /// Methods of shapes from [`ConvShape::bordered`]: the input in memory, with a border of zeros one pixel wide.
 impl ConvShape {
@@ -32,7 +23,7 @@ impl ConvShape {
     }
 
     /// Returns the range of row `y` of the maps inside the border.
-    pub(crate) const fn interior_row(&self, y: usize) -> std::ops::Range<usize> {
+    pub(crate) const fn interior_row(&self, y: usize) -> Range<usize> {
         let start = ((y + 1) * self.width + 1) * self.channels_in;
         start..start + (self.width - 2) * self.channels_in
     }
@@ -47,22 +38,16 @@ impl ConvShape {
         image[end..].fill(E::default());
     }
 
-    /// Writes the zeros of the border, and `content` between them.
-    pub(crate) fn write_interior<S: Simd>(
+    /// Writes the zeros of the border. `store_row` writes each row between them, given its range in an image without a border.
+    pub(crate) fn write_interior<E: Element>(
         &self,
-        simd: S,
-        content: Interior<'_>,
-        image: &mut [S::Element],
+        image: &mut [E],
+        store_row: impl Fn(Range<usize>, &mut [E]),
     ) {
         self.clear_border(image);
         let len = (self.width - 2) * self.channels_in;
         for y in 0..self.height - 2 {
-            let (from, to) = (y * len..(y + 1) * len, &mut image[self.interior_row(y)]);
-            match content {
-                Interior::Bytes(bytes) => store_bytes(simd, &bytes[from], to),
-                Interior::Maps(maps) => store(simd, &maps[from], to),
-                Interior::Relu(maps) => store_relu(simd, &maps[from], to),
-            }
+            store_row(y * len..(y + 1) * len, &mut image[self.interior_row(y)]);
         }
     }
 }
@@ -139,10 +124,10 @@ impl<E: Element> BorderedConvolution<E> {
     ) {
         let backward = self.backward.as_ref();
         let backward = backward.expect("a convolution whose input has a gradient is made for it");
-        let mut image = Buffer::new(backward.shape.bordered_len::<E>());
+        let mut image = Buffer::<E>::new(backward.shape.bordered_len::<E>());
         backward
             .shape
-            .write_interior(simd, Interior::Maps(grad_map), &mut image);
+            .write_interior(&mut image, |from, to| store(simd, &grad_map[from], to));
         let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_in);
         multiply_windows(simd, backward, &image, &mut row, then);
     }

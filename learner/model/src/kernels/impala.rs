@@ -5,7 +5,7 @@
 use candle_core::{Result, Tensor, bail};
 
 use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, pooled_size, stage_shapes};
-use crate::kernels::bordered::{BorderedConvolution, Interior, store_relu};
+use crate::kernels::bordered::{BorderedConvolution, store_relu};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::BorderedTensors;
 use crate::kernels::convolution::{relu_backward, store_relu_row};
@@ -15,6 +15,7 @@ use crate::kernels::linear::relu_gradient;
 use crate::kernels::operation::{Operation, apply_op2};
 use crate::kernels::pool::{pool, unpool};
 use crate::kernels::precision::Precision;
+use crate::kernels::rounding::{store, store_bytes};
 use crate::kernels::tasks::{Tasks, parameters_len, prepare_layers, split_parameters_mut};
 use crate::kernels::tensors::{Input, cpu_storage, values_of};
 
@@ -199,16 +200,19 @@ impl<S: Simd> Stages<S> {
     ) {
         let simd = self.simd;
         let mut first = Buffer::new(self.convolutions[0].shape().bordered_len::<S::Element>());
-        let mut x = Buffer::new(0);
+        let mut x = Buffer::<f32>::new(0);
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate() {
             let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
-            let (input, content, scale) = if stage == 0 {
-                (&mut *first, Interior::Bytes(image), S::Element::BYTE_SCALE)
+            let (input, scale) = if stage == 0 {
+                (&mut *first, S::Element::BYTE_SCALE)
             } else {
-                (take_input(conv, &mut inputs), Interior::Maps(&x), 1.0)
+                (take_input(conv, &mut inputs), 1.0)
             };
-            conv.shape().write_interior(simd, content, input);
+            conv.shape().write_interior(input, |from, to| match stage {
+                0 => store_bytes(simd, &image[from], to),
+                _ => store(simd, &x[from], to),
+            });
             let mut maps = Buffer::new(conv.shape().map_len());
             conv.forward(simd, input, |y, row| {
                 let to = &mut maps[y * row.len()..][..row.len()];
@@ -221,7 +225,9 @@ impl<S: Simd> Stages<S> {
             for block in blocks {
                 let (conv1, conv2) = (&block[0], &block[1]);
                 let x1 = take_input(conv1, &mut inputs);
-                conv1.shape().write_interior(simd, Interior::Relu(&x), x1);
+                conv1
+                    .shape()
+                    .write_interior(x1, |from, to| store_relu(simd, &x[from], to));
                 let x2 = take_input(conv2, &mut inputs);
                 conv2.shape().clear_border(x2);
                 conv1.forward(simd, x1, |y, row| {
@@ -306,9 +312,11 @@ impl<S: Simd> Stages<S> {
             let mut grad_maps = Buffer::zeros(conv.shape().map_len());
             unpool(simd, &grad, conv.shape().output(), own, &mut grad_maps);
             if stage == 0 {
-                let mut input = Buffer::new(conv.shape().bordered_len::<S::Element>());
-                conv.shape()
-                    .write_interior(simd, Interior::Bytes(image), &mut input);
+                let len = conv.shape().bordered_len::<S::Element>();
+                let mut input = Buffer::<S::Element>::new(len);
+                conv.shape().write_interior(&mut input, |from, to| {
+                    store_bytes(simd, &image[from], to);
+                });
                 add_gradients(conv, &input, &grad_maps);
                 return;
             }
