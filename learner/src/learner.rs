@@ -200,13 +200,9 @@ impl Learner {
     /// # Errors
     /// A state that is not finite, or a failing file system; older checkpoints are untouched.
     pub fn save(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), CheckpointError> {
-        let LearnerConfig {
-            spec, model, input, ..
-        } = &self.config;
         let extras = Extras {
-            run_spec_hash: self.spec_hash(),
-            description: &checkpoint::describe(spec, model, input),
-            without_heads: &checkpoint::describe(spec, &model.without_dim(), input),
+            spec: &self.config.spec,
+            input: &self.config.input,
             companion,
         };
         let keep = self.config.learner.checkpoints_kept as usize;

@@ -6,13 +6,14 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_model::{Parameters, WeightDtype};
+use driml_model::{InputSize, ModelConfig, Parameters, WeightDtype};
+use driml_protocol::RunSpec;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::{
-    description,
+    description::{METADATA_KEY, describe},
     error::{CheckpointError, damaged},
     folder::{PREFIX, list, prune, store},
 };
@@ -128,12 +129,10 @@ pub(super) fn format_hash(hash: u64) -> String {
 /// The contents of a checkpoint in addition to the learner's state.
 #[derive(Clone, Copy, Debug)]
 pub struct Extras<'a> {
-    /// Hash of the run's specification.
-    pub run_spec_hash: u64,
-    /// The description of the online network, from [`describe`](super::describe), for the metadata.
-    pub description: &'a str,
-    /// The description of a network without the auxiliary loss's heads, for the target and the averaged network.
-    pub without_heads: &'a str,
+    /// The run's specification.
+    pub spec: &'a RunSpec,
+    /// The size at which the network sees a frame.
+    pub input: &'a InputSize,
     /// Bytes that the caller keeps with the checkpoint.
     pub companion: Option<&'a [u8]>,
 }
@@ -170,7 +169,7 @@ fn files(
     let sums = files.iter();
     let file = StateFile {
         format: FORMAT,
-        run_spec_hash: format_hash(extras.run_spec_hash),
+        run_spec_hash: format_hash(extras.spec.hash()),
         updates: agent.updates(),
         adam_step: agent.adam.step,
         weights_version: state.weights_version,
@@ -197,25 +196,23 @@ fn tensor_files(
     agent: &Agent,
     extras: Extras<'_>,
 ) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
-    let described = |parameters: &Parameters, description: &str| {
-        parameters.to_described_safetensors(
-            WeightDtype::F32,
-            description::METADATA_KEY,
-            description,
-        )
+    let described = |parameters: &Parameters, model: &ModelConfig| {
+        let description = describe(extras.spec, model, extras.input);
+        parameters.to_described_safetensors(WeightDtype::F32, METADATA_KEY, &description)
     };
+    let (model, without_heads) = (agent.model(), agent.model().without_dim());
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;
     let mut files = vec![
-        (ONLINE, described(agent.online(), extras.description)?),
-        (TARGET, described(agent.target(), extras.without_heads)?),
+        (ONLINE, described(agent.online(), model)?),
+        (TARGET, described(agent.target(), &without_heads)?),
         (OPTIMIZER, moments),
     ];
     if let Some(key) = agent.key_encoder() {
-        files.push((KEY_ENCODER, described(key, extras.description)?));
+        files.push((KEY_ENCODER, described(key, model)?));
     }
     if let Some(average) = agent.average() {
-        files.push((AVERAGE, described(average, extras.without_heads)?));
+        files.push((AVERAGE, described(average, &without_heads)?));
     }
     Ok(files)
 }

@@ -10,8 +10,8 @@ use driml_learner::{
     AffinityEstimator, Agent, Alphabet, LearnedAffinity, RunCounts,
     checkpoint::{self, CheckpointError, Extras, LearnerState, list, load_latest, lock},
 };
-use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName, WeightDtype};
-use driml_protocol::ShardCounts;
+use driml_model::{Compute, InputSize, ModelConfig, Parameters, Precision, TorsoName, WeightDtype};
+use driml_protocol::{RunSpec, ShardCounts};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
@@ -21,8 +21,6 @@ use crate::synthetic::{
     ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, check_says, model, new_agent, random_batch,
     settings,
 };
-
-pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
 /// A learner's state before its first update, in a run with earlier learners.
 pub(crate) fn initial_state() -> LearnerState {
@@ -49,19 +47,21 @@ pub(crate) fn learn(run: &mut LearnerState, updates: u64) {
 }
 
 pub(crate) fn save(run: &LearnerState, folder: &Path, keep: usize) -> PathBuf {
-    try_save(run, folder, keep, DESCRIPTION).unwrap()
+    try_save(run, folder, keep).unwrap()
 }
 
 pub(crate) fn try_save(
     run: &LearnerState,
     folder: &Path,
     keep: usize,
-    description: &str,
 ) -> Result<PathBuf, CheckpointError> {
     let extras = Extras {
-        run_spec_hash: SPEC,
-        description,
-        without_heads: WITHOUT_HEADS,
+        spec: &RunSpec::smallest(),
+        input: &InputSize {
+            height: 20,
+            width: 24,
+            frame: None,
+        },
         companion: None,
     };
     checkpoint::save(folder, run, extras, keep)
@@ -90,13 +90,13 @@ pub(crate) fn run_counts() -> RunCounts {
     }
 }
 
-/// Metadata is for other programs: here it is any text.
-pub(crate) const DESCRIPTION: &str = r#"{"format":1}"#;
-const WITHOUT_HEADS: &str = r#"{"format":1,"model":{"dim":{}}}"#;
+fn spec_hash() -> u64 {
+    RunSpec::smallest().hash()
+}
 
 pub(crate) fn load(folder: &Path) -> Result<Option<LearnerState>, CheckpointError> {
     let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
-    load_latest(folder, &model, &settings, &Compute::CPU, SPEC)
+    load_latest(folder, &model, &settings, &Compute::CPU, spec_hash())
 }
 
 pub(crate) fn sha256(bytes: &[u8]) -> String {
@@ -124,10 +124,9 @@ fn a_checkpoint_of_another_network_says_which_setting_differs() {
     let folder = tempdir().unwrap();
     let run = initial_state();
     let ours = model(ALL_DIM);
-    let description = serde_json::json!({ "model": ours }).to_string();
-    let path = try_save(&run, folder.path(), 1, &description).unwrap();
+    let path = save(&run, folder.path(), 1);
     let load = |model: &ModelConfig| {
-        checkpoint::load(&path, model, &settings(ALL_DIM), &Compute::CPU, SPEC)
+        checkpoint::load(&path, model, &settings(ALL_DIM), &Compute::CPU, spec_hash())
     };
     assert!(load(&ours).is_ok());
     let other = ModelConfig {
@@ -169,7 +168,7 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
         learn(&mut run, 4);
         save(&run, folder.path(), 1);
         let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
-        let restored = load_latest(folder.path(), &model, &settings, loader, SPEC).unwrap();
+        let restored = load_latest(folder.path(), &model, &settings, loader, spec_hash()).unwrap();
         let mut resumed = restored.expect("a checkpoint").agent;
         let weights = |agent: &Agent| agent.weights(WeightDtype::F32).unwrap();
         let is_same = weights(&run.agent) == weights(&resumed);
@@ -276,15 +275,10 @@ fn the_networks_say_what_they_are_and_need_not() {
     let folder = tempdir().unwrap();
     let run = initial_state();
     let path = save(&run, folder.path(), 1);
-    for (name, description) in [
-        ("online.safetensors", DESCRIPTION),
-        ("target.safetensors", WITHOUT_HEADS),
-    ] {
+    for (name, has_heads) in [("online.safetensors", true), ("target.safetensors", false)] {
         let file = fs::read(path.join(name)).unwrap();
-        let (_, header) = safetensors::SafeTensors::read_metadata(&file).unwrap();
-        let entries = header.metadata().as_ref().unwrap();
-        assert_eq!(entries.len(), 1);
-        assert_eq!(entries["driml"], description);
+        let described = checkpoint::read_description(&file).unwrap().unwrap();
+        assert_eq!(described["model"]["dim"]["psi4"], has_heads);
     }
     let bare = run.agent.online().to_safetensors(|_| true).unwrap();
     fs::write(path.join("online.safetensors"), &bare).unwrap();
@@ -313,7 +307,7 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     };
     let load = |settings: &_| {
         let model = model(ALL_DIM);
-        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, SPEC);
+        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, spec_hash());
         restored.unwrap().unwrap().agent
     };
     save(&run, folder.path(), 1);

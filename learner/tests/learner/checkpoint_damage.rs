@@ -12,9 +12,9 @@ use serde_json::{Value, json};
 use tempfile::tempdir;
 
 use crate::{
-    checkpoint::{DESCRIPTION, change_state, initial_state, learn, load, save, sha256, try_save},
+    checkpoint::{change_state, initial_state, learn, load, save, sha256, try_save},
     errors::diverged_agent,
-    synthetic::{ACTIONS, ALL_DIM, CANDLE, check_says, model},
+    synthetic::{ACTIONS, CANDLE, check_says},
 };
 
 #[test]
@@ -22,8 +22,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
     let folder = tempdir().unwrap();
     let mut run = initial_state();
     learn(&mut run, 1);
-    let description = json!({ "model": model(ALL_DIM) }).to_string();
-    let path = try_save(&run, folder.path(), 1, &description).unwrap();
+    let path = save(&run, folder.path(), 1);
     for name in [
         "online.safetensors",
         "target.safetensors",
@@ -44,10 +43,11 @@ fn every_kind_of_damage_is_reported_with_its_file() {
             fs::write(&file, &whole[..cut]).unwrap();
             reported();
         }
-        // The last digit of a size in the network's description.
+        // The last digit of a size in a network's description.
         let size = br#"hidden\":16"#;
         let size = whole.windows(size.len()).position(|it| it == size);
-        assert_eq!(size.is_some(), name == "online.safetensors");
+        let is_described = name == "online.safetensors" || name == "target.safetensors";
+        assert_eq!(size.is_some(), is_described);
         for at in [Some(whole.len() / 2), size.map(|at| at + 10)]
             .into_iter()
             .flatten()
@@ -89,8 +89,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
         save(&run, folder.path(), 1);
         for name in ["head.bias", "dim.psi4.out.weight"] {
             run.agent = diverged_agent(compute, name).0;
-            let said = try_save(&run, folder.path(), 1, DESCRIPTION);
-            let said = said.unwrap_err().to_string();
+            let said = try_save(&run, folder.path(), 1).unwrap_err().to_string();
             let is_told = said.starts_with("the checkpoint was not saved") && said.contains(name);
             assert!(is_told, "{said}");
             let left: Vec<_> = fs::read_dir(folder.path()).unwrap().collect();
