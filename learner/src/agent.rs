@@ -77,11 +77,8 @@ impl Agent {
         parameters: NetworkParameters,
     ) -> Result<Self, UpdateError> {
         settings.validate()?;
-        let NetworkParameters {
-            online,
-            target,
-            key_encoder,
-        } = parameters;
+        let (online, target) = (parameters.online, parameters.target);
+        let key_encoder = parameters.key_encoder;
         let built = DimHeads {
             action: model.dim.embeds_action(),
             ..model.dim
@@ -273,19 +270,13 @@ impl Agent {
     /// Clips `gradients`, takes one Adam step and moves the slow networks that are due.
     /// Returns the global norm of the gradients before clipping.
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
-        let Networks {
-            settings,
-            compute,
-            parameters: online,
-            auxiliary,
-            ..
-        } = &self.networks;
-        let kernels = compute.kernels;
+        let (settings, online) = (&self.networks.settings, &self.networks.parameters);
+        let kernels = self.networks.compute.kernels;
         let norm = gradients.norm(kernels)?;
         let factor = clip_factor(norm, settings.max_grad_norm);
         self.adam.step(online, gradients, factor)?;
         self.updates += 1;
-        if let (Some(key), Some(tau)) = (&self.key_encoder, auxiliary.key_tau()) {
+        if let (Some(key), Some(tau)) = (&self.key_encoder, self.networks.auxiliary.key_tau()) {
             target::follow(key, online, tau, kernels)?;
         }
         match (&self.average, settings.average_tau) {

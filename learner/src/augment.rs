@@ -127,24 +127,17 @@ impl Augmenter {
 
     /// Draws the augmentation of one state: every position of the crop is equally likely, factors and turn are uniform in their ranges.
     pub fn draw(&self, rng: &mut impl Rng) -> View {
-        let AugmentSettings {
-            brightness,
-            contrast,
-            saturation,
-            hue,
-            ..
-        } = self.settings;
-        let (height, width, _) = self.size;
+        let (settings, (height, width, _)) = (self.settings, self.size);
         let top = rng.random_range(0..=height - self.crop.0);
         let left = rng.random_range(0..=width - self.crop.1);
         let mut around = |middle: f64, by: f64| middle + by * (2.0 * rng.random::<f64>() - 1.0);
         View {
             top,
             left,
-            brightness: around(1.0, brightness),
-            contrast: around(1.0, contrast),
-            saturation: around(1.0, saturation),
-            hue: around(0.0, hue),
+            brightness: around(1.0, settings.brightness),
+            contrast: around(1.0, settings.contrast),
+            saturation: around(1.0, settings.saturation),
+            hue: around(0.0, settings.hue),
         }
     }
 

@@ -263,9 +263,7 @@ impl Networks {
         batch: &Batch<'_>,
         noise: &UpdateNoise,
     ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
-        let ModelConfig {
-            num_actions, atoms, ..
-        } = self.model;
+        let (num_actions, atoms) = (self.model.num_actions, self.model.atoms);
         let len = self.model.frame_len();
         let frames = batch.next_states(len);
         let PassInput { bytes, indices } =

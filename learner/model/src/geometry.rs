@@ -44,20 +44,15 @@ impl ConvShape {
         (height, width, channels_in): (usize, usize, usize),
         layer: ConvLayer,
     ) -> Option<Self> {
-        let ConvLayer {
-            out,
-            kernel,
-            stride,
-        } = layer;
-        let exists = kernel > 0 && stride > 0 && channels_in > 0 && out > 0;
-        let fits = kernel <= height.min(width);
-        (exists && fits).then_some(Self {
+        let sizes = [layer.kernel, layer.stride, channels_in, layer.out];
+        let fits = layer.kernel <= height.min(width);
+        (!sizes.contains(&0) && fits).then_some(Self {
             height,
             width,
             channels_in,
-            channels_out: out,
-            kernel,
-            stride,
+            channels_out: layer.out,
+            kernel: layer.kernel,
+            stride: layer.stride,
         })
     }
 

@@ -48,22 +48,14 @@ const HIDDEN_MAX: f64 = 4096.0;
 
 impl LearnedSettings {
     pub(crate) fn check_valid(&self) -> Result<(), UpdateError> {
-        let Self {
-            hidden,
-            lr,
-            beta1,
-            beta2,
-            eps,
-            keep,
-        } = *self;
         let share = 0.0..=0.999_999;
         check_ranges(&[
-            ("hidden", hidden as f64, 1.0..=HIDDEN_MAX),
-            ("lr", lr, 1e-30..=1e38),
-            ("eps", eps, 1e-30..=1e30),
-            ("beta1", beta1, share.clone()),
-            ("beta2", beta2, share.clone()),
-            ("keep", keep, share),
+            ("hidden", self.hidden as f64, 1.0..=HIDDEN_MAX),
+            ("lr", self.lr, 1e-30..=1e38),
+            ("eps", self.eps, 1e-30..=1e30),
+            ("beta1", self.beta1, share.clone()),
+            ("beta2", self.beta2, share.clone()),
+            ("keep", self.keep, share),
         ])
     }
 }
@@ -206,13 +198,8 @@ impl LearnedAffinity {
     }
 
     fn step(&mut self, gradient: &[f64]) {
-        let LearnedSettings {
-            lr,
-            beta1,
-            beta2,
-            eps,
-            ..
-        } = self.settings;
+        let settings = self.settings;
+        let (beta1, beta2) = (settings.beta1, settings.beta2);
         self.updates += 1;
         let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
         let (correction1, correction2) = (1.0 - beta1.powi(t), 1.0 - beta2.powi(t));
@@ -220,7 +207,8 @@ impl LearnedAffinity {
         for ((p, &g), (m, v)) in self.parameters.iter_mut().zip(gradient).zip(moments) {
             *m = beta1 * *m + (1.0 - beta1) * g;
             *v = beta2 * *v + (1.0 - beta2) * g * g;
-            *p -= lr * (*m / correction1) / ((*v / correction2).sqrt() + eps);
+            let root = (*v / correction2).sqrt() + settings.eps;
+            *p -= settings.lr * (*m / correction1) / root;
         }
     }
 }

@@ -228,12 +228,7 @@ pub struct StepCoefficients {
 impl StepCoefficients {
     /// Computes the coefficients of step number `step`, counted from 1, for gradients times `factor`.
     pub fn new(settings: AdamSettings, step: u64, factor: f64) -> Self {
-        let AdamSettings {
-            lr,
-            beta1,
-            beta2,
-            eps,
-        } = settings;
+        let (beta1, beta2) = (settings.beta1, settings.beta2);
         let t = i32::try_from(step).unwrap_or(i32::MAX);
         Self {
             factor: factor as f32,
@@ -241,9 +236,9 @@ impl StepCoefficients {
             one_minus_beta1: (1.0 - beta1) as f32,
             beta2: beta2 as f32,
             one_minus_beta2: (1.0 - beta2) as f32,
-            step_size: (lr / (1.0 - beta1.powi(t))) as f32,
+            step_size: (settings.lr / (1.0 - beta1.powi(t))) as f32,
             root_scale: (1.0 / (1.0 - beta2.powi(t)).sqrt()) as f32,
-            eps: eps as f32,
+            eps: settings.eps as f32,
             flushes_moments: step.is_multiple_of(FLUSH_PERIOD),
         }
     }

@@ -74,13 +74,7 @@ pub(crate) fn multiply_tile<S: Simd>(
     panel: &[S::Element],
     output: OutputTile<'_>,
 ) {
-    let OutputTile {
-        out,
-        row_stride,
-        cols,
-        vecs,
-        mode,
-    } = output;
+    let (vecs, cols) = (output.vecs, output.cols);
     assert!(
         (1..=S::VECS_MAX).contains(&vecs) && (1..=S::rows_max(vecs)).contains(&rows),
         "a tile of {rows} rows by {vecs} registers"
@@ -95,7 +89,7 @@ pub(crate) fn multiply_tile<S: Simd>(
     assert!(
         left.contains_rows(rows)
             && panel.len() >= panel_len
-            && (rows - 1) * row_stride + cols <= out.len(),
+            && (rows - 1) * output.row_stride + cols <= output.out.len(),
         "a tile beyond its operands"
     );
     let tile = RawTile {
@@ -106,10 +100,10 @@ pub(crate) fn multiply_tile<S: Simd>(
         run_stride: left.run_stride,
         runs: left.runs,
         panel: panel.as_ptr(),
-        out: out.as_mut_ptr(),
-        out_stride: row_stride,
+        out: output.out.as_mut_ptr(),
+        out_stride: output.row_stride,
         cols,
-        mode,
+        mode: output.mode,
     };
     // SAFETY: the sizes are within the instruction set's limits, and the asserts above check what `RawTile` requires. The
     // largest index of each operand is inside its slice, and strides are not negative. `out` is borrowed exclusively.
