@@ -8,7 +8,7 @@ use crate::kernels::buffer::{ALIGNMENT, Buffer};
 use crate::kernels::convolution::{
     Convolution, add_locations, gradient_panels, multiply_windows, weight_gradient,
 };
-use crate::kernels::images::{Images, ScratchBuffer};
+use crate::kernels::images::Images;
 use crate::kernels::isa::{Element, Mode, Simd, vectorized};
 use crate::kernels::linear::relu_scalar;
 use crate::kernels::rounding::store;
@@ -143,7 +143,7 @@ impl<E: Element> BorderedConvolution<E> {
     ) {
         let shape = self.shape();
         let (len, shift) = (shape.image_len(), shape.window_stride());
-        let mut scratch = [const { ScratchBuffer::new() }; 2];
+        let mut scratch = [None, None];
         let mut panels = gradient_panels(simd, shape);
         let images = Images::Maps(&image[..len]);
         let steps = images.steps(simd, 0, (len, shift), &mut scratch);

@@ -7,7 +7,7 @@
 
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::images::{Images, ScratchBuffer};
+use crate::kernels::images::Images;
 use crate::kernels::isa::{Element, LANES, LeftOperand, Mode, Simd, row_tiles, vectorized};
 use crate::kernels::linear::{relu_gradient, relu_scalar};
 use crate::kernels::panels::{Matrix, Panels, Threads};
@@ -106,7 +106,7 @@ pub(crate) fn forward<S: Simd, M: Element>(
 ) {
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
-    let (mut scratch, mut row) = (ScratchBuffer::new(), Buffer::new(out_width * out));
+    let (mut scratch, mut row) = (None, Buffer::new(out_width * out));
     // If a run is odd, the last step of the last window reads one scalar beyond the image and multiplies it by 0.
     let len = (shape.image_len(), shape.run_len() % S::Element::DEPTH);
     for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
@@ -186,7 +186,7 @@ pub(crate) fn backward<S: Simd, M: Element>(
     let stride = out.next_multiple_of(S::Element::DEPTH);
     let mut rows = Buffer::<S::Element>::new(shape.locations() * stride);
     let mut panels = gradient_panels(simd, shape);
-    let mut scratch = [const { ScratchBuffer::new() }; 2];
+    let mut scratch = [None, None];
     bias.fill(0.0);
     let each = maps
         .chunks_exact(map_len)

@@ -53,13 +53,13 @@ impl<E: Element> Images<'_, E> {
         simd: S,
         index: usize,
         (len, padding): (usize, usize),
-        scratch: &'r mut ScratchBuffer<E>,
+        scratch: &'r mut Scratch<E>,
     ) -> &'r [E] {
         let range = index * len..(index + 1) * len;
         if let (Self::Maps(maps), 0) = (self, padding) {
             return &maps[range];
         }
-        let operand = scratch.slice(len + padding);
+        let operand = scratch.get_or_insert_with(|| Buffer::new(len + padding));
         operand[len..].fill(E::default());
         let image = &mut operand[..len];
         match self {
@@ -77,28 +77,17 @@ impl<E: Element> Images<'_, E> {
         simd: S,
         index: usize,
         (len, shift): (usize, usize),
-        [scratch, image_scratch]: &'r mut [ScratchBuffer<E>; 2],
+        [scratch, image_scratch]: &'r mut [Scratch<E>; 2],
     ) -> &'r [E] {
         let image = self.image(simd, index, (len, 0), image_scratch);
         if E::DEPTH == 1 {
             return image;
         }
-        let steps = scratch.slice(len * E::DEPTH);
+        let steps = scratch.get_or_insert_with(|| Buffer::new(len * E::DEPTH));
         store_steps(simd, image, shift, steps);
         steps
     }
 }
 
-/// Scratch memory for one image at a time.
-pub(crate) struct ScratchBuffer<E: Element>(Option<Buffer<E>>);
-
-impl<E: Element> ScratchBuffer<E> {
-    pub(crate) const fn new() -> Self {
-        Self(None)
-    }
-
-    /// Returns `len` scalars with old content. `len` must be the same in every call.
-    fn slice(&mut self, len: usize) -> &mut [E] {
-        self.0.get_or_insert_with(|| Buffer::new(len))
-    }
-}
+/// Scratch memory for one image at a time, with old content. All images have the same length.
+pub(crate) type Scratch<E> = Option<Buffer<E>>;
