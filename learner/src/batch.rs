@@ -92,6 +92,7 @@ impl<'a> Batch<'a> {
             ));
         }
         let anchors = self.anchors.unwrap_or(self.states_t);
+        let weights = self.importance_weight.map_or(rows, <[f32]>::len);
         for (name, length, row_length) in [
             ("states_t", self.states_t.len(), state_bytes),
             ("anchors", anchors.len(), state_bytes),
@@ -100,11 +101,7 @@ impl<'a> Batch<'a> {
             ("n_step_return", self.n_step_return.len(), 1),
             ("bootstrap_discount", self.bootstrap_discount.len(), 1),
             ("positive_valid", self.positive_valid.len(), positives),
-            (
-                "importance_weight",
-                self.importance_weight.map_or(rows, <[f32]>::len),
-                1,
-            ),
+            ("importance_weight", weights, 1),
         ] {
             if length != rows * row_length {
                 return invalid(format!(
@@ -113,14 +110,10 @@ impl<'a> Batch<'a> {
             }
         }
         let bootstraps = self.bootstrapping_rows().count();
+        let all = self.positive_valid.len();
         let valid = self.positive_valid.iter().filter(|valid| **valid != 0);
         for (name, length, all, present) in [
-            (
-                "states_k",
-                self.states_k.len(),
-                rows * positives,
-                valid.count(),
-            ),
+            ("states_k", self.states_k.len(), all, valid.count()),
             ("states_n", self.states_n.len(), rows, bootstraps),
         ] {
             if length != all * state_bytes && length != present * state_bytes {

@@ -235,14 +235,6 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_gpu_has_no_bf16_of_ours() {
-        let error = DeviceName::Cuda(1).open(Precision::Bf16).unwrap_err();
-        let error = error.to_string();
-        assert!(error.contains("set learner.precision"), "{error}");
-        assert!(DeviceName::Cpu.open(Precision::Bf16).is_ok());
-    }
-
     #[cfg(not(feature = "cuda"))]
     #[test]
     fn a_program_without_cuda_says_so() {

@@ -182,13 +182,14 @@ impl Network {
     /// Computes Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers, ignored if Psi does not see the action).
     pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = require_head(self.psi3.as_ref(), "psi3")?;
-        flatten_locations(head.forward(f3, self.embed_actions(actions)?.as_ref())?)
+        let maps = head.forward(f3, self.embed_actions(actions)?.as_ref())?;
+        Ok(maps.flatten(1, 2)?)
     }
 
     /// Computes Phi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c].
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
-        let head = require_head(self.phi3.as_ref(), "phi3")?;
-        flatten_locations(head.forward(f3, None)?)
+        let maps = require_head(self.phi3.as_ref(), "phi3")?.forward(f3, None)?;
+        Ok(maps.flatten(1, 2)?)
     }
 
     /// Computes Psi_4 [B, embedding_dim] of `f4` [B, hidden] and `actions` [B] (integers, ignored if Psi does not see the action).
@@ -219,11 +220,6 @@ impl Network {
 
 fn require_head<'a>(head: Option<&'a DimHead>, name: &'static str) -> Result<&'a DimHead> {
     head.ok_or(ModelError::NoHead(name))
-}
-
-/// Reshapes [B, h, w, embedding_dim] to [B, h * w, embedding_dim].
-fn flatten_locations(maps: Tensor) -> Result<Tensor> {
-    Ok(maps.flatten(1, 2)?)
 }
 
 /// The torso and Psi_4 alone, which encode a state as psi_4(f4) to compare with another network's, such as CURL's keys.

@@ -194,7 +194,10 @@ pub(crate) fn decode(
         let view = found
             .remove(name.as_str())
             .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
-        check_shape(&name, view.shape(), &shape)?;
+        if view.shape() != shape {
+            let why = format!("has shape {:?}, wanted {shape:?}", view.shape());
+            return Err(ModelError::parameter(&name, why));
+        }
         let values = weight_dtype::decode(view.dtype(), view.data()).ok_or_else(|| {
             let why = format!("has type {:?}, wanted F32, F16 or BF16", view.dtype());
             ModelError::parameter(&name, why)
@@ -206,14 +209,6 @@ pub(crate) fn decode(
         Some(name) => Err(ModelError::parameter(name, "is not part of this network")),
         None => Ok(parameters),
     }
-}
-
-fn check_shape(name: &str, found: &[usize], wanted: &[usize]) -> Result<()> {
-    if found == wanted {
-        return Ok(());
-    }
-    let why = format!("has shape {found:?}, wanted {wanted:?}");
-    Err(ModelError::parameter(name, why))
 }
 
 fn check_finite(name: &str, values: &[f32]) -> Result<()> {

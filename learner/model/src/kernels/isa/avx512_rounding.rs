@@ -42,20 +42,23 @@ pub(super) unsafe fn round(values: &[f32], to: &mut [bf16]) {
     }
 }
 
+/// The words that a register of pairs takes, from word `first` of two rows on. The second row's words follow `row_len` of the first's.
+const fn pair_order(first: usize, row_len: usize) -> [u16; 2 * LANES] {
+    let mut order = [0; 2 * LANES];
+    let mut at = 0;
+    while at < order.len() {
+        order[at] = (first + at / 2 + at % 2 * row_len) as u16;
+        at += 1;
+    }
+    order
+}
+
 /// `Rounding::round_pairs`, 16 pairs at a time.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 pub(super) unsafe fn round_pairs(first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-    // Word i of a register of pairs is word i / 2 of the first row (words 0 to 15) if i is even, else of the second (16 to 31).
-    const ORDER: [u16; 2 * LANES] = {
-        let mut order = [0; 2 * LANES];
-        let mut at = 0;
-        while at < order.len() {
-            order[at] = (at / 2 + at % 2 * LANES) as u16;
-            at += 1;
-        }
-        order
-    };
+    // Words 0 to 15 are those of the first row.
+    const ORDER: [u16; 2 * LANES] = pair_order(0, LANES);
     // SAFETY: `ORDER` is the 64 bytes of a register.
     let order = unsafe { _mm512_loadu_si512(ORDER.as_ptr().cast()) };
     let interleaved = |first: __m512, second: __m512| {
@@ -97,17 +100,8 @@ pub(super) unsafe fn round_pairs(first: &[f32], second: &[f32], pairs: &mut [bf1
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma")]
 pub(super) unsafe fn pair(first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
-    // Word i of the first (second) register of pairs is word i / 2 (16 + i / 2) of the first row if i is even, else of the second.
-    const ORDERS: [[u16; 2 * LANES]; 2] = {
-        let mut orders = [[0; 2 * LANES]; 2];
-        let mut at = 0;
-        while at < 2 * LANES {
-            let word = at / 2 + at % 2 * 2 * LANES;
-            (orders[0][at], orders[1][at]) = (word as u16, (word + LANES) as u16);
-            at += 1;
-        }
-        orders
-    };
+    // Words 0 to 31 are those of the first row. The second register of pairs begins with the rows' words 16.
+    const ORDERS: [[u16; 2 * LANES]; 2] = [pair_order(0, 2 * LANES), pair_order(LANES, 2 * LANES)];
     // SAFETY: each of `ORDERS` is the 64 bytes of a register.
     let orders = ORDERS.map(|order| unsafe { _mm512_loadu_si512(order.as_ptr().cast()) });
     let columns = first.len().min(second.len());
