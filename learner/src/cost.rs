@@ -98,20 +98,24 @@ impl UpdateCost {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::DimHeads;
+    use driml_model::{ConvLayer, DimHeads};
 
     use super::*;
     use crate::auxiliary::settings::Lambda;
 
     /// Input 6 x 6 x 1, local features 2 x 2 x 3, 5 values in f4, embedding_dim 4, 2 actions of 3 atoms.
     fn model(dim: DimHeads) -> ModelConfig {
-        let model: ModelConfig = toml::from_str(
-            "height = 6\nwidth = 6\ninput_channels = 1\nnum_actions = 2\natoms = 3\nv_min = -1.0\nv_max = 1.0\n\
-             conv = [{ out = 3, kernel = 4, stride = 2 }]\nhidden = 5\nembedding_dim = 4\naction_embed = 2\n\
-             dim = { psi3 = false, phi3 = false, psi4 = false, phi4 = false, action = false }",
-        )
-        .unwrap();
-        ModelConfig { dim, ..model }
+        ModelConfig {
+            height: 6,
+            width: 6,
+            num_actions: 2,
+            atoms: 3,
+            conv: vec![ConvLayer::new(3, 4, 2)],
+            hidden: 5,
+            embedding_dim: 4,
+            dim,
+            ..ModelConfig::small()
+        }
     }
 
     #[test]

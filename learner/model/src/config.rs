@@ -313,13 +313,9 @@ impl ModelConfig {
         }
         layers
     }
-}
 
-#[cfg(test)]
-impl ModelConfig {
-    /// A network for tests: input 8 x 8 x 1, maps of 3 x 3 x 4 and 2 x 2 x 5, every DIM head.
-    pub(crate) fn small() -> Self {
-        let conv = |out, kernel, stride| ConvLayer::new(out, kernel, stride);
+    /// A small network, for tests, benches and examples: input 8 x 8 x 1, maps of 3 x 3 x 4 and 2 x 2 x 5, every DIM head.
+    pub fn small() -> Self {
         Self {
             height: 8,
             width: 8,
@@ -329,7 +325,7 @@ impl ModelConfig {
             v_min: -1.0,
             v_max: 1.0,
             torso: TorsoName::Nature,
-            conv: vec![conv(4, 4, 2), conv(5, 2, 1)],
+            conv: vec![ConvLayer::new(4, 4, 2), ConvLayer::new(5, 2, 1)],
             channels: vec![],
             scale_blocks: false,
             hidden: 7,

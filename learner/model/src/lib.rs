@@ -8,16 +8,11 @@
 //!
 //! ```
 //! use candle_core::{Device, Tensor};
-//! use driml_model::{ConvLayer, DimHeads, HeadConfig, Kernels, ModelConfig, Network, Parameters, TorsoName};
+//! use driml_model::{Kernels, ModelConfig, Network, Parameters};
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
-//! let no_heads = DimHeads { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
-//! let config = ModelConfig {
-//!     height: 8, width: 8, input_channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
-//!     torso: TorsoName::Nature, conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
-//!     channels: vec![], scale_blocks: false,
-//!     hidden: 8, embedding_dim: 8, action_embed: 2, dim: no_heads, loss_layers: vec![], head: HeadConfig::PLAIN,
-//! };
+//! // Three actions, and frames of 8 x 8 x 1.
+//! let config = ModelConfig::small();
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
 //! let network = Network::new(&config, &parameters, Kernels::FUSED)?;

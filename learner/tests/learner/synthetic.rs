@@ -9,7 +9,7 @@ use driml_learner::{
     auxiliary::{cpc, curl, dim},
     parity::deviation::REFERENCE,
 };
-use driml_model::{Compute, ConvLayer, HeadConfig, ModelConfig, Parameters, TorsoName};
+use driml_model::{Compute, ConvLayer, HeadConfig, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -45,16 +45,12 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
         atoms: 21,
         v_min: -5.0,
         v_max: 5.0,
-        torso: TorsoName::Nature,
         conv: vec![ConvLayer::new(5, 8, 4), ConvLayer::new(6, 3, 1)],
-        channels: vec![],
-        scale_blocks: false,
         hidden: 16,
         embedding_dim: 12,
         action_embed: 7,
         dim: lambda.dim_heads(true),
-        loss_layers: vec![],
-        head: HeadConfig::PLAIN,
+        ..ModelConfig::small()
     }
 }
 

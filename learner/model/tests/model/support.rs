@@ -3,7 +3,7 @@
 
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
-    ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, PolicyNetwork, Precision, TorsoName,
+    ConvLayer, HeadConfig, ModelConfig, Parameters, PolicyNetwork, Precision, TorsoName,
 };
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
@@ -52,20 +52,15 @@ pub(crate) fn small() -> ModelConfig {
         atoms: 11,
         v_min: -2.0,
         v_max: 3.0,
-        torso: TorsoName::Nature,
         conv: vec![
             ConvLayer::new(5, 8, 4),
             ConvLayer::new(7, 3, 2),
             ConvLayer::new(6, 2, 1),
         ],
-        channels: vec![],
-        scale_blocks: false,
         hidden: 19,
         embedding_dim: 13,
         action_embed: 9,
-        dim: DimHeads::ALL,
-        loss_layers: vec![],
-        head: HeadConfig::PLAIN,
+        ..ModelConfig::small()
     }
 }
 
