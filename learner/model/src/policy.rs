@@ -104,12 +104,9 @@ impl PolicyNetwork {
                 .zip(frames)
                 .for_each(|(values, frames)| task(frames, values));
         }
-        match values.iter().position(|value| !value.is_finite()) {
-            Some(index) => Err(ModelError::NotFinite {
-                row: index / actions,
-            }),
-            None => Ok(()),
-        }
+        let bad = values.iter().position(|value| !value.is_finite());
+        let bad = bad.map(|index| index / actions);
+        bad.map_or(Ok(()), |row| Err(ModelError::NotFinite { row }))
     }
 
     /// Writes the greedy action of each frame in `frames` [B, H, W, C] to `actions` [B]. On a tie the lowest action wins.

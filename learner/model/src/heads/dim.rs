@@ -93,25 +93,17 @@ impl ActionEmbedding {
 
     /// Computes embeddings [B, e] of `actions` [B], integers below the number of actions. They are read on the CPU and best stored there.
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
-        let one_hot = self.one_hot(actions)?;
-        self.block.forward(&one_hot, None)
-    }
-
-    fn one_hot(&self, actions: &Tensor) -> Result<Tensor> {
-        let indices = actions.detach().to_dtype(DType::I64)?.to_vec1::<i64>()?;
-        let mut one_hot = vec![0.0f32; indices.len() * self.num_actions];
-        for (row, &action) in one_hot.chunks_exact_mut(self.num_actions).zip(&indices) {
-            let entry = usize::try_from(action)
-                .ok()
-                .and_then(|action| row.get_mut(action));
-            *entry.ok_or_else(|| {
-                ModelError::Input(format!("action {action} of {}", self.num_actions))
-            })? = 1.0;
+        let (indices, count) = (actions.detach().to_dtype(DType::I64)?, self.num_actions);
+        let indices = indices.to_vec1::<i64>()?;
+        let mut one_hot = vec![0.0f32; indices.len() * count];
+        for (row, &action) in one_hot.chunks_exact_mut(count).zip(&indices) {
+            let index = usize::try_from(action).ok();
+            let unknown = || ModelError::Input(format!("action {action} of {count}"));
+            let entry = index.and_then(|index| row.get_mut(index));
+            *entry.ok_or_else(unknown)? = 1.0;
         }
-        Ok(Tensor::from_vec(
-            one_hot,
-            (indices.len(), self.num_actions),
-            self.block.parameters.hidden_weight.device(),
-        )?)
+        let device = self.block.parameters.hidden_weight.device();
+        let one_hot = Tensor::from_vec(one_hot, (indices.len(), count), device)?;
+        self.block.forward(&one_hot, None)
     }
 }

@@ -172,10 +172,8 @@ impl<S: Simd> Stages<S> {
         let inputs = self.convolutions[1..].iter();
         let inputs = inputs.map(|it| it.shape().bordered_len::<S::Element>());
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
-        (
-            inputs.sum(),
-            stages.map(|stage| pooled_len(&stage[0])).sum(),
-        )
+        let argmax = stages.map(|stage| pooled_len(&stage[0]));
+        (inputs.sum(), argmax.sum())
     }
 
     /// Computes f3 of some images, one after the other.
