@@ -135,7 +135,7 @@ mod tests {
         // The input needs no gradient.
         let torso = 10 * (2 * conv + 3 * fc);
         // One of the two actions.
-        let plain = [torso, 10 * 3 * head / 2, 10 * value, 0, 0, 0, 0, 0];
+        let plain: [u64; 8] = [torso, 10 * 3 * head / 2, 10 * value, 0, 0, 0, 0, 0];
         assert_eq!(counts(&model(DimHeads::NONE), &c51), plain);
 
         let lambda = Lambda::from_values([1.0, 0.0, 0.0, 1.0]);
@@ -157,7 +157,7 @@ mod tests {
         let scores = 3 * 2 * 2 * (4 + 1) * 10 * 10 * 4;
         let (head, value) = (10 * 3 * head, 10 * value);
         // Two positives and the augmented s_t.
-        let expected = [torso, head, value, value, 3 * torso, 0, 10 * heads, scores];
+        let expected: [u64; 8] = [torso, head, value, value, 3 * torso, 0, 10 * heads, scores];
         let model = model(lambda.dim_heads(true));
         assert_eq!(counts(&model, &dim), expected);
         let total = UpdateCost::compute(&model, &dim).total();
