@@ -160,8 +160,6 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     run.affinity = initial_state().affinity;
     for (place, value, said) in [
         ("/affinity/settings/hidden", json!(u64::MAX), "hidden = "),
-        ("/affinity/settings/lr", json!(0), "lr = "),
-        ("/affinity/settings/keep", json!(1), "keep = "),
         ("/updates", json!(u64::MAX), "updates"),
         ("/adam_step", json!(u64::MAX), "adam_step"),
         ("/weights_version", json!(u64::MAX), "weights_version"),

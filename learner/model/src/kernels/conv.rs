@@ -139,7 +139,6 @@ impl<S: Simd> Operation<2> for ConvStack<S> {
         grad_maps: &[f32],
     ) -> Result<[Option<Vec<f32>>; 2]> {
         let maps = values_of(maps)?;
-        let maps = &maps[..];
         let image_grad = images.dtype() == DType::F32 && images.track_op();
         let (storage, layout) = images.storage_and_layout();
         let images = Input::new(cpu_storage(&storage)?, layout).pixels()?;

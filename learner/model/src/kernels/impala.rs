@@ -110,7 +110,6 @@ impl<S: Simd> Operation<2> for ResidualStages<S> {
         let (storage, layout) = images.storage_and_layout();
         let images = bytes(Input::new(cpu_storage(&storage)?, layout))?;
         let f3 = values_of(f3)?;
-        let f3 = &f3[..];
         let stages = Stages::new(self.simd, &self.shapes, &values_of(parameters)?, true);
         let tasks = self.tasks(&stages);
         let gradient = tasks.backward(&self.shapes, saved, &mut [], |task, tape, _| {
