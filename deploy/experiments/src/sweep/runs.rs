@@ -131,7 +131,10 @@ impl Runs {
         commit: &str,
         resumed: bool,
     ) -> anyhow::Result<()> {
-        let earlier = resumed.then(|| self.read_commit(plan)).unwrap_or_default();
+        let earlier = match resumed {
+            true => self.read_commit(plan),
+            false => String::new(),
+        };
         let mut commits: Vec<_> = earlier.split('+').filter(|it| !it.is_empty()).collect();
         if !commits.contains(&commit) {
             commits.push(commit);
