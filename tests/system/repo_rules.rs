@@ -12,11 +12,11 @@ use walkdir::{DirEntry, WalkDir};
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_510),
-    ("actor", 10_740),
-    ("replay-server", 11_125),
-    ("learner", 22_420),
-    ("deploy", 31_010),
-    ("tests", 10_435),
+    ("actor", 10_540),
+    ("replay-server", 11_080),
+    ("learner", 21_980),
+    ("deploy", 30_925),
+    ("tests", 10_260),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;
