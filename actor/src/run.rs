@@ -1,7 +1,7 @@
 //! Runs one actor process: joins the run, acts, and delivers chunks until it is told to stop or the run has enough transitions.
 //! The acting itself is in `collect`, which uses no network.
 
-use std::{cell::OnceCell, sync::Arc, time::Duration};
+use std::{cell::Cell, sync::Arc, time::Duration};
 
 use anyhow::{Context, bail};
 use driml_envs::WorldName;
@@ -119,10 +119,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         sequence: 0,
         leaving: false,
     };
-    let rejected = OnceCell::new();
+    let rejected = Cell::new(None);
     let is_over = || match client.ask(&poll, ASK_MAX) {
         Ok(InsertReply::Finished { .. }) => true,
-        Ok(InsertReply::Refused { why }) => rejected.set(why).is_ok(),
+        Ok(InsertReply::Refused { why }) => {
+            rejected.set(Some(why));
+            true
+        }
         _ => false,
     };
     // A world in its own process may take minutes to start. The replay server exits soon after the run.
@@ -132,7 +135,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
             move || Collector::new(&settings, pool, incarnation, version, &first.safetensors);
         shutdown.run_unless_set("environments", build, is_over)?
     };
-    if let Some(why) = rejected.into_inner() {
+    if let Some(why) = rejected.take() {
         bail!("the replay server rejected this actor: {why}");
     }
     let Some(collector) = built else {

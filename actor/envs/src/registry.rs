@@ -123,17 +123,27 @@ impl WorldConfig {
         actions
     }
 
-    /// Returns the same world with one level per episode: a level of training, or one that training has not seen.
+    /// Returns the same world with one level of training per episode.
     ///
     /// # Errors
-    /// The world has no levels, or no unseen ones; the message says what to use instead.
-    pub fn with_single_levels(&self, unseen: bool) -> Result<Self, EnvError> {
+    /// The world has no levels; the message says what to use instead.
+    pub fn with_single_levels(&self) -> Result<Self, EnvError> {
+        Ok(Self::Procgen(self.procgen()?.with_single_levels()))
+    }
+
+    /// Returns the same world with one level per episode that training has not seen.
+    ///
+    /// # Errors
+    /// As [`with_single_levels`](Self::with_single_levels); also if training has seen all levels.
+    pub fn with_unseen_levels(&self) -> Result<Self, EnvError> {
+        self.procgen()?.with_unseen_levels().map(Self::Procgen)
+    }
+
+    fn procgen(&self) -> Result<&ProcgenConfig, EnvError> {
+        let why = "this run's world has no levels: use --levels train";
         match self {
-            Self::Procgen(config) => config.with_single_levels(unseen).map(Self::Procgen),
-            _ => {
-                let why = "this run's world has no levels: use --levels train";
-                Err(EnvError::Config(why.into()))
-            }
+            Self::Procgen(config) => Ok(config),
+            _ => Err(EnvError::Config(why.into())),
         }
     }
 
@@ -329,10 +339,6 @@ fn is_gymnasium_name(text: &str) -> bool {
 
 /// Returns the world whose name is nearest to `text`: at most 3 edits, and a third of its letters, away. `text` may lack the kind.
 fn nearest_world(text: &str) -> Option<WorldName> {
-    // Names are short: a long text cannot be near one.
-    if text.chars().count() > 40 {
-        return None;
-    }
     let letters = |text: &str| -> String { text.chars().filter(|c| c.is_alphanumeric()).collect() };
     let text = letters(&text.to_lowercase());
     let distance = |name: WorldName| {

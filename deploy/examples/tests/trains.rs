@@ -1,6 +1,6 @@
 //! The example's program trains in its own world, with its own loss, in processes as well as in lockstep.
 
-use driml_tests::TestSystem;
+use driml_tests::{Outcome, TestSystem};
 
 #[test]
 fn the_world_and_the_loss_train_as_built_in_ones_do() {
@@ -23,6 +23,9 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
         trained.weights_sha256
     });
     assert_eq!(hashes[0], hashes[1]);
+    system.run_ok("local --resume first --frames 1600");
+    let resumed = system.run_folder("first").check(Outcome::Finished);
+    assert!(resumed.frames >= 1600, "{resumed:#?}");
     let played = system.run_ok("evaluate --run run --episodes 4").stdout;
     assert!(played.starts_with("island as trained on"), "{played}");
     system

@@ -112,10 +112,8 @@ impl Figure {
         }
         let is_in_first = |it: &&Series| legends[0].iter().any(|first| first.name == it.name);
         let lacks_a_name = look == Look::Plain && !shared.iter().all(is_in_first);
-        if !lacks_a_name && !legends.iter().any(is_large) {
-            shared.clear();
-        }
-        shared
+        let is_needed = lacks_a_name || legends.iter().any(is_large);
+        if is_needed { shared } else { Vec::new() }
     }
 
     fn draw(&self, look: Look, letters: Letters) -> Canvas {

@@ -239,8 +239,8 @@ fn policy_rng(seed: u64) -> ChaCha8Rng {
 pub fn world_with_levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
     let changed = match levels {
         Levels::Train => Ok(world.clone()),
-        Levels::TrainSingle => world.with_single_levels(false),
-        Levels::Unseen => world.with_single_levels(true),
+        Levels::TrainSingle => world.with_single_levels(),
+        Levels::Unseen => world.with_unseen_levels(),
     };
     changed.map_err(|e| usage!("{e}"))
 }

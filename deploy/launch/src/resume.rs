@@ -307,7 +307,11 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
         frames,
         replay_is_kept,
         after_updates: updates,
-        frames_max: config.frames(),
+        // A run in lockstep repeats what follows its checkpoint; before the first update only frames tell that.
+        frames_max: match lockstep && updates == 0 {
+            true => frames,
+            false => config.frames(),
+        },
     };
     Ok(Resumption::Resumed(Box::new(ResumedRun {
         config,

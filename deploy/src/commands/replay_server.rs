@@ -94,14 +94,8 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
 /// smaller replay would delete transitions.
 fn keep_capacity(args: &mut ReplayServerArgs) {
     let flags = &mut args.run.flags;
-    let set_shards = |set: &String| match set.split_once('=')? {
-        (path, number) if path.trim() == "replay.shards" => number.trim().parse().ok(),
-        _ => None,
-    };
-    let shards = flags.sets.iter().rev().find_map(set_shards);
-    let shards = shards.or(flags.replay_shards).unwrap_or(1);
     if let (None, Some(dir)) = (&args.run.config, &args.replay_dir)
-        && let Some(capacity) = kept_capacity(dir, args.shard, shards)
+        && let Some(capacity) = kept_capacity(dir, args.shard, flags.shards())
     {
         tracing::info!(
             "the replay in {} holds up to {capacity} transitions",

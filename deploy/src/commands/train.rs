@@ -143,6 +143,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let plan = plan::describe(&config, &from, &run_dir, lockstep, point, &machine);
     print_wrapped(&plan, plan::INDENT)?;
     let parent = args.exit_with_parent;
+    let existed = run_dir.path().is_dir();
     let train = || -> anyhow::Result<()> {
         config.world.install(&mut console::eprintln)?;
         if args.lockstep {
@@ -157,7 +158,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     };
     train().inspect_err(|_| {
         // Removes only an empty folder: one in which nothing was begun.
-        let _ = fs::remove_dir(run_dir.path());
+        if !existed {
+            let _ = fs::remove_dir(run_dir.path());
+        }
     })
 }
 

@@ -105,8 +105,10 @@ impl PolicyNetwork {
                 .for_each(|(values, frames)| task(frames, values));
         }
         let bad = values.iter().position(|value| !value.is_finite());
-        let bad = bad.map(|index| index / actions);
-        bad.map_or(Ok(()), |row| Err(ModelError::NotFinite { row }))
+        match bad.map(|index| index / actions) {
+            Some(row) => Err(ModelError::NotFinite { row }),
+            None => Ok(()),
+        }
     }
 
     /// Writes the greedy action of each frame in `frames` [B, H, W, C] to `actions` [B]. On a tie the lowest action wins.

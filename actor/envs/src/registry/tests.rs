@@ -97,7 +97,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     assert_eq!(config.frame_shape().height, 3);
     assert!(config.validate().is_ok() && config.build(1, 1, 0).is_err());
     check_round_trip(&config);
-    assert!(config.with_single_levels(true).is_err());
+    assert!(config.with_single_levels().is_err());
     assert_eq!(plugin::preset("flat"), Some("# preset"));
     let wrong = text.replace("3.5", "3.5\ncolour = 1");
     fails(toml::from_str::<WorldConfig>(&wrong), &["colour"]);
@@ -158,6 +158,13 @@ fn configs() -> [WorldConfig; 4] {
         WorldConfig::Ising(ising::tests::paper_config()),
         WorldConfig::MsPacman(pacman::tests::config()),
     ]
+}
+
+#[test]
+fn a_world_of_wrong_settings_is_not_built() {
+    let mut config = ising::tests::paper_config();
+    config.patch_size = 2;
+    fails(WorldConfig::Ising(config).build(1, 1, 0), &["patch_size"]);
 }
 
 #[test]
@@ -236,7 +243,8 @@ fn continues(world: &WorldConfig) -> bool {
 fn unseen_levels_are_none_of_those_trained_on() {
     for (start, count) in [(0, 500), (70, 1), (1000, 200)] {
         let world = procgen(start, count);
-        let [single, unseen] = [false, true].map(|it| world.with_single_levels(it).unwrap());
+        let single = world.with_single_levels().unwrap();
+        let unseen = world.with_unseen_levels().unwrap();
         assert!(continues(&world) && !continues(&single) && !continues(&unseen));
         assert_eq!(levels_of(&single), start..start + count);
         let unseen = levels_of(&unseen);
@@ -249,9 +257,9 @@ fn unseen_levels_are_none_of_those_trained_on() {
 
 #[test]
 fn levels_that_a_world_does_not_have_are_refused() {
-    fails(procgen(0, 0).with_single_levels(true), &["none is unseen"]);
+    fails(procgen(0, 0).with_unseen_levels(), &["none is unseen"]);
     let [_, chain, ..] = configs();
-    for unseen in [false, true] {
-        fails(chain.with_single_levels(unseen), &["has no levels"]);
+    for wrong in [chain.with_single_levels(), chain.with_unseen_levels()] {
+        fails(wrong, &["has no levels"]);
     }
 }

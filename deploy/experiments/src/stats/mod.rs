@@ -73,10 +73,10 @@ fn differ(from: &[f64], to: &[f64]) -> bool {
 
 /// Returns as the end of a sentence whether `to` is better than its base `from`.
 pub(crate) fn verdict(from: &[f64], to: &[f64]) -> &'static str {
-    match difference(from, to) {
-        Some(it) if differ(from, to) && it.mean > 0.0 => ", better than its base",
-        Some(_) if differ(from, to) => ", worse than its base",
-        _ => "",
+    match differ(from, to) {
+        false => "",
+        true if mean(to) > mean(from) => ", better than its base",
+        true => ", worse than its base",
     }
 }
 

@@ -60,9 +60,16 @@ impl Runs {
     /// Returns the names of the finished runs in this folder that none of `plans` has, sorted.
     pub(super) fn finished_besides<P>(&self, plans: &[PointPlan<P>]) -> Vec<String> {
         let planned: HashSet<_> = plans.iter().map(|(_, plan)| plan.name.as_str()).collect();
+        // A run with enough episodes was stopped, so its outcome is an interruption.
+        let enough = plans.iter().filter_map(|(_, plan)| plan.episodes).min();
+        let is_finished = |it: Summary| match it.outcome {
+            Outcome::Finished => true,
+            Outcome::Interrupted => enough.is_some_and(|all| it.episodes >= all),
+            Outcome::Failed => false,
+        };
         let is_other = |name: &str| {
-            let summary = Summary::read(&RunFolder::new(self.root.join(name)));
-            !planned.contains(name) && summary.is_ok_and(|it| it.outcome == Outcome::Finished)
+            let folder = RunFolder::new(self.root.join(name));
+            !planned.contains(name) && Summary::read(&folder).is_ok_and(is_finished)
         };
         let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
         let names = entries.filter_map(|entry| {

@@ -16,7 +16,7 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     checkpoint_choice::CheckpointChoice,
-    console,
+    console::{self, Screen},
     evaluator::{EvaluationSchedule, evaluate_and_keep},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
@@ -41,7 +41,9 @@ pub fn run(
 ) -> anyhow::Result<()> {
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
     let GracefulShutdown { drain, immediate } = shutdown.context("listening for signals")?;
-    watch_interrupts(drain.clone(), immediate)?;
+    let mut display = Display::new(config.frames(), Instant::now());
+    let screen = display.screen.clone();
+    watch_interrupts(drain.clone(), immediate, screen.clone())?;
     let is_stopped = || drain.is_set();
     let mut schedule = EvaluationSchedule::new(config, run_dir)?;
     let events = config.local.tensorboard;
@@ -57,8 +59,6 @@ pub fn run(
     let point = resumed.unwrap_or_default();
     let (frames, updates) = (point.frames, point.updates);
     let mut view = RunView::starting_at(Plan::new(config), frames, updates);
-    let mut display = Display::new(config.frames(), Instant::now());
-    let screen = display.screen.clone();
     let mut evaluate = |updates, is_last| {
         let Some(episodes) = schedule.take_episodes(updates, is_last) else {
             return;
@@ -136,13 +136,13 @@ pub fn run(
 }
 
 /// Reports the first interrupt, because the round in progress may wait for a world for long. Exits at the second.
-fn watch_interrupts(first: Shutdown, second: Shutdown) -> anyhow::Result<()> {
+fn watch_interrupts(first: Shutdown, second: Shutdown, screen: Screen) -> anyhow::Result<()> {
     let watch = move || {
         first.wait();
-        console::eprintln("stopping after this round (Ctrl-C again exits at once)");
+        screen.print_line("stopping (Ctrl-C again exits at once)");
         second.wait();
         let error = "error: stopped at once by a second interrupt: what was not saved is lost";
-        console::eprintln(error);
+        screen.print_line(error);
         std::process::exit(1);
     };
     let thread = std::thread::Builder::new().name("end".into());

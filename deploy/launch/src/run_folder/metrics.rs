@@ -81,9 +81,8 @@ pub(super) fn rows_up_to(
     let seconds = seconds.fold(0.0, f64::max);
     table.keep_rows(path, |it: Counts| {
         // Actors run ahead: without the limit on frames, a run that now ends sooner would keep rows from after its end. A replay that
-        // is filled anew counts from the checkpoint's frames, and so does a run in lockstep; updates tell its later rows, if it has any.
-        let is_kept = resume_point.replay_is_kept && resume_point.updates > 0;
-        let is_counted = is_kept || it.frames <= resume_point.frames;
+        // is filled anew counts from the checkpoint's frames.
+        let is_counted = resume_point.replay_is_kept || it.frames <= resume_point.frames;
         is_counted && it.updates <= resume_point.updates && it.frames <= resume_point.frames_max
     })?;
     let columns: Vec<_> = header.iter().map(|name| table.column_index(name)).collect();

@@ -35,7 +35,8 @@ impl<'a> Product<'a> {
     /// # Panics
     /// If the shapes do not match.
     pub(crate) fn new(precision: Precision, a: Matrix<'a>, b: Matrix<'a>) -> Self {
-        assert_eq!(a.cols, b.rows, "the terms of a product's sums");
+        let (rows, cols) = (a.rows, b.cols);
+        assert_eq!(a.cols, b.rows, "terms of a {rows}x{cols} product");
         Self {
             precision,
             a,

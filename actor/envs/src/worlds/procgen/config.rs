@@ -66,16 +66,22 @@ impl ProcgenConfig {
     }
 
     /// Returns the same game with one level per episode.
-    pub(crate) fn with_single_levels(&self, unseen: bool) -> Result<Self, EnvError> {
-        let mut changed = self.clone();
-        changed.use_sequential_levels = false;
-        if unseen {
-            let why = "this run trained on all levels, so none is unseen";
-            require(self.num_levels > 0, why)?;
-            changed.start_level += self.num_levels;
-            changed.num_levels = UNSEEN_LEVELS;
+    pub(crate) fn with_single_levels(&self) -> Self {
+        Self {
+            use_sequential_levels: false,
+            ..self.clone()
         }
-        Ok(changed)
+    }
+
+    /// Returns the same game with one level per episode, from those behind the levels of training.
+    pub(crate) fn with_unseen_levels(&self) -> Result<Self, EnvError> {
+        let why = "this run trained on all levels, so none is unseen";
+        require(self.num_levels > 0, why)?;
+        Ok(Self {
+            start_level: self.start_level + self.num_levels,
+            num_levels: UNSEEN_LEVELS,
+            ..self.with_single_levels()
+        })
     }
 
     /// The engine's settings, checked.

@@ -133,9 +133,11 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
 }
 
 #[test]
-fn too_many_threads_are_refused_without_an_engine() {
-    let made = ProcgenWorld::new(&config(Game::Maze), 1, 1, 1000);
-    fails(made, &["1000 threads"]);
+fn wrong_settings_and_too_many_threads_are_rejected_without_an_engine() {
+    let mut maze = config(Game::Maze);
+    fails(ProcgenWorld::new(&maze, 1, 1, 1000), &["1000 threads"]);
+    maze.frame_side = 7;
+    fails(ProcgenWorld::new(&maze, 1, 1, 0), &["frame_side = 7"]);
 }
 
 #[test]

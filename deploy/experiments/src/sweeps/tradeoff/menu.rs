@@ -220,7 +220,10 @@ impl Settings {
     }
 
     pub(super) const fn seed_count(&self, is_base: bool) -> u32 {
-        self.seeds * if is_base { BASE_SEEDS } else { 1 }
+        match is_base {
+            true => BASE_SEEDS * self.seeds,
+            false => self.seeds,
+        }
     }
 }
 

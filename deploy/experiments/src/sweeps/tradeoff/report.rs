@@ -215,8 +215,9 @@ fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
     let placed = results.points.values().filter_map(place);
     let (placed, bars): (Vec<_>, Vec<_>) = placed.unzip();
     let front = front(&placed);
-    let speeds: Vec<f64> = placed.iter().map(|it| it.0).collect();
-    let values: Vec<f64> = bars.iter().flat_map(|it| [it.1, it.2]).collect();
+    let speeds: Vec<f64> = placed.iter().map(|&(speed, _)| speed).collect();
+    let values = bars.iter().flat_map(|&(_, low, high)| [low, high]);
+    let values: Vec<f64> = values.collect();
     let label = format!("{name} return");
     let panels = results.rows_by_dial().map(|rows| {
         let line = Series::line("", 0, front.clone());
