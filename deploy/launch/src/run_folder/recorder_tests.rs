@@ -236,14 +236,19 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
     let at_start = ResumePoint::default();
     let in_lockstep = ResumePoint {
         frames: 320,
-        frames_max: 9_999,
+        frames_max: 320,
         replay_is_kept: true,
         ..at_start
+    };
+    let with_log = ResumePoint {
+        frames_max: 9_999,
+        ..in_lockstep
     };
     for (metrics, point, kept, episodes) in [
         ("1.0,700,0,2\n", at_start, 0, 0),
         // The kept replay counts the episodes.
         ("1.0,320,0,2\n1.5,800,0,3\n", in_lockstep, 1, 0),
+        ("1.0,320,0,2\n1.5,800,0,3\n", with_log, 2, 0),
         ("1.0,1900,31,2\n1.5,2300,31,3\n", point(31), 1, 2),
     ] {
         let folder = tempfile::tempdir().unwrap();
