@@ -91,7 +91,7 @@ impl Collector {
         let world = settings.world.build(envs, world_seed, threads);
         let world = world.map_err(build_error)?;
         let shape = world.frame_shape();
-        let sent_size = (spec.frame_height as usize, spec.frame_width as usize);
+        let sent_size = spec.frame_size();
         let (height, width) = settings.input.whole_frame(sent_size);
         let (channels, num_actions) = (spec.frame_channels as usize, spec.num_actions as usize);
         let expected = (height, width, channels, num_actions);

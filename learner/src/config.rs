@@ -224,10 +224,7 @@ impl LearnerConfig {
         this.learner.validate()?;
         this.learner.update.validate()?;
         let (height, width) = this.input.whole_input();
-        let frame_size = (
-            this.spec.frame_height as usize,
-            this.spec.frame_width as usize,
-        );
+        let frame_size = this.spec.frame_size();
         let states = (this.spec.frame_channels * this.spec.frame_stack) as usize;
         let whole = ModelConfig {
             height,

@@ -59,14 +59,13 @@ pub(crate) struct Preparation {
 impl Preparation {
     pub(crate) fn new(config: &LearnerConfig) -> Result<Self, ModelError> {
         let (spec, model) = (&config.spec, &config.model);
-        let frame_size = (spec.frame_height as usize, spec.frame_width as usize);
         let size = (model.height, model.width, model.input_channels);
         let channels = spec.frame_channels as usize;
         let augment = config.learner.augment;
         Ok(Self {
             positives: config.learner.update.auxiliary_loss.positives(),
             state_bytes: model.frame_len(),
-            enlarge: config.input.resizer(frame_size, model)?,
+            enlarge: config.input.resizer(spec.frame_size(), model)?,
             enlarged: Default::default(),
             augment: augment.map(|settings| Augmenter::new(settings, size, channels)),
             augmented: Default::default(),

@@ -125,7 +125,12 @@ impl RunSpec {
         }
     }
 
-    /// Bytes of one frame as actors send it: neither stacked nor enlarged.
+    /// Rows and columns of one frame as actors send it: neither stacked nor enlarged.
+    pub const fn frame_size(&self) -> (usize, usize) {
+        (self.frame_height as usize, self.frame_width as usize)
+    }
+
+    /// Bytes of one frame as actors send it.
     pub const fn frame_bytes(&self) -> usize {
         self.frame_height as usize * self.frame_width as usize * self.frame_channels as usize
     }

@@ -64,8 +64,7 @@ impl Recording {
     pub(super) fn record() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::eprintln)?;
         let config = settings::run_config(settings::WORLD, "c51", "paper", &[])?;
-        let run = &config.run;
-        let sent = (run.frame_height as usize, run.frame_width as usize);
+        let sent = config.run.frame_size();
         let whole = config.world.build(STREAMS, 1, 0)?;
         let world = RestrictedWorld::wrap(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();

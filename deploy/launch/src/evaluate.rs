@@ -170,8 +170,8 @@ impl Player {
     }
 
     fn enlarge(&self) -> anyhow::Result<Option<Resizer>> {
-        let config = &self.config;
-        Ok(config.input.resizer(frame_size(config), &config.model)?)
+        let (config, size) = (&self.config, self.config.run.frame_size());
+        Ok(config.input.resizer(size, &config.model)?)
     }
 }
 
@@ -217,15 +217,10 @@ fn play_episodes(
         steps_max: episodes.div_ceil(envs) as u64 * STEPS_PER_ROUND_MAX,
     };
     let actions = world.actions(config.actor.actions);
-    let world = RestrictedWorld::wrap(world.build(envs, seed, 0)?, actions, frame_size(config))?;
+    let size = config.run.frame_size();
+    let world = RestrictedWorld::wrap(world.build(envs, seed, 0)?, actions, size)?;
     episode_returns(world, policy, evaluation, policy_rng(seed), watch)
         .with_context(|| format!("playing {}", config.run.world))
-}
-
-/// Rows and columns of a frame as actors send it.
-const fn frame_size(config: &RunConfig) -> (usize, usize) {
-    let spec = &config.run;
-    (spec.frame_height as usize, spec.frame_width as usize)
 }
 
 /// The generator of the policy's random actions. Its numbers differ from those of every environment, which has the same seed.

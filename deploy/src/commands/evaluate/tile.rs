@@ -74,7 +74,7 @@ impl Layout {
         local: Option<Local>,
     ) -> Self {
         let spec = &config.run;
-        let (height, width) = (spec.frame_height as usize, spec.frame_width as usize);
+        let (height, width) = spec.frame_size();
         let longer = height.max(width).max(1);
         let zoom = ((FRAME_SIDE + longer / 2) / longer).max(1);
         let enlarged = ((width * zoom) as f64, (height * zoom) as f64);

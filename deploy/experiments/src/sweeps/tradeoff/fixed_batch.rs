@@ -43,9 +43,8 @@ pub(super) fn sample(
     }
     let drawn = replay.sample(rows as u32);
     let batch = drawn.map_err(|why| anyhow!("no batch: {why:?}"))?;
-    let (spec, model) = (&settings.spec, &config.model);
-    let frame_size = (spec.frame_height as usize, spec.frame_width as usize);
-    let resizer = config.input.resizer(frame_size, model)?;
+    let frame_size = settings.spec.frame_size();
+    let resizer = config.input.resizer(frame_size, &config.model)?;
     let enlarged = |states: &[u8]| match &resizer {
         None => states.to_vec(),
         Some(resizer) => {
