@@ -65,12 +65,7 @@ impl Insight {
 
     /// Computes the network's outputs for states [B, H, W, C].
     pub fn evaluate(&self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
-        let enlarged = self.enlarge.as_ref().map(|enlarge| {
-            let count = states.len() / enlarge.input_bytes();
-            let mut enlarged = vec![0; count * enlarge.output_bytes()];
-            enlarge.apply(states, &mut enlarged);
-            enlarged
-        });
+        let enlarged = self.enlarge.as_ref().map(|it| it.resized(states));
         let input = enlarged.as_deref().unwrap_or(states);
         let states = states_tensor(&self.model, input, &self.compute.device)?;
         let features = self.network.features(&states)?;

@@ -165,6 +165,16 @@ impl Resizer {
         self.source_rows.len() * self.source_cols.len() * self.channels
     }
 
+    /// Resizes `images` [n, from, c] to [n, to, c].
+    ///
+    /// # Panics
+    /// If the length is not that of whole images.
+    pub fn resized(&self, images: &[u8]) -> Vec<u8> {
+        let mut enlarged = vec![0; images.len() / self.input_bytes() * self.output_bytes()];
+        self.apply(images, &mut enlarged);
+        enlarged
+    }
+
     /// Resizes `images` [n, from, c] into `enlarged` [n, to, c].
     ///
     /// # Panics
@@ -213,8 +223,8 @@ mod tests {
             let images: Vec<u8> = (0..2 * from.0 * from.1 * channels)
                 .map(|index| (index * 7 % 251) as u8)
                 .collect();
-            let mut enlarged = vec![0; 2 * to.0 * to.1 * channels];
-            resizer.apply(&images, &mut enlarged);
+            let enlarged = resizer.resized(&images);
+            assert_eq!(enlarged.len(), 2 * to.0 * to.1 * channels);
             for (index, &value) in enlarged.iter().enumerate() {
                 let (pixel, channel) = (index / channels, index % channels);
                 let (image, y, x) = (pixel / (to.0 * to.1), pixel / to.1 % to.0, pixel % to.1);
@@ -257,9 +267,7 @@ mod tests {
             let image: Vec<u8> = (0..frame.0 * frame.1)
                 .map(|at| (at * 7 % 251) as u8)
                 .collect();
-            let mut whole = vec![0; input.0 * input.1];
-            let resizer = Resizer::new(frame, input, 1).unwrap();
-            resizer.apply(&image, &mut whole);
+            let whole = Resizer::new(frame, input, 1).unwrap().resized(&image);
             let model = ModelConfig {
                 height: found.input.0,
                 width: found.input.1,
@@ -267,11 +275,10 @@ mod tests {
                 ..ModelConfig::small()
             };
             let sent = cut(&image, frame.1, found.frame);
-            let mut part = vec![0; found.input.0 * found.input.1];
-            match size.resizer(found.frame, &model).unwrap() {
-                Some(resizer) => resizer.apply(&sent, &mut part),
-                None => part.copy_from_slice(&sent),
-            }
+            let part = match size.resizer(found.frame, &model).unwrap() {
+                Some(resizer) => resizer.resized(&sent),
+                None => sent,
+            };
             assert_eq!(part, cut(&whole, input.1, found.input), "{frame:?}");
             // One row less is too small.
             let less = (found.frame.0 - 1, found.frame.1);

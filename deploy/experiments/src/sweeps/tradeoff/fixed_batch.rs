@@ -47,12 +47,7 @@ pub(super) fn sample(
     let resizer = config.input.resizer(frame_size, &config.model)?;
     let enlarged = |states: &[u8]| match &resizer {
         None => states.to_vec(),
-        Some(resizer) => {
-            let images = states.len() / resizer.input_bytes();
-            let mut enlarged = vec![0; images * resizer.output_bytes()];
-            resizer.apply(states, &mut enlarged);
-            enlarged
-        }
+        Some(resizer) => resizer.resized(states),
     };
     Ok(OwnedBatch {
         states_t: enlarged(&batch.states_t()),
