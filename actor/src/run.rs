@@ -1,15 +1,14 @@
 //! Runs one actor process: joins the run, acts, and delivers chunks until it is told to stop or the run has enough transitions.
 //! The acting itself is in `collect`, which uses no network.
 
-use std::{cell::Cell, sync::Arc, time::Duration};
+use std::{cell::Cell, time::Duration};
 
 use anyhow::{Context, bail};
 use driml_envs::WorldName;
 use driml_protocol::{
-    Activity, ActorJoin, ChunkPoll, InsertReply, Keys, Leave, Participant, RunClient, Shutdown,
-    join, reporter,
-    session::{self, Endpoints},
-    tls::Credentials,
+    Activity, ActorJoin, ChunkPoll, InsertReply, Leave, Participant, RunClient, Shutdown, join,
+    reporter,
+    session::{Connection, SMALL_MESSAGE_BYTES_MAX},
 };
 use zenoh::Wait;
 
@@ -28,12 +27,8 @@ const ASK_MAX: Duration = Duration::from_secs(2);
 /// The arguments of one actor process. All other settings come from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
-    /// Endpoints of the replay server.
-    pub connect: Vec<String>,
-    /// The actor's TLS certificate and key; `None` without TLS.
-    pub credentials: Option<Arc<Credentials>>,
-    /// Prefix of the run's keys.
-    pub namespace: String,
+    /// The connection to the replay server.
+    pub connection: Connection,
     /// The actor's number, unique in the run.
     pub actor: u32,
     /// The number of environments, if it differs from the run's settings.
@@ -48,13 +43,12 @@ pub struct RunArgs {
 /// # Errors
 /// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
-    let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let endpoints = Endpoints::connect_to(args.connect);
-    let (credentials, bytes_max) = (args.credentials.as_ref(), session::SMALL_MESSAGE_BYTES_MAX);
-    let opened = session::open_unless(shutdown, endpoints, &keys, credentials, bytes_max)?;
+    let connection = args.connection;
+    let opened = connection.open_unless(shutdown, SMALL_MESSAGE_BYTES_MAX)?;
     let Some(session) = opened else {
         return Ok(false);
     };
+    let keys = connection.keys;
     let Some(run_info) = join::fetch_run_info(&session, &keys, shutdown)? else {
         return Ok(false);
     };

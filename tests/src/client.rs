@@ -1,14 +1,14 @@
 //! A zenoh client of a run, like any process of the run: sends requests, and any message that a test needs.
 //! The client stores nothing, and has a role in the run only if a test joins it as an actor or the learner.
 
-use std::{net::UdpSocket, time::Duration};
+use std::{net::UdpSocket, sync::Arc, time::Duration};
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
     ReplayStatus, RunClient, RunSpec, Shutdown, codec,
     config::Settings,
     join,
-    session::{self, Endpoints, SessionError},
+    session::{self, Connection, Endpoints, MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
 use zenoh::{Session, Wait, qos::Priority};
@@ -70,14 +70,17 @@ pub fn check_nothing_lost(replay: &ReplayStatus) {
 
 impl Client {
     /// Connects to the run at an endpoint once its replay server answers.
-    pub(crate) fn join(endpoint: &str, credentials: Option<&Credentials>) -> Self {
-        let endpoints = Endpoints::connect_to(vec![endpoint.to_owned()]);
-        let keys = Keys::new(NAMESPACE).unwrap();
-        let bytes_max = session::MESSAGE_BYTES_MAX;
+    pub(crate) fn join(endpoint: &str, credentials: Option<Credentials>) -> Self {
+        let connection = Connection {
+            endpoints: Endpoints::connect_to(vec![endpoint.to_owned()]),
+            keys: Keys::new(NAMESPACE).unwrap(),
+            credentials: credentials.map(Arc::new),
+        };
         // One attempt waits for some seconds; on a busy machine a process may need longer to start listening.
         let session = wait_for(&format!("a process that listens on {endpoint}"), || {
-            session::open_as(&endpoints, &keys, credentials, bytes_max).ok()
+            connection.open(MESSAGE_BYTES_MAX).ok()
         });
+        let keys = connection.keys;
         let run_info = join::fetch_run_info(&session, &keys, &Shutdown::default())
             .unwrap()
             .expect("this client is not told to stop");

@@ -283,7 +283,7 @@ impl TestSystem {
     pub fn connect_as(&self, role: Role) -> Client {
         let read = || Credentials::read(&self.path("tls"), role).unwrap();
         let credentials = (!self.tls.is_empty()).then(read);
-        Client::join(&self.endpoint, credentials.as_ref())
+        Client::join(&self.endpoint, credentials)
     }
 
     /// Returns a process's connection to the run with this `spec`, without a request to the replay server.

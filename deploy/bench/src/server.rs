@@ -17,7 +17,7 @@ use driml_learner::{
 use driml_machine::speed_meter::SpeedMeter;
 use driml_protocol::{
     ActorJoin, JoinReply, Keys, LearnerJoin, Peer, Request, RunClient, Shutdown, join,
-    session::{self, Endpoints, MESSAGE_BYTES_MAX},
+    session::{Connection, Endpoints, MESSAGE_BYTES_MAX},
     tls::{Credentials, Role},
 };
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
@@ -196,11 +196,14 @@ impl Wire {
     /// Opens a session in a role, with the role's certificate if the server uses TLS.
     fn open(&self, keys: &Keys, role: Role) -> anyhow::Result<Session> {
         let credentials = match &self.folder {
-            Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?),
+            Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?.into()),
             _ => None,
         };
-        let to = Endpoints::connect_to(vec![self.endpoint.clone()]);
-        let opened = session::open_as(&to, keys, credentials.as_ref(), MESSAGE_BYTES_MAX);
-        Ok(opened?)
+        let connection = Connection {
+            endpoints: Endpoints::connect_to(vec![self.endpoint.clone()]),
+            keys: keys.clone(),
+            credentials,
+        };
+        Ok(connection.open(MESSAGE_BYTES_MAX)?)
     }
 }

@@ -48,14 +48,13 @@ fn actor_id(text: &str) -> Result<u32, String> {
 
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
-    let credentials = args.tls.credentials(Role::Actor(args.id))?;
+    let (role, namespace) = (Role::Actor(args.id), &args.join.namespace);
+    let connection = args.tls.connection(role, namespace, args.connect)?;
     let world = args.env.as_deref().map(presets::world).transpose();
     let world = world.map_err(|e| usage!("--env: {e}"))?;
     let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;
     let run = driml_actor::RunArgs {
-        connect: args.connect,
-        credentials,
-        namespace: args.join.namespace,
+        connection,
         actor: args.id,
         envs: args.envs,
         world,

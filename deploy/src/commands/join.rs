@@ -7,7 +7,8 @@ use clap::Args;
 use driml_launch::{endpoint::DEFAULT_NAMESPACE, rendezvous, shared_memory};
 use driml_machine::error::{Interrupted, Usage};
 use driml_protocol::{
-    Keys, session,
+    Keys,
+    session::{self, Connection, Endpoints},
     tls::{Credentials, Role},
 };
 
@@ -58,14 +59,27 @@ impl TlsFlags {
         let read = self.tls_dir.as_ref().map(read).transpose();
         read.map_err(|e| Usage(e.to_string()))
     }
+
+    /// Returns how a process in this role reaches the run at these endpoints.
+    pub(super) fn connection(
+        &self,
+        role: Role,
+        namespace: &str,
+        connect: Vec<String>,
+    ) -> Result<Connection, Usage> {
+        Ok(Connection {
+            credentials: self.credentials(role)?,
+            keys: Keys::new(namespace).map_err(Usage)?,
+            endpoints: Endpoints::connect_to(connect),
+        })
+    }
 }
 
-/// Checks the flags, and calls `listen` to listen for signals.
+/// Removes the shared memory of processes that were killed, and calls `listen` to listen for signals.
 pub(super) fn prepare_join<T>(
     flags: &JoinFlags,
     listen: fn(Option<u32>) -> io::Result<T>,
 ) -> anyhow::Result<T> {
-    Keys::new(&flags.namespace).map_err(Usage)?;
     if flags.exit_with_parent.is_none() {
         session::remove_orphaned_shared_memory();
     }

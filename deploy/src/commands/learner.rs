@@ -33,13 +33,12 @@ pub(crate) struct LearnerArgs {
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
     check_folder("--run-dir", &args.run_dir)?;
-    let credentials = args.tls.credentials(Role::Learner)?;
+    let (role, namespace) = (Role::Learner, &args.join.namespace);
+    let connection = args.tls.connection(role, namespace, args.connect)?;
     check_device(args.on.device)?;
     let shutdown = prepare_join(&args.join, Shutdown::on_signals)?;
     let run = driml_learner::RunArgs {
-        connect: args.connect,
-        credentials,
-        namespace: args.join.namespace,
+        connection,
         run_dir: args.run_dir,
         device: args.on.device,
         restart: args.restart,

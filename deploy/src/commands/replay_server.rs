@@ -46,7 +46,9 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     check_listen_endpoints(&args.listen, args.tls.is_set(), args.network.allow_insecure)?;
     check_unused(&args.listen)?;
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
-    let credentials = args.tls.credentials(Role::ReplayServer)?;
+    let (role, namespace) = (Role::ReplayServer, &args.join.namespace);
+    let mut connection = args.tls.connection(role, namespace, args.connect.clone())?;
+    connection.endpoints.listen.clone_from(&args.listen);
     args.run.flags.server_alone = true;
     keep_capacity(&mut args);
     let (config, _) = flags::resolve(&args.run, &Machine::detect())?;
@@ -71,10 +73,7 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     config.notes.iter().for_each(|it| tracing::warn!("{it}"));
     open_files::warn_if_limit_low(&config);
     let run = driml_replay_server::RunArgs {
-        listen: args.listen,
-        connect: args.connect,
-        credentials,
-        namespace: args.join.namespace,
+        connection,
         shard: args.shard,
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,

@@ -71,9 +71,9 @@ impl RunSelection {
     /// Opens a connection to the run. The error may be an [`UnreachableRun`].
     fn open(&self) -> anyhow::Result<Poller> {
         check_connect_endpoints(&self.connect, self.tls.is_set())?;
-        let credentials = self.tls.credentials(Role::Observer)?;
-        let endpoints = self.endpoints()?;
-        let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
+        let (role, connect) = (Role::Observer, self.endpoints()?);
+        let connection = self.tls.connection(role, &self.namespace, connect)?;
+        let opened = Poller::open(&connection);
         if opened.is_err() {
             // The run may have ended meanwhile.
             self.endpoints()?;

@@ -10,8 +10,8 @@ use std::{
 use anyhow::Context;
 use driml_model::DeviceName;
 use driml_protocol::{
-    Activity, BatchHeader, Keys, Participant, ReplayStatus, Shutdown, atomic_write, reporter,
-    shared_memory, tls::Credentials,
+    Activity, BatchHeader, Participant, ReplayStatus, Shutdown, atomic_write, reporter,
+    session::Connection, shared_memory,
 };
 
 use super::{
@@ -37,12 +37,8 @@ const TICK: Duration = Duration::from_millis(200);
 /// The arguments of a learner; everything else comes from the replay server.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
-    /// Endpoints of the replay server; one for each shard.
-    pub connect: Vec<String>,
-    /// The certificate of this process; `None` without TLS.
-    pub credentials: Option<Arc<Credentials>>,
-    /// Prefix of the run's keys.
-    pub namespace: String,
+    /// The connection to the replay server, with an endpoint for each shard.
+    pub connection: Connection,
     /// Where checkpoints go: `RUN_DIR/checkpoints`.
     pub run_dir: PathBuf,
     /// The device on which updates are computed.
@@ -59,9 +55,7 @@ pub struct RunArgs {
 /// # Errors
 /// A device that is not there, no replay server to join, settings that cannot work, an update that failed, a disk that rejects writes.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
-    let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let credentials = args.credentials.as_ref();
-    let Some(shards) = Shards::connect(&args.connect, &keys, credentials, shutdown)? else {
+    let Some(shards) = Shards::connect(&args.connection, shutdown)? else {
         return Ok(false);
     };
     let config = LearnerConfig::from_toml(&shards.config_toml)
@@ -100,7 +94,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         folder.display(),
     );
     let spec_hash = learner.spec_hash();
-    let clients = shards.clients(&keys, spec_hash);
+    let clients = shards.clients(&args.connection.keys, spec_hash);
     let counts = learner.run_counts_mut();
     if updates == 0 {
         // Without a kept replay, the run starts again; the servers report what a kept one has.

@@ -1,16 +1,12 @@
 //! The replay's shards: joins them all, and decides how many rows of a batch come from each.
 //! It fetches no batches: `fetcher` does.
 
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use driml_protocol::{
     Batch, Keys, LearnerJoin, Peer, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting,
     join,
-    session::{self, Endpoints},
-    tls::Credentials,
+    session::{Connection, MESSAGE_BYTES_MAX},
 };
 use rand::Rng;
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
@@ -40,21 +36,18 @@ pub(crate) struct Membership {
 impl Shards {
     /// Connects to the shard at each endpoint; `None` if the shutdown comes first.
     pub(crate) fn connect(
-        connect: &[String],
-        keys: &Keys,
-        credentials: Option<&Arc<Credentials>>,
+        connection: &Connection,
         shutdown: &Shutdown,
     ) -> anyhow::Result<Option<Self>> {
+        let connect = &connection.endpoints.connect;
         let mut sessions = Vec::new();
         let mut run_infos = Vec::new();
         for endpoint in connect {
-            let endpoints = Endpoints::connect_to(vec![endpoint.clone()]);
-            let max = session::MESSAGE_BYTES_MAX;
-            let opened = session::open_unless(shutdown, endpoints, keys, credentials, max)?;
-            let Some(session) = opened else {
+            let shard = connection.to_endpoint(endpoint);
+            let Some(session) = shard.open_unless(shutdown, MESSAGE_BYTES_MAX)? else {
                 return Ok(None);
             };
-            let Some(run_info) = join::fetch_run_info(&session, keys, shutdown)? else {
+            let Some(run_info) = join::fetch_run_info(&session, &shard.keys, shutdown)? else {
                 return Ok(None);
             };
             sessions.push(session);

@@ -52,46 +52,59 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     open_with_settings(endpoints, MESSAGE_BYTES_MAX, &[])
 }
 
-/// Like [`open`], with `credentials` if there are any: endpoints are then `quic/HOST:PORT` or unix sockets, and a replay server grants each
-/// role of the run only the keys that it needs. Messages of more than `message_bytes_max` bytes, which no peer of this run sends, are
-/// dropped on arrival.
-pub fn open_as(
-    endpoints: &Endpoints,
-    keys: &Keys,
-    credentials: Option<&Credentials>,
-    message_bytes_max: usize,
-) -> Result<Session, SessionError> {
-    let Some(credentials) = credentials else {
-        return open_with_settings(endpoints, message_bytes_max, &[]);
-    };
-    credentials.warn_if_expiring();
-    let mut settings = vec![
-        ("transport/link/tls", credentials.zenoh_settings()),
-        (
-            "transport/link/protocols",
-            "[\"quic\", \"unixsock-stream\"]".into(),
-        ),
-    ];
-    if credentials.role == Role::ReplayServer {
-        settings.push(("access_control", tls::access_rules(keys)));
-    }
-    open_with_settings(endpoints, message_bytes_max, &settings)
+/// How a process reaches the others of its run.
+#[derive(Clone, Debug)]
+pub struct Connection {
+    /// The endpoints of the session.
+    pub endpoints: Endpoints,
+    /// The keys of the run's messages.
+    pub keys: Keys,
+    /// The certificate and the key of this process; `None` without TLS.
+    pub credentials: Option<Arc<Credentials>>,
 }
 
-/// Like [`open_as`], for a process that waits for its replay server; returns `None` if `shutdown` is set first.
-pub fn open_unless(
-    shutdown: &Shutdown,
-    endpoints: Endpoints,
-    keys: &Keys,
-    credentials: Option<&Arc<Credentials>>,
-    message_bytes_max: usize,
-) -> Result<Option<Session>, SessionError> {
-    let (keys, credentials) = (keys.clone(), credentials.cloned());
-    let failed = endpoints.clone();
-    let open = move || open_as(&endpoints, &keys, credentials.as_deref(), message_bytes_max);
-    match shutdown.run_unless_set("connecting", open, || false) {
-        Ok(opened) => opened.transpose(),
-        Err(e) => Err(failed.open_error(&format!("starting a thread: {e}"))),
+impl Connection {
+    /// Like [`open`], with the credentials if there are any: endpoints are then `quic/HOST:PORT` or unix sockets, and a replay server grants
+    /// each role of the run only the keys that it needs. Messages of more than `message_bytes_max` bytes, which no peer of this run sends,
+    /// are dropped on arrival.
+    pub fn open(&self, message_bytes_max: usize) -> Result<Session, SessionError> {
+        let Some(credentials) = &self.credentials else {
+            return open_with_settings(&self.endpoints, message_bytes_max, &[]);
+        };
+        credentials.warn_if_expiring();
+        let mut settings = vec![
+            ("transport/link/tls", credentials.zenoh_settings()),
+            (
+                "transport/link/protocols",
+                "[\"quic\", \"unixsock-stream\"]".into(),
+            ),
+        ];
+        if credentials.role == Role::ReplayServer {
+            settings.push(("access_control", tls::access_rules(&self.keys)));
+        }
+        open_with_settings(&self.endpoints, message_bytes_max, &settings)
+    }
+
+    /// Like [`Self::open`], for a process that waits for its replay server; returns `None` if `shutdown` is set first.
+    pub fn open_unless(
+        &self,
+        shutdown: &Shutdown,
+        message_bytes_max: usize,
+    ) -> Result<Option<Session>, SessionError> {
+        let this = self.clone();
+        let open = move || this.open(message_bytes_max);
+        let opened = shutdown.run_unless_set("connecting", open, || false);
+        let failed = |e| format!("starting a thread: {e}");
+        let opened = opened.map_err(|e| self.endpoints.open_error(&failed(e)));
+        opened?.transpose()
+    }
+
+    /// The same connection, to this endpoint alone.
+    pub fn to_endpoint(&self, endpoint: &str) -> Self {
+        Self {
+            endpoints: Endpoints::connect_to(vec![endpoint.to_owned()]),
+            ..self.clone()
+        }
     }
 }
 

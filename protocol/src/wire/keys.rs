@@ -30,6 +30,11 @@ impl Keys {
         }
     }
 
+    /// The prefix of all keys.
+    pub fn namespace(&self) -> &str {
+        &self.namespace
+    }
+
     fn prefixed(&self, name: &str) -> String {
         format!("{}/{name}", self.namespace)
     }

@@ -9,13 +9,12 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, Peer, Recovering, Request, RunClient,
-    RunSpec, Sampling, Shutdown, answer_queries,
+    BatchHeader, BufferPool, Incoming, POOL_BATCHES, Peer, Recovering, Request, RunClient, RunSpec,
+    Sampling, Shutdown, answer_queries,
     config::{Settings, TransportConfig},
     fail_point, join_within,
-    session::{self, Endpoints},
+    session::Connection,
     shared_memory,
-    tls::Credentials,
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable, sample::SampleKind};
 
@@ -46,14 +45,8 @@ const THREADS_JOIN_MAX: Duration = Duration::from_secs(2);
 /// The arguments of a replay server process.
 #[derive(Clone, Debug)]
 pub struct RunArgs {
-    /// Endpoints to listen on.
-    pub listen: Vec<String>,
-    /// Routers to connect to, if any.
-    pub connect: Vec<String>,
-    /// The TLS certificate and key of the process; `None` without TLS.
-    pub credentials: Option<Arc<Credentials>>,
-    /// Prefix of the run's keys.
-    pub namespace: String,
+    /// The endpoints to listen on, and routers to connect to, if any.
+    pub connection: Connection,
     /// The number of this shard of the replay, from 0.
     pub shard: u32,
     /// Bytes of one version of the weights, which the replay server cannot compute. Uploads of more than about twice as many are rejected.
@@ -103,18 +96,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let is_lockable = || shared_memory::check_lockable(needed).inspect_err(warn_slower);
     let reads_shared_memory = is_granted && is_lockable().is_ok();
     let limits = MessageLimits::from_settings(&settings, &spec, args.weights_bytes_max)?;
-    let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let endpoints = Endpoints {
-        listen: args.listen.clone(),
-        connect: args.connect,
-    };
-    let session = session::open_as(
-        &endpoints,
-        &keys,
-        args.credentials.as_deref(),
-        limits.largest_bytes(),
-    )?;
-    let client = RunClient::new(session, keys, spec.hash());
+    let session = args.connection.open(limits.largest_bytes())?;
+    let client = RunClient::new(session, args.connection.keys, spec.hash());
     let gate = Arc::new(ServiceGate {
         service: OnceLock::new(),
         recovery: RecoveryControl::new(args.drain.clone()),
@@ -125,7 +108,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         declared.map_err(|e| anyhow::anyhow!("declaring what the replay server answers: {e}"))?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
-        args.listen,
+        args.connection.endpoints.listen,
         client.spec_hash()
     );
     let read = match kept {

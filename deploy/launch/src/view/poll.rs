@@ -11,8 +11,7 @@ use driml_machine::error::{Usage, usage};
 use driml_protocol::{
     CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, ReplayStatus,
     RunClient, RunInfo, Waiting, join, reach,
-    session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
-    tls::Credentials,
+    session::{self, Connection, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
 };
 use driml_settings::config::RunConfig;
 use zenoh::{Session, Wait};
@@ -74,25 +73,21 @@ impl Poller {
         }
     }
 
-    /// Connects to the replay servers at `endpoints`, with an observer's certificate if they require one.
+    /// Connects to the replay server at each endpoint of `connection`, which has an observer's certificate if they require one.
     ///
     /// # Errors
     /// Nothing listens at an endpoint, or something that is not a replay server of this program and namespace.
-    pub fn open(
-        endpoints: &[String],
-        namespace: &str,
-        credentials: Option<&Credentials>,
-    ) -> anyhow::Result<Self> {
-        let keys = Keys::new(namespace).map_err(Usage)?;
+    pub fn open(connection: &Connection) -> anyhow::Result<Self> {
+        let (endpoints, keys) = (&connection.endpoints.connect, &connection.keys);
         let mut servers = Vec::new();
         let mut config: Option<RunConfig> = None;
         let mut shards = BTreeMap::new();
         for endpoint in endpoints {
-            let server = Endpoints::connect_to(vec![endpoint.clone()]);
             // An observer does not wait for a server that does not listen yet.
             reach::check_listening(endpoint)?;
-            let session = session::open_as(&server, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
-            let (served, shard) = fetch_settings(&session, &keys, endpoint, namespace)?;
+            let server = connection.to_endpoint(endpoint);
+            let session = server.open(SMALL_MESSAGE_BYTES_MAX)?;
+            let (served, shard) = fetch_settings(&session, keys, endpoint)?;
             let hash = served.run.hash();
             if config.get_or_insert(served).run.hash() != hash {
                 bail!(usage!(
@@ -237,7 +232,6 @@ fn fetch_settings(
     session: &Session,
     keys: &Keys,
     endpoint: &str,
-    namespace: &str,
 ) -> anyhow::Result<(RunConfig, Option<u32>)> {
     let (config_toml, shard) = match join::fetch_run_info_once(session, keys, ANSWER_MAX) {
         Ok(run_info) => (run_info.config_toml, Some(run_info.shard.0)),
@@ -249,7 +243,8 @@ fn fetch_settings(
         }
         Err(SessionError::NoResponder { .. }) => {
             bail!(usage!(
-                "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}: check the endpoint and --namespace"
+                "a program listens on {endpoint}, but it is not a replay server with the namespace {:?}: check the endpoint and --namespace",
+                keys.namespace()
             ));
         }
         Err(other) => {
