@@ -107,12 +107,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         earlier_incarnations: welcome.earlier_incarnations,
     };
     let version = first.header.version;
-    let poll = ChunkPoll {
-        actor: join.actor,
-        incarnation: join.incarnation,
-        sequence: 0,
-        leaving: false,
-    };
+    let poll = ChunkPoll::new(join.actor, join.incarnation, 0);
     let rejected = Cell::new(None);
     let is_over = || match client.ask(&poll, ASK_MAX) {
         Ok(InsertReply::Finished { .. }) => true,

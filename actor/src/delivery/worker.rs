@@ -347,10 +347,8 @@ impl DeliveryWorker {
             header.leaving |= leaving;
             it.pending = Some(if it.is_kept {
                 let poll = ChunkPoll {
-                    actor: header.actor,
-                    incarnation: header.incarnation,
-                    sequence: header.sequence,
                     leaving: header.leaving,
+                    ..ChunkPoll::new(header.actor, header.incarnation, header.sequence)
                 };
                 self.client.send(self.client.encode(&poll)?, timeout)?
             } else {

@@ -233,6 +233,18 @@ pub struct ChunkPoll {
     pub leaving: bool,
 }
 
+impl ChunkPoll {
+    /// The poll of an actor that stays.
+    pub const fn new(actor: u32, incarnation: u64, sequence: u64) -> Self {
+        Self {
+            actor,
+            incarnation,
+            sequence,
+            leaving: false,
+        }
+    }
+}
+
 /// The replay server's reply to a chunk or a poll.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum InsertReply {

@@ -377,10 +377,8 @@ pub(crate) fn samples() -> Vec<Sample> {
             restart: true,
         }),
         Sample::new(&ChunkPoll {
-            actor: 1,
-            incarnation: 2,
-            sequence: 3,
             leaving: true,
+            ..ChunkPoll::new(1, 2, 3)
         }),
         Sample::new(&WeightsRequest::NewerThan(7)),
         Sample::new(&WeightsRequest::Piece {

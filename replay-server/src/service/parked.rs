@@ -172,13 +172,8 @@ pub(super) mod tests {
         packer.pack(Cow::Owned(chunk))
     }
 
-    fn poll(actor: u32, sequence: u64) -> ChunkPoll {
-        ChunkPoll {
-            actor,
-            incarnation: 9,
-            sequence,
-            leaving: false,
-        }
+    const fn poll(actor: u32, sequence: u64) -> ChunkPoll {
+        ChunkPoll::new(actor, 9, sequence)
     }
 
     #[test]

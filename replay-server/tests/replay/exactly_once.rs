@@ -218,12 +218,7 @@ fn a_poll_says_what_became_of_a_chunk() {
         transitions_max: Some(12),
         ..Config::unlimited(1000)
     });
-    let poll = |incarnation, sequence| ChunkPoll {
-        actor: 0,
-        incarnation,
-        sequence,
-        leaving: false,
-    };
+    let poll = |incarnation, sequence| ChunkPoll::new(0, incarnation, sequence);
     let unknown = replay.answer_poll(&poll(1, 0)).unwrap();
     assert!(is_refused(&unknown), "{unknown:?}");
     insert(&mut replay, header(0, 1, 0, 0));

@@ -108,10 +108,8 @@ fn reject_each_kind_of_message(run: &AttackedRun) {
     };
     let (no_run, newest) = ("counts that no run reaches", "acted, and the newest are");
     let poll = ChunkPoll {
-        actor: 0,
-        incarnation: INCARNATION,
-        sequence: u64::MAX,
         leaving: true,
+        ..ChunkPoll::new(0, INCARNATION, u64::MAX)
     };
     run.check_lies(
         [

@@ -68,12 +68,7 @@ fn an_actor_asks_for_nothing_but_its_own(run: &TlsRun) {
     let (other, incarnation) = (0, 9);
     let leave = Leave::new(other, incarnation, 0);
     let join = ActorJoin::new(other, incarnation);
-    let poll = ChunkPoll {
-        actor: other,
-        incarnation,
-        sequence: 0,
-        leaving: false,
-    };
+    let poll = ChunkPoll::new(other, incarnation, 0);
     let weights = upload(hash, 1, 1 << 19, b"w");
     let before = run.refusals();
     send_in_parallel(
