@@ -11,7 +11,7 @@ use anyhow::anyhow;
 use driml_protocol::{
     Buffer, BufferPool, CodecError, LogLimiter, PIECE_BYTES, RunClient, Shutdown, Silence, Weights,
     WeightsReply, WeightsRequest, WeightsVersion, codec::PAYLOAD_BYTES_MAX, fail_point, lock,
-    session::SessionError,
+    session::SessionError, spawn,
 };
 
 /// Time-out of the request for one piece, once those before it have arrived.
@@ -207,9 +207,7 @@ pub(crate) fn start_puller(
             }
         }
     };
-    std::thread::Builder::new()
-        .name("weights-watch".into())
-        .spawn(pull_loop)?;
+    spawn("weights-watch", pull_loop)?;
     Ok(newest)
 }
 

@@ -66,6 +66,7 @@ pub use process::{
     log_limiter::LogLimiter,
     shutdown::{GracefulShutdown, Shutdown, join_within},
     silence::Silence,
+    spawn,
 };
 pub use query_workers::{Incoming, Responder, answer_queries};
 pub use run_spec::{FRAME_STACK_MAX, Horizon, RunSpec, TimeoutRule};

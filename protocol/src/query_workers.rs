@@ -22,7 +22,7 @@ use zenoh::{
 use crate::{
     client::{EncodedMessage, RunClient},
     messages::recovering::Recovering,
-    process::fail_point,
+    process::{fail_point, spawn},
     session,
     wire::{
         buffers::{Buffer, BufferPool},
@@ -148,9 +148,8 @@ pub fn answer_queries<R: Request + 'static>(
             }
             Work::Rejected(bytes) => on_rejected(bytes),
         };
-        std::thread::Builder::new()
-            .name(format!("{name}-{i}"))
-            .spawn(move || std::iter::from_fn(next).for_each(handle))
+        let work = move || std::iter::from_fn(next).for_each(handle);
+        spawn(format!("{name}-{i}"), work)
     };
     let threads = (0..threads).map(thread).collect::<Result<_, _>>()?;
     let enqueue = move |query: Query| {

@@ -12,7 +12,9 @@ use crate::{
         report::{Participant, Report, Warning},
         table::Ack,
     },
-    process::{activity::Activity, fail_point, last_warning, shutdown::Shutdown, silence::Silence},
+    process::{
+        activity::Activity, fail_point, last_warning, shutdown::Shutdown, silence::Silence, spawn,
+    },
     session::SessionError,
 };
 
@@ -86,9 +88,7 @@ pub fn start(
             }
         }
     };
-    std::thread::Builder::new()
-        .name("reporter".into())
-        .spawn(work)
+    spawn("reporter", work)
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{ActorJoin, BufferPool, Chunk, RunClient, Shutdown, lock};
+use driml_protocol::{ActorJoin, BufferPool, Chunk, RunClient, Shutdown, lock, spawn};
 
 use state::{DeliveryState, Progress};
 use worker::DeliveryWorker;
@@ -45,9 +45,7 @@ impl Delivery {
         lock(&state.progress).is_held = true;
         let (queue, chunks) = mpsc::channel();
         let worker = DeliveryWorker::new(client, actor, limits, pool, shutdown, state.clone());
-        let thread = std::thread::Builder::new()
-            .name("delivery".into())
-            .spawn(move || worker.run(&chunks))?;
+        let thread = spawn("delivery", move || worker.run(&chunks))?;
         Ok(Self {
             queue,
             chunks_max: limits.chunks_in_flight_max,

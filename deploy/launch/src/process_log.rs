@@ -10,7 +10,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_protocol::{fail_point, lock};
+use driml_protocol::{fail_point, lock, spawn};
 
 use crate::{console::Screen, run_folder::AppendLog};
 
@@ -69,9 +69,8 @@ impl ProcessLog {
                 screen.print_lines(shown.into_iter().chain(said));
             }
         };
-        let thread = std::thread::Builder::new().name(format!("log of {}", self.name));
-        let thread = thread.spawn(copy_lines).context("starting a thread")?;
-        self.threads.push(thread);
+        let thread = spawn(format!("log of {}", self.name), copy_lines);
+        self.threads.push(thread.context("starting a thread")?);
         Ok(())
     }
 

@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::bail;
-use driml_protocol::{RunClient, Shutdown, join_within};
+use driml_protocol::{RunClient, Shutdown, join_within, spawn};
 
 pub use super::fetcher::{Counters, NextBatch, Requests, ServedBatch};
 use super::fetcher::{Fetched, Fetcher, SharedState};
@@ -39,10 +39,8 @@ impl BatchSource {
         for i in 0..requests.in_flight {
             let fetcher = Fetcher::new(&shared);
             let sender = sender.clone();
-            let thread = std::thread::Builder::new()
-                .name(format!("batches-{i}"))
-                .spawn(move || fetcher.run(&sender))?;
-            threads.push(thread);
+            let fetch = move || fetcher.run(&sender);
+            threads.push(spawn(format!("batches-{i}"), fetch)?);
         }
         Ok(Self {
             fetched,

@@ -13,7 +13,7 @@ use std::{
 use driml_protocol::{
     Ack, AffinityUpdate, CodecError, EncodedMessage, Incoming, LearnerStatus, LogLimiter,
     PriorityUpdate, Request, RunClient, Sampling, Shutdown, Weights, WeightsUpload, answer_queries,
-    codec::PAYLOAD_BYTES_MAX, fail_point, lock, session::SessionError,
+    codec::PAYLOAD_BYTES_MAX, fail_point, lock, session::SessionError, spawn,
 };
 use zenoh::query::Queryable;
 
@@ -202,8 +202,7 @@ impl OutboxSender {
         message: impl Fn(&T) -> Result<EncodedMessage<R>, CodecError> + Send + 'static,
     ) -> std::io::Result<()> {
         let name = format!("{}-sender", self.what);
-        let thread = std::thread::Builder::new().name(name.clone());
-        thread.spawn(move || {
+        spawn(name.clone(), move || {
             while !self.shutdown.is_set() {
                 fail_point::reach(&name);
                 let Some(value) = outbox.take() else { continue };

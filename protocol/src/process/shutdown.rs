@@ -9,7 +9,7 @@ use std::{
 };
 
 use super::{
-    fail_point, lock,
+    fail_point, lock, spawn,
     termination::{self, ExitReason},
 };
 
@@ -61,8 +61,7 @@ impl Shutdown {
         is_over: impl Fn() -> bool,
     ) -> std::io::Result<Option<T>> {
         let (sender, receiver) = mpsc::channel();
-        let thread = std::thread::Builder::new().name(name.into());
-        thread.spawn(move || {
+        spawn(name, move || {
             fail_point::reach(name);
             // The receiver is gone if the caller no longer waits.
             let _ = sender.send(work());

@@ -13,7 +13,7 @@ use nix::{
 };
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use super::fail_point;
+use super::{fail_point, spawn};
 
 /// How often a process checks whether its parent and the reader of stderr still exist.
 const CHECK_PERIOD: Duration = Duration::from_millis(500);
@@ -75,10 +75,7 @@ pub(super) fn watch(
             on_reason(reason);
         }
     };
-    std::thread::Builder::new()
-        .name(name.into())
-        .spawn(move || runtime.block_on(watching))?;
-    Ok(())
+    spawn(name, move || runtime.block_on(watching)).map(drop)
 }
 
 /// Waits for the signal; without one, never returns.

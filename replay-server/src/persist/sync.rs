@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{LogLimiter, Shutdown, atomic_write, fail_point, lock};
+use driml_protocol::{LogLimiter, Shutdown, atomic_write, fail_point, lock, spawn};
 
 /// Maximum segments that wait for a flush. One more causes a flush before anything else is written.
 const UNFLUSHED_SEGMENTS_MAX: usize = 32;
@@ -92,8 +92,8 @@ impl Syncer {
         let mut thread = None;
         if !period.is_zero() {
             let (flusher, stop) = (flusher.clone(), stop.clone());
-            let named = std::thread::Builder::new().name("replay-fsync".into());
-            thread = Some(named.spawn(move || flush_periodically(&flusher, &stop, period))?);
+            let flush = move || flush_periodically(&flusher, &stop, period);
+            thread = Some(spawn("replay-fsync", flush)?);
         }
         Ok(Self {
             flusher,

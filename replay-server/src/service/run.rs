@@ -14,7 +14,7 @@ use driml_protocol::{
     config::{Settings, TransportConfig},
     fail_point, join_within,
     session::Connection,
-    shared_memory,
+    shared_memory, spawn,
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable, sample::SampleKind};
 
@@ -315,13 +315,11 @@ fn watch_members(
         fail_point::reach("members");
         receiver.recv()
     };
-    let thread = std::thread::Builder::new()
-        .name("members".into())
-        .spawn(move || {
-            while let Ok((who, kind)) = next() {
-                service.update_connection(who, kind);
-            }
-        })?;
+    let thread = spawn("members", move || {
+        while let Ok((who, kind)) = next() {
+            service.update_connection(who, kind);
+        }
+    })?;
     let subscriber = client
         .session()
         .liveliness()
@@ -339,18 +337,16 @@ fn watch_members(
 
 impl Service {
     fn start_threads(self: Arc<Self>) -> std::io::Result<Threads> {
-        let spawn = |name: &str, work: fn(&Self)| {
+        let start = |name: &str, work: fn(&Self)| {
             let service = self.clone();
-            std::thread::Builder::new()
-                .name(name.into())
-                .spawn(move || work(&service))
+            spawn(name, move || work(&service))
         };
         let mut threads = vec![
-            spawn("admit", Self::store_parked_chunks)?,
-            spawn("missing", Self::log_missing_processes)?,
+            start("admit", Self::store_parked_chunks)?,
+            start("missing", Self::log_missing_processes)?,
         ];
         for i in 0..BATCH_THREADS {
-            threads.push(spawn(&format!("sample-{i}"), Self::serve_parked_requests)?);
+            threads.push(start(&format!("sample-{i}"), Self::serve_parked_requests)?);
         }
         Ok(threads)
     }

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use driml_machine::units::count;
-use driml_protocol::{GracefulShutdown, Shutdown};
+use driml_protocol::{GracefulShutdown, Shutdown, spawn};
 use driml_settings::config::RunConfig;
 
 use crate::{
@@ -145,9 +145,7 @@ fn watch_interrupts(first: Shutdown, second: Shutdown, screen: Screen) -> anyhow
         screen.print_line(error);
         std::process::exit(1);
     };
-    let thread = std::thread::Builder::new().name("end".into());
-    thread.spawn(watch).context("starting a thread")?;
-    Ok(())
+    spawn("end", watch).context("starting a thread").map(drop)
 }
 
 /// Records the state of the run, and the episodes that ended. Returns warnings.
