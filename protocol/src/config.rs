@@ -4,6 +4,7 @@
 use std::{fmt::Display, ops::RangeBounds};
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde_json::Value;
 
 /// Why settings were rejected: which key, its value, and what to do.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -43,6 +44,23 @@ pub fn check_range<T: PartialOrd + Display>(
 /// Describes in one line what is wrong with a table, and at which of its keys.
 pub fn describe(error: &toml::de::Error) -> String {
     error.to_string().trim_end().replace('\n', ", ")
+}
+
+/// Finds the first value that differs. Returns its path, which starts with `name`, and both values.
+pub fn first_difference(
+    name: &str,
+    one: &Value,
+    other: &Value,
+) -> Option<(String, String, String)> {
+    if one == other {
+        return None;
+    }
+    if let (Value::Object(ones), Value::Object(others)) = (one, other) {
+        let keys = ones.keys().chain(others.keys());
+        let at = |key: &String| first_difference(&format!("{name}.{key}"), &one[key], &other[key]);
+        return keys.into_iter().find_map(at);
+    }
+    Some((name.into(), one.to_string(), other.to_string()))
 }
 
 /// The `[transport]` table: how messages are sent.

@@ -19,13 +19,12 @@ use driml_machine::{
     process_env,
     resources::{self, Machine},
 };
-use driml_protocol::GracefulShutdown;
+use driml_protocol::{GracefulShutdown, config::first_difference};
 use minijinja::{Value, context};
 use serde::{
     Deserialize, Serialize,
     de::{DeserializeOwned, IgnoredAny},
 };
-use serde_json::Value as Json;
 
 use crate::{
     flags::ExperimentFlags,
@@ -287,18 +286,13 @@ pub(crate) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFla
 /// Names the first setting that differs, with both values.
 fn describe_change(before: &[u8], now: &[u8]) -> String {
     let [before, now] = [before, now].map(|it| serde_json::from_slice(it).unwrap_or_default());
-    first_change("", &before, &now).unwrap_or_else(|| "other settings".into())
-}
-
-fn first_change(path: &str, before: &Json, now: &Json) -> Option<String> {
-    let (Json::Object(old), Json::Object(new)) = (before, now) else {
-        return (before != now).then(|| format!("{path} = {before}, not {now}"));
-    };
-    old.keys().chain(new.keys()).find_map(|key| {
-        let [before, now] = [old, new].map(|it| it.get(key).unwrap_or(&Json::Null));
-        let dot = if path.is_empty() { "" } else { "." };
-        first_change(&format!("{path}{dot}{key}"), before, now)
-    })
+    match first_difference("", &before, &now) {
+        None => "other settings".into(),
+        Some((path, before, now)) => {
+            let path = path.trim_start_matches('.');
+            format!("{path} = {before}, not {now}")
+        }
+    }
 }
 
 fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {

@@ -81,20 +81,3 @@ pub fn read_description(safetensors: &[u8]) -> Result<Option<Value>, SafeTensorE
     let text = metadata.and_then(|it| it.get(METADATA_KEY));
     Ok(text.and_then(|it| serde_json::from_str(it).ok()))
 }
-
-/// Finds the first value that differs. Returns its path, which starts with `name`, and both values.
-pub(super) fn first_difference(
-    name: &str,
-    one: &Value,
-    other: &Value,
-) -> Option<(String, String, String)> {
-    if one == other {
-        return None;
-    }
-    if let (Value::Object(ones), Value::Object(others)) = (one, other) {
-        let keys = ones.keys().chain(others.keys());
-        let at = |key: &String| first_difference(&format!("{name}.{key}"), &one[key], &other[key]);
-        return keys.into_iter().find_map(at);
-    }
-    Some((name.into(), one.to_string(), other.to_string()))
-}

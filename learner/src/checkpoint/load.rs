@@ -4,6 +4,7 @@ use std::path::Path;
 
 use candle_core::Device;
 use driml_model::{Compute, Encoder, ModelConfig, Parameters};
+use driml_protocol::config::first_difference;
 use serde_json::Value;
 
 use super::{
@@ -104,8 +105,8 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
     let ours = serde_json::to_string(model).and_then(|text| serde_json::from_str(&text));
     let ours: Value = ours.unwrap_or_default();
     // If the torso differs, only that is reported: other differences follow from it.
-    let torso = description::first_difference("model.torso", &saved["torso"], &ours["torso"]);
-    match torso.or_else(|| description::first_difference("model", saved, &ours)) {
+    let torso = first_difference("model.torso", &saved["torso"], &ours["torso"]);
+    match torso.or_else(|| first_difference("model", saved, &ours)) {
         None => Ok(()),
         Some((key, found, expected)) => Err(CheckpointError::Mismatch(format!(
             "the checkpoint {} was saved with {key} = {found}, this run has {key} = {expected}: resume with the settings it was made with, or choose \
