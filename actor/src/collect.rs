@@ -215,7 +215,6 @@ mod tests {
             model: ModelConfig {
                 height: 12,
                 width: 12,
-                input_channels: 1,
                 num_actions: 3,
                 conv: vec![ConvLayer::new(2, 4, 4)],
                 ..model()

@@ -144,7 +144,7 @@ impl Policy for NetworkPolicy {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, Parameters, TorsoName};
+    use driml_model::{Compute, ConvLayer, HeadConfig, Parameters};
     use rand::SeedableRng;
 
     use super::*;
@@ -156,21 +156,11 @@ pub(crate) mod tests {
         ModelConfig {
             height: 4,
             width: 4,
-            input_channels: 1,
             num_actions: ACTIONS,
             atoms: 5,
-            v_min: -1.0,
-            v_max: 1.0,
-            torso: TorsoName::Nature,
             conv: vec![ConvLayer::new(2, 2, 2)],
-            channels: vec![],
-            scale_blocks: false,
             hidden: 4,
-            embedding_dim: 4,
-            action_embed: 4,
-            dim: DimHeads::NONE,
-            loss_layers: vec![],
-            head: HeadConfig::PLAIN,
+            ..ModelConfig::small().without_dim()
         }
     }
 

@@ -3,28 +3,20 @@
 use std::{collections::HashMap, iter};
 
 use candle_core::{Device, Tensor};
-use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result, TorsoName};
+use driml_model::{ConvLayer, ModelConfig, Parameters, Result};
 
 /// Returns the config of a network with one pixel, one action and `atoms` atoms. The weight of its head has `atoms * hidden` scalars.
 pub(crate) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
     ModelConfig {
         height: 1,
         width: 1,
-        input_channels: 1,
         num_actions: 1,
         atoms,
         v_min: support.0,
         v_max: support.1,
-        torso: TorsoName::Nature,
         conv: vec![ConvLayer::new(1, 1, 1)],
-        channels: vec![],
-        scale_blocks: false,
         hidden,
-        embedding_dim: 1,
-        action_embed: 1,
-        dim: DimHeads::NONE,
-        loss_layers: vec![],
-        head: HeadConfig::PLAIN,
+        ..ModelConfig::small().without_dim()
     }
 }
 
