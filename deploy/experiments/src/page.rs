@@ -54,7 +54,7 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     environment.set_trim_blocks(true);
     environment.set_lstrip_blocks(true);
     environment.add_function("figure", |stem: &str, caption: &str| {
-        format!("![{caption}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
+        format!("![{stem}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
     });
     environment.add_filter("fixed", fixed);
     environment.add_filter("percent", |value: Value| {
@@ -155,7 +155,7 @@ mod tests {
             "**Command.** `driml experiment t`",
             "**Time.** 2 min on a machine with 64 cores.\n",
             "**Results.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n",
-            "![A 0.5](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
+            "![fig](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
