@@ -2,6 +2,7 @@
 
     python driml_net.py RUN                    # what the network is, and its values for a blank state
     python driml_net.py RUN --onnx net.onnx    # the network: states in, expected returns out
+    python driml_net.py FILE.safetensors       # the same of what `driml evaluate --export` wrote
 
     from driml_net import load
     network, run = load("runs/coin")
@@ -206,10 +207,16 @@ def load(run, checkpoint=None, weights=None):
 
     `weights`: "average", which has no DIM heads, or "online" [default: "average" if the checkpoint has it, as `driml evaluate`].
     """
-    folder = Path(checkpoint) if checkpoint else newest_checkpoint(run)
-    if weights is None:
-        weights = "average" if (folder / "average.safetensors").exists() else "online"
-    tensors, metadata = read_safetensors(folder / f"{weights}.safetensors")
+    if Path(run).is_file():
+        file, weights = run, "exported"
+    else:
+        folder = Path(checkpoint) if checkpoint else newest_checkpoint(run)
+        if weights is None:
+            weights = "average" if (folder / "average.safetensors").exists() else "online"
+        file = folder / f"{weights}.safetensors"
+    if not Path(file).exists():
+        raise SystemExit(f"{file} is not there")
+    tensors, metadata = read_safetensors(file)
     described = description(run, metadata)
     if weights != "online":
         # Earlier versions described the online network in every file.
@@ -247,7 +254,7 @@ def export(network, described, path):
 
 def main():
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("run", type=Path, help="folder of the run")
+    arguments.add_argument("run", type=Path, help="folder of the run, or a file of `driml evaluate --export`")
     arguments.add_argument("--checkpoint", type=Path, help="folder of one of its checkpoints [default: the newest]")
     arguments.add_argument("--weights", choices=["average", "online"], help="which weights [default: average, if it has some]")
     arguments.add_argument("--onnx", type=Path, metavar="FILE", help="write the network there")

@@ -93,7 +93,7 @@ pub(crate) fn command_line() -> clap::Command {
 impl Command {
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
-            Self::Train(args) => train::run(args),
+            Self::Train(args) => train::run(args, VERSION),
             Self::Actor(args) => actor::run(args),
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),

@@ -1,6 +1,7 @@
 //! What a run will do and about how long it takes, printed before the run starts.
 //! This module decides nothing, and its time is an estimate from the network's arithmetic, not a promise.
 
+use driml_actor::Schedule;
 use driml_learner::{
     DeviceName, Precision,
     cost::{UpdateCost, UpdateShape},
@@ -62,7 +63,8 @@ pub fn describe(
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);
     let (processes, run_dir) = (processes(config, lockstep), run_dir.display());
     let note = |note: &String| format!("{:INDENT$}{note}\n", "note");
-    let notes: String = config.notes.iter().map(note).collect();
+    let exploration = note_on_epsilon(config);
+    let notes: String = config.notes.iter().chain(&exploration).map(note).collect();
     format!(
         "trains      {agent} on {world}, seed {seed}, from {source}\n\
          frames      {frames} in all, with {updates} of {rows} (replay ratio {ratio})\n\
@@ -71,6 +73,18 @@ pub fn describe(
          run folder  {run_dir}\n\
          time        roughly {time}, from the network's arithmetic\n{notes}"
     )
+}
+
+/// The note of a run that ends before epsilon does not fall any more.
+fn note_on_epsilon(config: &RunConfig) -> Option<String> {
+    let schedule = Schedule::new(&config.actor, 0).ok()?;
+    let (frames, falls) = (config.frames(), schedule.decay_frames);
+    (frames < falls && schedule.start > schedule.end).then(|| {
+        let last = schedule.epsilon(frames);
+        format!(
+            "the last actions are still random with probability {last:.2}, as epsilon falls over {falls} frames (actor.epsilon_decay_frames)"
+        )
+    })
 }
 
 fn processes(config: &RunConfig, lockstep: bool) -> String {

@@ -106,7 +106,8 @@ pub(crate) fn print_next_steps(
         print_resume_hint(world, folder);
         return Err(Interrupted.into());
     }
-    console::print(&summary.next_steps(folder, is_resumable(world, folder)))
+    // A description that does not fit beside its command stands below it.
+    console::print_wrapped(&summary.next_steps(folder, is_resumable(world, folder)), 6)
 }
 
 /// Waits until the learner of an ended run in `folder` has saved and the other processes of the run have exited.

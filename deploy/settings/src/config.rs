@@ -79,6 +79,9 @@ pub struct RunConfig {
     /// Notes that are printed before the run starts.
     #[serde(skip)]
     pub notes: Vec<String>,
+    /// The program and its version, which the run folder records.
+    #[serde(skip)]
+    pub program: String,
 }
 
 impl RunConfig {

@@ -81,6 +81,9 @@ impl Flags {
 pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
     let (source, from) = match &args.config {
         Some(path) => {
+            // The folder of a run stands for its settings.
+            let in_folder = path.join("config.toml");
+            let path = if path.is_dir() { &in_folder } else { path };
             let name = path.display().to_string();
             let text = std::fs::read_to_string(path);
             let text = text.map_err(|e| usage!("reading the settings {name}: {e}"))?;

@@ -75,7 +75,7 @@ pub(crate) struct TrainArgs {
 /// The `learner.checkpoint_period_updates` of all presets except `smoke`, whose period divides this one.
 const CHECKPOINT_PERIOD: u64 = 1_000;
 
-pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
+pub(crate) fn run(mut args: TrainArgs, version: &str) -> anyhow::Result<()> {
     let machine = Machine::detect();
     let sets = &mut args.run.flags.sets;
     sets.extend((args.device).map(|device| format!("local.learner_device={device}")));
@@ -96,10 +96,10 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             "local.evaluation={{every_updates={every},episodes={episodes}}}"
         ));
     }
-    let (config, from, resume_point) = match &args.resume {
+    let (mut config, from, resume_point) = match &args.resume {
         Some(folder) => {
             let found = match resume::prepare(&RunFolder::new(folder), &args.run.flags)? {
-                Resumption::Done(sentence) => return console::print(&format!("{sentence}\n")),
+                Resumption::Done(sentence) => return print_wrapped(&format!("{sentence}\n"), 0),
                 Resumption::Resumed(found) => found,
             };
             args.lockstep = found.lockstep;
@@ -119,6 +119,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             (config, from, None)
         }
     };
+    config.program = format!("driml {version}");
     let listen = args.listen.as_slice();
     check_listen_endpoints(listen, args.tls.is_set(), args.network.allow_insecure)?;
     check_unused(listen)?;

@@ -172,8 +172,12 @@ impl RunFolder {
     }
 
     pub(super) fn write_config(&self, config: &RunConfig) -> anyhow::Result<()> {
-        let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
-        let text = head.to_owned() + &config.to_toml();
+        let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n";
+        let program = match &*config.program {
+            "" => String::new(),
+            program => format!("# Written by {program}.\n"),
+        };
+        let text = format!("{head}{program}\n{}", config.to_toml());
         write_atomically(&self.config(), text.as_bytes())
     }
 }

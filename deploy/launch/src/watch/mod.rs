@@ -263,7 +263,7 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<Vec<String>> {
     };
     if is_locked && endpoints.is_empty() {
         state.message = format!(
-            "one process writes {run}, in lockstep or as `driml watch`, and answers no requests. metrics.csv has {so_far} so far"
+            "one process uses {run}, in lockstep, as `driml watch` or to play the last episodes, and answers no requests. metrics.csv has {so_far} so far"
         );
     } else if is_locked {
         let frames = read_progress(folder).map_or(0, |it| it.frames);
