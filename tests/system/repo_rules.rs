@@ -11,11 +11,11 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_510),
-    ("actor", 10_540),
-    ("replay-server", 11_080),
-    ("learner", 21_980),
-    ("deploy", 30_925),
+    ("protocol", 7_550),
+    ("actor", 10_535),
+    ("replay-server", 11_050),
+    ("learner", 21_960),
+    ("deploy", 30_965),
     ("tests", 10_260),
 ];
 /// The most lines of one file.

@@ -318,6 +318,6 @@ mod tests {
         std::fs::remove_file(folder.endpoints()).unwrap();
         let _lock = folder.lock().unwrap();
         let said = found();
-        assert!(said.starts_with("one process writes "), "{said}");
+        assert!(said.starts_with("one process uses "), "{said}");
     }
 }
