@@ -132,6 +132,7 @@ pub(crate) fn run(mut args: TrainArgs, version: &str) -> anyhow::Result<()> {
     args.tls.credentials(Role::ReplayServer)?;
     check_device(config.local.learner_device)?;
     check(&config, args.lockstep)?;
+    let is_new = args.resume.is_none() && !args.run_dir.as_ref().is_some_and(|it| it.is_dir());
     let run_dir = match args.resume {
         Some(folder) => RunFolder::new(folder),
         None => {
@@ -144,7 +145,6 @@ pub(crate) fn run(mut args: TrainArgs, version: &str) -> anyhow::Result<()> {
     let plan = plan::describe(&config, &from, &run_dir, lockstep, point, &machine);
     print_wrapped(&plan, plan::INDENT)?;
     let parent = args.exit_with_parent;
-    let existed = run_dir.path().is_dir();
     let train = || -> anyhow::Result<()> {
         config.world.install(&mut console::eprintln)?;
         if args.lockstep {
@@ -159,7 +159,7 @@ pub(crate) fn run(mut args: TrainArgs, version: &str) -> anyhow::Result<()> {
     };
     train().inspect_err(|_| {
         // Removes only an empty folder: one in which nothing was begun.
-        if !existed {
+        if is_new {
             let _ = fs::remove_dir(run_dir.path());
         }
     })
