@@ -75,7 +75,7 @@ pub fn describe(
     )
 }
 
-/// The note of a run that ends before epsilon does not fall any more.
+/// The note of a run that ends while epsilon still falls.
 fn note_on_epsilon(config: &RunConfig) -> Option<String> {
     let schedule = Schedule::new(&config.actor, 0).ok()?;
     let (frames, falls) = (config.frames(), schedule.decay_frames);
