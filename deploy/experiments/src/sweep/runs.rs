@@ -44,13 +44,7 @@ impl Runs {
         let folder = self.folder(plan);
         read_progress(&folder)?;
         let summary = Summary::read(&folder).ok()?;
-        let has_enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
-        let is_good = match summary.outcome {
-            Outcome::Finished => true,
-            Outcome::Interrupted => has_enough,
-            Outcome::Failed => false,
-        };
-        is_good.then_some(FinishedRun {
+        is_finished(&summary, plan.episodes).then_some(FinishedRun {
             folder,
             summary,
             commit: self.read_commit(plan),
@@ -60,16 +54,11 @@ impl Runs {
     /// Returns the names of the finished runs in this folder that none of `plans` has, sorted.
     pub(super) fn finished_besides<P>(&self, plans: &[PointPlan<P>]) -> Vec<String> {
         let planned: HashSet<_> = plans.iter().map(|(_, plan)| plan.name.as_str()).collect();
-        // A run with enough episodes was stopped, so its outcome is an interruption.
         let enough = plans.iter().filter_map(|(_, plan)| plan.episodes).min();
-        let is_finished = |it: Summary| match it.outcome {
-            Outcome::Finished => true,
-            Outcome::Interrupted => enough.is_some_and(|all| it.episodes >= all),
-            Outcome::Failed => false,
-        };
         let is_other = |name: &str| {
             let folder = RunFolder::new(self.root.join(name));
-            !planned.contains(name) && Summary::read(&folder).is_ok_and(is_finished)
+            let is_done = |it: Summary| is_finished(&it, enough);
+            !planned.contains(name) && Summary::read(&folder).is_ok_and(is_done)
         };
         let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
         let names = entries.filter_map(|entry| {
@@ -184,6 +173,15 @@ pub(super) fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     let aside = free.expect("there are more numbers than folders");
     fs::rename(folder, &aside).with_context(|| format!("moving {} aside", folder.display()))?;
     Ok(Some(aside))
+}
+
+/// Whether a run is complete, or was stopped with the `episodes` that are enough.
+fn is_finished(summary: &Summary, episodes: Option<u64>) -> bool {
+    match summary.outcome {
+        Outcome::Finished => true,
+        Outcome::Interrupted => episodes.is_some_and(|all| summary.episodes >= all),
+        Outcome::Failed => false,
+    }
 }
 
 #[cfg(test)]
