@@ -89,10 +89,13 @@ impl RunFolder {
         cells.iter().map(|it| it.parse().unwrap()).collect()
     }
 
-    /// Returns one column of `episodes.csv` so far; `None` where a cell is empty.
+    /// Returns one column of `episodes.csv` so far, nothing before its header is written; `None` where a cell is empty.
     #[track_caller]
     pub fn episode_column<T: FromStr>(&self, name: &str) -> Vec<Option<T>> {
         let table = self.table("episodes.csv");
+        if table.header.is_empty() {
+            return Vec::new();
+        }
         let at = table.column_index(name);
         let at = at.unwrap_or_else(|| panic!("{name} is not in {:?}", table.header));
         let parse = |cell: &str| {
