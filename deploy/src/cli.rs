@@ -1,6 +1,9 @@
 //! The list of commands. Each has its flags and its code in a file of `commands`, or in the crate that it is named for.
 
-use clap::{Arg, CommandFactory, Parser, Subcommand};
+use clap::{
+    Arg, CommandFactory, Parser, Subcommand,
+    error::{ContextKind, ContextValue},
+};
 use driml_bench::flags::BenchArgs;
 use driml_experiments::{
     flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
@@ -90,6 +93,31 @@ pub(crate) fn command_line() -> clap::Command {
     take_negative_numbers(Cli::command())
 }
 
+/// Flags of CleanRL and Stable-Baselines3, and what `driml train` takes instead.
+const FLAGS_ELSEWHERE: [(&str, &str); 7] = [
+    ("--batch-size", "--set learner.batch_size=256"),
+    ("--buffer-size", "--set replay.capacity_transitions=1e5"),
+    ("--gamma", "--set run.gamma=0.99"),
+    ("--learning-rate", "--set learner.update.adam.lr=1e-4"),
+    ("--lr", "--set learner.update.adam.lr=1e-4"),
+    ("--num-envs", "--actors 1 --envs 16"),
+    ("--total-timesteps", "--frames 1e6"),
+];
+
+/// Adds to the error about a flag of another program what to use instead.
+pub(crate) fn add_equivalent(mut error: clap::Error) -> clap::Error {
+    let unknown = error.get(ContextKind::InvalidArg).map(ToString::to_string);
+    let mut known = FLAGS_ELSEWHERE.iter();
+    if let Some((_, equivalent)) = known.find(|it| unknown.as_deref() == Some(it.0)) {
+        // The flag with the most similar name, and its usage, have nothing to do with it.
+        error.remove(ContextKind::SuggestedArg);
+        error.remove(ContextKind::Usage);
+        let tip = format!("driml train takes {equivalent}").into();
+        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![tip]));
+    }
+    error
+}
+
 impl Command {
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
@@ -118,10 +146,31 @@ impl Command {
 
 #[cfg(test)]
 mod tests {
+    use driml_machine::resources::Machine;
+    use driml_settings::flags::resolve;
+
     use super::*;
 
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn what_is_named_for_a_flag_of_another_program_can_be_set() {
+        let machine = Machine {
+            cores: 2,
+            memory_bytes: 64 << 30,
+            fast_bf16: false,
+        };
+        for (flag, equivalent) in FLAGS_ELSEWHERE {
+            let parse = |flags| Cli::try_parse_from(format!("driml train {flags}").split(' '));
+            let error = add_equivalent(parse(flag).unwrap_err()).to_string();
+            assert!(error.contains(equivalent), "{error}");
+            let Command::Train(args) = parse(equivalent).unwrap().command else {
+                panic!("{equivalent}");
+            };
+            resolve(&args.run, &machine).unwrap();
+        }
     }
 }

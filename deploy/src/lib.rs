@@ -22,7 +22,7 @@ use driml_machine::{
 
 pub use crate::registry::Registry;
 
-use crate::cli::{Cli, Command, command_line};
+use crate::cli::{Cli, Command, add_equivalent, command_line};
 
 /// Runs the program. The exit code is 0 on success, 64 for a call that cannot work or whose output cannot be written, 130 after an
 /// interrupt, and 1 for other errors.
@@ -38,6 +38,7 @@ pub fn main_with(registry: Registry) -> ExitCode {
     let cli = match matched.and_then(|it| Cli::from_arg_matches(&it)) {
         Ok(cli) => cli,
         Err(e) => {
+            let e = add_equivalent(e);
             // If printing fails, the terminal is gone.
             let _ = e.print();
             return match e.use_stderr() {
