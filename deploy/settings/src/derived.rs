@@ -4,7 +4,7 @@
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::UpdateSettings;
 use driml_machine::error::{Usage, usage};
-use driml_model::{ConvLayer, FrameSize, InputSize, ModelConfig, ReadArea, TorsoName};
+use driml_model::{ConvLayer, FrameSize, InputSize, ModelConfig, Precision, ReadArea, TorsoName};
 use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
@@ -66,18 +66,26 @@ pub(crate) fn fill_in_declaration(table: &mut Table, command: &str) -> Result<()
 }
 
 /// Replaces each precision `auto`: by bf16 if the processor is faster in it and does the computing, else by f32.
-pub(crate) fn resolve_precision(table: &mut Table, fast_bf16: bool) {
+pub(crate) fn resolve_precision(table: &mut Table, fast_bf16: bool) -> Result<(), Usage> {
     let device = find(table, "local.learner_device").and_then(Value::as_str);
     let on_cpu = device.is_none_or(|device| device == "cpu");
     for (path, fast) in [
         ("actor.precision", fast_bf16),
         ("learner.precision", fast_bf16 && on_cpu),
     ] {
-        if find(table, path).and_then(Value::as_str) == Some("auto") {
-            let name = if fast { "bf16" } else { "f32" };
-            insert(table, path, Value::String(name.into()));
+        match find(table, path).and_then(Value::as_str) {
+            Some("auto") => {
+                let name = if fast { "bf16" } else { "f32" };
+                insert(table, path, Value::String(name.into()));
+            }
+            Some(name) => {
+                let known = name.parse::<Precision>();
+                known.map_err(|e| usage!("{path}: {e}, or auto"))?;
+            }
+            None => {}
         }
     }
+    Ok(())
 }
 
 /// Removes the presets' settings of torsos other than this network's. Settings that `is_set` by hand stay, so that their check rejects them.

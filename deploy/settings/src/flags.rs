@@ -193,11 +193,11 @@ impl Source {
             remove(&mut table, COMPRESSED_MAX);
         }
         let is_capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
-        derived::resolve_precision(&mut table, machine.fast_bf16);
         let in_file = |e| match self {
             Self::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
             _ => e,
         };
+        derived::resolve_precision(&mut table, machine.fast_bf16).map_err(in_file)?;
         let mut config = RunConfig::derive(table).map_err(in_file)?;
         memory::fit(&mut config, is_capacity_set, flags.server_alone, machine).map_err(in_file)?;
         config = config.checked().map_err(in_file)?;
@@ -221,7 +221,7 @@ fn apply_sets(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> 
         // A new key may be an optional setting, which the type of its table knows.
         if is_new {
             let mut read = tried.clone();
-            derived::resolve_precision(&mut read, false);
+            derived::resolve_precision(&mut read, false)?;
             let read = RunConfig::derive(read);
             let key = parsed.path.rsplit('.').next().unwrap_or_default();
             let unknown = format!("unknown field `{key}`");
