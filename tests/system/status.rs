@@ -107,21 +107,21 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         "local --agent c51 {LONG} --actors 2 --run-dir run"
     ));
     wait_until("a status of the living run", || {
-        let ended = system.run("status --run run");
+        let ended = system.run("status run");
         ended.code == Some(0) && ended.stdout.contains("learns")
     });
-    let watched = system.start("status --run run --watch --json");
+    let watched = system.start("status run --watch --json");
     process.interrupt().expect_code(130);
     watched.wait_ok();
-    let watch_once = "watch --once --run run --prometheus run.prom";
+    let watch_once = "watch --once run --prometheus run.prom";
     system.fails(watch_once, "no process of it runs");
     let file = system.read("run.prom");
     assert!(file.ends_with("\ndriml_up 0\n"), "{file}");
     system
-        .run_ok("status --run run")
+        .run_ok("status run")
         .expect_stdout("no process runs in run, which holds")
         .expect_stdout("`driml train --resume run` resumes it");
-    system.rejects("status --run nowhere", "nowhere is not the folder of a run");
+    system.rejects("status nowhere", "nowhere is not the folder of a run");
 }
 
 /// The launcher still plays the last checkpoint; no other process is left.
@@ -135,16 +135,14 @@ fn a_run_that_is_ending_is_no_riddle() {
     let config = system.read("run/config.toml");
     check_has(&config, &["checkpoint_period_updates = 50"]);
     system
-        .run_ok("status --run run")
+        .run_ok("status run")
         .expect_stdout("the run in run is stopping: all frames are stored");
-    let stopping = system.run_json("status --json --run run");
+    let stopping = system.run_json("status --json run");
     assert_eq!(stopping["finished"], false, "{stopping}");
     process.interrupt().expect_code(0);
-    system
-        .run_ok("status --run run")
-        .expect_stdout("the run is over");
+    system.run_ok("status run").expect_stdout("the run is over");
     for command in ["status --json", "watch --once --json"] {
-        let over = system.run_json(&format!("{command} --run run"));
+        let over = system.run_json(&format!("{command} run"));
         assert_eq!(over["finished"], true);
         assert_eq!(over["message"], "the run is over");
         assert_eq!(over["summary"]["outcome"], "finished", "{over}");

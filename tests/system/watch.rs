@@ -63,7 +63,7 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
 fn a_launched_run_is_watched_and_continues_without() {
     let system = system();
     let launcher = start_run(&system, 1);
-    let mut watched = system.start("watch --run run --run-dir seen");
+    let mut watched = system.start("watch run --run-dir seen");
     let seen = system.run_folder("seen");
     let rows = || seen.table("metrics.csv").rows.len();
     wait_until("two rows", || rows() >= 2);
@@ -77,12 +77,12 @@ fn a_launched_run_is_watched_and_continues_without() {
     system.run_ok(&format!("local --agent c51 {SHORT} --run-dir other"));
     system.rejects_each(
         "
-        watch --run run --run-dir run => run is written by `driml train` or by another `driml watch`
-        watch --run run --run-dir other => other holds another run (chain with c51, seed 1)
+        watch run --run-dir run => run is written by `driml train` or by another `driml watch`
+        watch run --run-dir other => other holds another run (chain with c51, seed 1)
         ",
     );
 
-    let watched = system.start("watch --run run --run-dir seen");
+    let watched = system.start("watch run --run-dir seen");
     wait_until("further rows", || rows() > before + 1);
     launcher.interrupt().expect_code(130);
     watched.interrupt().expect_code(130);
@@ -222,7 +222,7 @@ fn prometheus_reads_the_file_of_a_run_that_is_watched() {
     };
     let system = system();
     let launcher = start_run(&system, 1);
-    let watched = system.start("watch --run run --prometheus run.prom");
+    let watched = system.start("watch run --prometheus run.prom");
     let path = system.path("run.prom");
     let read = "
 import sys

@@ -21,7 +21,7 @@ pub(crate) struct RunSelection {
     #[arg(long, value_name = "ENDPOINT", group = "whose")]
     connect: Vec<String>,
     /// Folder of a run that `driml train` started on this machine
-    #[arg(long, value_name = "DIR", group = "whose")]
+    #[arg(value_name = "RUN", group = "whose")]
     run: Option<PathBuf>,
     /// Prefix of the run's keys
     #[arg(long, value_name = "NS", default_value = DEFAULT_NAMESPACE)]
