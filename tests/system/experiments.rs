@@ -357,5 +357,7 @@ fn a_grid_makes_every_combination_once() {
     assert_eq!(table().rows, made);
     // Another grid is rejected in the same folder.
     let other = format!("{fixed} --frames 352");
-    system.rejects(&other, "holds results made with axes = ");
+    let not_of =
+        "`, not of `driml sweep --env chain --agent c51,driml-ada --preset smoke --frames 352`";
+    system.rejects(&other, not_of);
 }

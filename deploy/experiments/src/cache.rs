@@ -295,7 +295,7 @@ fn describe_change(before: &[u8], now: &[u8]) -> String {
     }
 }
 
-fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
+pub(crate) fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
     let suffix = if flags.smoke { "-smoke" } else { "" };
     let default = || Path::new("experiments").join(format!("{name}{suffix}"));
     flags.out.clone().unwrap_or_else(default)

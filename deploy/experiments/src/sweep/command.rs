@@ -1,8 +1,9 @@
 //! `driml sweep`: makes a run for each combination of settings and each seed, then a table and a plot of all runs.
 //! `axes` decides which runs there are, and `queue` makes them.
 
+use anyhow::bail;
 use driml_launch::console::{align_columns, print_wrapped};
-use driml_machine::error::usage;
+use driml_machine::{error::usage, shell::quoted};
 use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
@@ -12,7 +13,7 @@ use super::{
     queue,
 };
 use crate::{
-    cache::{Session, settings_of},
+    cache::{self, Session, settings_of},
     flags::{ExperimentFlags, SEEDS_MAX, SweepArgs},
     plot::{self, flags::PlotArgs},
     stats::{Spread, interval},
@@ -41,8 +42,16 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         out: args.out.clone(),
         ..ExperimentFlags::default()
     };
-    let stored = settings_of(NAME, &flags).filter(|_| args.report);
-    let (settings, seeds) = resolve_settings(args, stored)?;
+    let stored = || settings_of::<Settings>(NAME, &flags);
+    let (settings, seeds) = resolve_settings(args, stored().filter(|_| args.report))?;
+    if let Some(other) = stored().filter(|it| *it != settings) {
+        bail!(usage!(
+            "{} holds the runs of `{}`, not of `{}`: choose another --out, or remove that folder",
+            cache::folder(NAME, &flags).display(),
+            other.command(),
+            settings.command()
+        ));
+    }
     let axes = &settings.axes;
     let cells = cells(axes, args.seeds)?;
     // A report asks for `SEEDS_MAX` seeds; no sweep has more than `RUNS_MAX` runs.
@@ -135,6 +144,22 @@ fn parse_axes(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
 }
 
 impl Settings {
+    /// The command with these settings, for a person who compares it with another.
+    fn command(&self) -> String {
+        let axes = self.axes.iter().map(|Axis { name, values }| {
+            let values = values.join(",");
+            match name.as_str() {
+                "env" | "agent" => format!("--{name} {}", quoted(&values)),
+                _ => format!("--set {}", quoted(&format!("{name}={values}"))),
+            }
+        });
+        let mut words = vec!["driml sweep".to_owned()];
+        words.extend(axes);
+        words.extend(self.preset.iter().map(|it| format!("--preset {it}")));
+        words.extend(self.frames.iter().map(|it| format!("--frames {it}")));
+        words.join(" ")
+    }
+
     fn call(&self, cell: &Cell, seed: u32) -> TrainCall {
         let mut call = TrainCall {
             preset: self.preset.clone(),
@@ -220,6 +245,13 @@ mod tests {
         assert_eq!(of("--report", stored()), (stored().unwrap(), SEEDS_MAX));
         let given = of("--report --agent c51 --seeds 2", stored());
         assert_eq!(given, of("--agent c51 --seeds 2", None));
+    }
+
+    #[test]
+    fn the_command_of_a_folder_has_the_same_settings() {
+        let line = "--env chain --agent c51,curl --set learner.batch_size=64,256 --preset smoke --frames 320";
+        let (settings, _) = resolve_settings(&parse(line), None).unwrap();
+        assert_eq!(settings.command(), format!("driml sweep {line}"));
     }
 
     #[test]
