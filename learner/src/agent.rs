@@ -223,6 +223,7 @@ impl Agent {
                 total: evaluation.total,
                 grad_norm,
                 q_mean: q_values.iter().sum::<f32>() / batch.rows as f32,
+                share_beyond: evaluation.share_beyond,
             })
         })
     }

@@ -15,7 +15,7 @@ use crate::{
     error::UpdateError,
     losses::{
         c51::{kl_loss, row_kls, softmax},
-        projection::project,
+        projection::{project, share_beyond},
     },
     optimiser::gradients::Gradients,
     settings::UpdateSettings,
@@ -37,6 +37,8 @@ pub struct UpdateReport {
     pub grad_norm: f64,
     /// Mean over rows of the taken action's value, in units of return.
     pub q_mean: f32,
+    /// Share of the rows whose target's mean lies beyond the atoms.
+    pub share_beyond: f64,
 }
 
 /// The losses of a batch, what they were computed from, and the gradients, before any optimiser step.
@@ -56,6 +58,8 @@ pub struct Evaluation {
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
+    /// Share of the rows whose target's mean lies beyond the atoms.
+    pub share_beyond: f64,
     /// Gradients of the total, before clipping.
     pub gradients: Gradients,
 }
@@ -112,6 +116,8 @@ struct BellmanTarget {
     next_greedy_action: Vec<u8>,
     /// Target distributions [B, N], moved one Bellman step and projected onto the atoms.
     projection: Vec<f32>,
+    /// Share of the rows whose mean lies beyond the atoms before the projection.
+    share_beyond: f64,
 }
 
 impl Networks {
@@ -166,6 +172,7 @@ impl Networks {
             taken_logits,
             next_greedy_action: target.next_greedy_action,
             target_projection: target.projection,
+            share_beyond: target.share_beyond,
             gradients,
         })
     }
@@ -242,18 +249,14 @@ impl Networks {
             let what = "the target network's distribution";
             return Err(UpdateError::NonFinite(what.to_owned()));
         }
+        let (reward, discount) = (batch.n_step_return, batch.bootstrap_discount);
+        let (v_min, v_max) = (self.model.v_min, self.model.v_max);
         let mut projection = vec![0f32; probs.len()];
-        project(
-            &probs,
-            batch.n_step_return,
-            batch.bootstrap_discount,
-            self.model.v_min,
-            self.model.v_max,
-            &mut projection,
-        );
+        project(&probs, reward, discount, v_min, v_max, &mut projection);
         Ok(BellmanTarget {
             next_greedy_action,
             projection,
+            share_beyond: share_beyond(&probs, reward, discount, v_min, v_max),
         })
     }
 

@@ -22,12 +22,16 @@ use crate::{
 
 /// The name under which the noisy layers' seed is derived from the run's seed.
 const NOISE_SEED_NAME: &str = "noisy layers";
+/// The share of targets beyond C51's atoms up to which no warning is due: only the best or the worst states are then affected.
+const SHARE_BEYOND_MAX: f64 = 0.1;
 
 /// A learner: its settings, its state, and the preparation of its batches.
 pub struct Learner {
     config: LearnerConfig,
     state: LearnerState,
     preparation: Preparation,
+    /// Share of the targets beyond C51's atoms, over about the last 100 updates; `None` once that was warned of.
+    share_beyond: Option<f64>,
 }
 
 /// Applies the settings that an agent's state does not contain.
@@ -56,6 +60,7 @@ impl Learner {
                 run_counts: RunCounts::default(),
             },
             preparation: Preparation::new(&config)?,
+            share_beyond: Some(0.0),
             config,
         })
     }
@@ -141,7 +146,27 @@ impl Learner {
         }
         let report = self.state.agent.update(&batch)?;
         (self.state.rng, self.state.affinity) = (rng, affinity);
+        self.warn_of_clipping(report.share_beyond);
         Ok(report)
+    }
+
+    /// Warns once if C51 clips many of the newest targets, of which `share` of the last batch.
+    fn warn_of_clipping(&mut self, share: f64) {
+        let Some(mean) = &mut self.share_beyond else {
+            return;
+        };
+        *mean += (share - *mean) / 100.0;
+        if *mean > SHARE_BEYOND_MAX {
+            let percent = *mean * 100.0;
+            self.share_beyond = None;
+            let (v_min, v_max) = (self.config.model.v_min, self.config.model.v_max);
+            tracing::warn!(
+                "{percent:.0}% of the newest targets lie beyond model.v_min = {v_min} or model.v_max = {v_max}, where C51 clips them and \
+                 no longer tells actions apart: start a new run with a wider range, such as --set model.v_min={} --set model.v_max={}",
+                4.0 * v_min,
+                4.0 * v_max
+            );
+        }
     }
 
     /// Writes the results of the last update into `status`.

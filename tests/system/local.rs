@@ -56,6 +56,15 @@ fn c51_leaves_a_whole_run_folder() {
 }
 
 #[test]
+fn clipped_returns_are_warned_of_once() {
+    let system = system();
+    let narrow = "--set model.v_min=-0.05 --set model.v_max=0.05";
+    let ended = system.run_ok(&format!("local --lockstep --agent c51 {SHORT} {narrow}"));
+    let wider = "--set model.v_min=-0.2 --set model.v_max=0.2";
+    assert_eq!(ended.stderr.matches(wider).count(), 1, "{ended:#?}");
+}
+
+#[test]
 fn driml_ada_with_two_actors_over_tcp() {
     let (endpoint, _) = listen_on_free_port();
     let system = system().with_endpoint(endpoint);

@@ -67,3 +67,46 @@ pub fn project(
         }
     }
 }
+
+/// Share of the rows whose moved distribution has a mean beyond the atoms, by more than a thousandth of their range: C51 cannot represent
+/// the value of such a state. A row of which only some probability lies there does not count. The arguments are those of [`project`].
+pub fn share_beyond(
+    probs: &[f32],
+    reward: &[f32],
+    discount: &[f32],
+    v_min: f32,
+    v_max: f32,
+) -> f64 {
+    let atoms = probs.len() / reward.len();
+    let (v_min, v_max) = (f64::from(v_min), f64::from(v_max));
+    let (spacing, margin) = ((v_max - v_min) / (atoms - 1) as f64, (v_max - v_min) * 1e-3);
+    let is_beyond = |&(row, (&reward, &discount)): &(&[f32], (&f32, &f32))| {
+        let probs = row.iter().enumerate();
+        let atom: f64 = probs.map(|(i, &p)| i as f64 * f64::from(p)).sum();
+        let mean = f64::from(reward) + f64::from(discount) * (v_min + atom * spacing);
+        mean < v_min - margin || mean > v_max + margin
+    };
+    let rows = probs.chunks_exact(atoms).zip(reward.iter().zip(discount));
+    rows.filter(is_beyond).count() as f64 / reward.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::share_beyond;
+
+    #[test]
+    fn a_row_is_beyond_the_atoms_if_its_mean_is() {
+        for (probs, reward, discount, expected) in [
+            ([0.0, 0.0, 1.0], 0.0, 1.0, 0.0),
+            ([0.0, 0.0, 1.0], 0.1, 0.9, 0.0),
+            ([0.0, 0.0, 1.0], 0.2, 0.9, 1.0),
+            // A quarter of the probability is beyond.
+            ([0.25, 0.5, 0.25], 0.9, 0.9, 0.0),
+            ([1.0, 0.0, 0.0], -0.2, 0.9, 1.0),
+            ([1.0, 0.0, 0.0], 1.5, 0.0, 1.0),
+        ] {
+            let found = share_beyond(&probs, &[reward], &[discount], -1.0, 1.0);
+            assert_eq!(found, expected, "{probs:?}, {reward}, {discount}");
+        }
+    }
+}
