@@ -195,7 +195,7 @@ pub fn log_to_stderr() {
         !is_rejection || lock(&rejections).admit().is_some()
     });
     let log = tracing_subscriber::fmt::layer()
-        .with_writer(stderr)
+        .with_writer(|| LogWriter)
         // It would report a stderr that cannot be written to with `eprintln!`, which panics then.
         .log_internal_errors(false)
         .with_ansi(stderr().is_terminal())
@@ -208,6 +208,28 @@ pub fn log_to_stderr() {
         .init();
 }
 
+/// Removes the hint that zenoh adds to each rejected QUIC connection: it is false, as all connections share the endpoint's socket.
+fn without_false_hint(text: &str) -> String {
+    match text.contains("QUIC acceptor failed") {
+        true => text.replace(" Hint: increase the system open file limit.", ""),
+        false => text.to_owned(),
+    }
+}
+
+/// Writes the log to stderr, a line per call.
+struct LogWriter;
+
+impl Write for LogWriter {
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        let text = without_false_hint(&String::from_utf8_lossy(line));
+        stderr().write_all(text.as_bytes()).map(|()| line.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        stderr().flush()
+    }
+}
+
 /// A log layer that keeps the last warning or error, which this process reports in its status.
 struct LastWarning;
 
@@ -217,7 +239,7 @@ impl<S: Subscriber> Layer<S> for LastWarning {
             let mut text = String::new();
             event.record(&mut |field: &Field, value: &dyn fmt::Debug| {
                 if field.name() == "message" {
-                    text = format!("{value:?}");
+                    text = without_false_hint(&format!("{value:?}"));
                 }
             });
             last_warning::set(text);
