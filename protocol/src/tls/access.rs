@@ -1,6 +1,8 @@
 //! The roles of processes, each a certificate's common name, and their rights as rules for zenoh's access control, which denies all else.
 //! The rules see only a message's key and its sender's common name; the process that answers checks the content.
 
+use serde_json::{Value, json};
+
 use crate::{
     messages::{
         affinity::AffinityUpdate,
@@ -123,74 +125,62 @@ fn grant(keys: &Keys, role: Role) -> Grant {
     }
 }
 
-/// The rules, subjects and policies of zenoh's access control, as JSON5.
-#[derive(Default)]
-struct AccessLists {
-    rules: Vec<String>,
-    subjects: Vec<String>,
-    policies: Vec<String>,
+/// A rule of zenoh's access control, which allows `messages` at `keys`. `flows` and `messages` are words.
+fn allow(id: &str, flows: &str, messages: &str, keys: &[String]) -> Value {
+    let words = |text: &str| text.split(' ').map(Value::from).collect::<Vec<_>>();
+    let (flows, messages) = (words(flows), words(messages));
+    json!({ "id": id, "permission": "allow", "flows": flows, "messages": messages, "key_exprs": keys })
 }
 
-impl AccessLists {
-    fn add_role(&mut self, name: Role, grant: &Grant) {
-        let mut rules = Vec::new();
-        let answers = r#""declare_queryable", "reply""#;
-        let subscribes = r#""declare_subscriber""#;
-        let lives = r#""liveliness_token""#;
-        for (what, flow, messages, keys) in [
-            ("asks", "ingress", r#""query""#, &grant.query),
-            ("is-answered", "egress", r#""reply""#, &grant.query),
-            ("answers", "ingress", answers, &grant.reply),
-            ("is-asked", "egress", r#""query""#, &grant.reply),
-            ("listens", "ingress", subscribes, &grant.subscribe),
-            ("receives", "egress", r#""put""#, &grant.subscribe),
-            ("lives", "ingress", lives, &grant.liveliness),
-        ] {
-            if keys.is_empty() {
-                continue;
-            }
-            let id = format!("{name}-{what}");
-            // Rust's debug format of strings and of lists of them is JSON5.
-            self.rules.push(format!(
-                "{{ id: {id:?}, permission: \"allow\", flows: [\"{flow}\"], messages: [{messages}], key_exprs: {keys:?} }}"
-            ));
-            rules.push(id);
-        }
-        self.subjects.push(format!(
-            "{{ id: \"{name}\", cert_common_names: [\"{name}\"], link_protocols: [\"quic\"] }}"
-        ));
-        self.policies
-            .push(format!("{{ rules: {rules:?}, subjects: [\"{name}\"] }}"));
-    }
-
-    /// Allows everything through a unix socket of this machine, which the permissions of its folder guard.
-    fn add_unix_sockets(&mut self) {
-        let all = "\"put\", \"delete\", \"declare_subscriber\", \"query\", \"reply\", \"declare_queryable\", \"liveliness_token\", \
-                   \"liveliness_query\", \"declare_liveliness_subscriber\"";
-        self.rules.push(format!(
-            "{{ id: \"all\", permission: \"allow\", flows: [\"ingress\", \"egress\"], messages: [{all}], key_exprs: [\"**\"] }}"
-        ));
-        let subject = "{ id: \"this-machine\", link_protocols: [\"unixsock-stream\"] }";
-        self.subjects.push(subject.into());
-        let policy = "{ rules: [\"all\"], subjects: [\"this-machine\"] }";
-        self.policies.push(policy.into());
-    }
+/// The rules that give `role` its rights.
+fn role_rules(role: Role, grant: &Grant) -> Vec<Value> {
+    let rule = |(what, flow, messages, keys): (&str, &str, &str, &Vec<String>)| {
+        let id = format!("{role}-{what}");
+        (!keys.is_empty()).then(|| allow(&id, flow, messages, keys))
+    };
+    let all = [
+        ("asks", "ingress", "query", &grant.query),
+        ("is-answered", "egress", "reply", &grant.query),
+        (
+            "answers",
+            "ingress",
+            "declare_queryable reply",
+            &grant.reply,
+        ),
+        ("is-asked", "egress", "query", &grant.reply),
+        ("listens", "ingress", "declare_subscriber", &grant.subscribe),
+        ("receives", "egress", "put", &grant.subscribe),
+        ("lives", "ingress", "liveliness_token", &grant.liveliness),
+    ];
+    all.into_iter().filter_map(rule).collect()
 }
 
-/// Returns zenoh's whole `access_control`, JSON5, for the replay server of the run with these keys.
+/// Returns zenoh's whole `access_control`, JSON, for the replay server of the run with these keys.
 pub(crate) fn access_rules(keys: &Keys) -> String {
-    let mut lists = AccessLists::default();
     let actors = (0..ACTORS_MAX).map(Role::Actor);
-    for role in actors.chain([Role::Learner, Role::Observer]) {
-        lists.add_role(role, &grant(keys, role));
+    let roles = actors.chain([Role::Learner, Role::Observer]).map(|role| {
+        let name = role.to_string();
+        let subject =
+            json!({ "id": name, "cert_common_names": [name], "link_protocols": ["quic"] });
+        (subject, role_rules(role, &grant(keys, role)))
+    });
+    // The permissions of a unix socket's folder guard it.
+    let local = json!({ "id": "this-machine", "link_protocols": ["unixsock-stream"] });
+    let all = "put delete declare_subscriber query reply declare_queryable liveliness_token liveliness_query \
+               declare_liveliness_subscriber";
+    let everything = allow("all", "ingress egress", all, &["**".into()]);
+    let (mut rules, mut subjects, mut policies) = (Vec::new(), Vec::new(), Vec::new());
+    for (subject, own) in roles.chain([(local, vec![everything])]) {
+        let ids: Vec<_> = own.iter().map(|rule| &rule["id"]).collect();
+        policies.push(json!({ "rules": ids, "subjects": [subject["id"]] }));
+        rules.extend(own);
+        subjects.push(subject);
     }
-    lists.add_unix_sockets();
-    format!(
-        "{{ enabled: true, default_permission: \"deny\", rules: [{}], subjects: [{}], policies: [{}] }}",
-        lists.rules.join(", "),
-        lists.subjects.join(", "),
-        lists.policies.join(", ")
-    )
+    let control = json!({
+        "enabled": true, "default_permission": "deny",
+        "rules": rules, "subjects": subjects, "policies": policies,
+    });
+    control.to_string()
 }
 
 #[cfg(test)]

@@ -161,18 +161,15 @@ impl Credentials {
     }
 
     pub(crate) fn zenoh_settings(&self) -> String {
-        let paths = [
-            ("root_ca_certificate", &self.authority),
-            ("listen_certificate", &self.certificate),
-            ("listen_private_key", &self.key),
-            ("connect_certificate", &self.certificate),
-            ("connect_private_key", &self.key),
-        ];
-        let paths = paths.map(|(name, path)| format!("{name}: {}", json!(path.to_string_lossy())));
-        format!(
-            "{{ {}, enable_mtls: true, verify_name_on_connect: true, close_link_on_expiration: true }}",
-            paths.join(", ")
-        )
+        let [authority, certificate, key] =
+            [&self.authority, &self.certificate, &self.key].map(|it| it.to_string_lossy());
+        let settings = json!({
+            "root_ca_certificate": authority,
+            "listen_certificate": certificate, "listen_private_key": key,
+            "connect_certificate": certificate, "connect_private_key": key,
+            "enable_mtls": true, "verify_name_on_connect": true, "close_link_on_expiration": true,
+        });
+        settings.to_string()
     }
 }
 
