@@ -55,12 +55,11 @@ impl BufferPool {
     /// Like [`BufferPool::new`], with shared memory for `count` buffers of `bytes` each. If the machine does not grant shared memory, a
     /// warning is logged and all buffers are private.
     pub fn shared(spare_max: usize, count: usize, bytes: usize) -> Self {
-        let mut shared = None;
         let created = create_provider(shared_memory::pool_bytes(count, bytes));
-        shared_memory::is_granted(created.map(|provider| {
-            let trust = Mutex::default();
-            shared = Some(SharedMemory { provider, trust });
-        }));
+        let shared = shared_memory::granted(created).map(|provider| SharedMemory {
+            provider,
+            trust: Mutex::default(),
+        });
         Self::with_shared(spare_max, shared)
     }
 

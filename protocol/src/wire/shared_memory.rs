@@ -131,16 +131,15 @@ fn check_limit(limit: Option<u64>, bytes: usize, action: &str, option: &str) -> 
     }
 }
 
-/// Returns whether shared memory was granted; if not, logs a warning with the reason and the effect.
-pub fn is_granted(asked: Result<(), String>) -> bool {
-    asked
-        .inspect_err(|why| {
-            tracing::warn!(
-                "no shared memory, so messages go through sockets, which is slower: {why}; \
-                 --set transport.shared_memory=false asks for none"
-            );
-        })
-        .is_ok()
+/// Returns the shared memory that was granted; if none was, logs a warning with the reason and the effect.
+pub fn granted<T>(asked: Result<T, String>) -> Option<T> {
+    let warn = |why: &String| {
+        tracing::warn!(
+            "no shared memory, so messages go through sockets, which is slower: {why}; \
+             --set transport.shared_memory=false asks for none"
+        );
+    };
+    asked.inspect_err(warn).ok()
 }
 
 /// Calls `allocate` if `bytes` bytes are free in [`FOLDER`]. Processes that allocate at the same time take turns by a lock, so that all

@@ -84,8 +84,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
     let batch = BatchHeader::largest(&spec, batch_size).with_sampling(&config.sampling);
     // Computed for the whole run: if shared memory is too small, all messages go through sockets.
     let needed = shared_memory_bytes(&settings, 1)?;
-    let is_granted =
-        transport.shared_memory && shared_memory::is_granted(shared_memory::check_room(needed));
+    let room = || shared_memory::granted(shared_memory::check_room(needed));
+    let is_granted = transport.shared_memory && room().is_some();
     let pool = if is_granted {
         BufferPool::shared(SPARE_BUFFERS_MAX, POOL_BATCHES, batch.payload_bytes())
     } else {

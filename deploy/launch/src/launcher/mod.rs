@@ -84,7 +84,7 @@ pub fn run(
     let shared_memory = config.transport.shared_memory && {
         let settings = Settings::parse(&config.to_toml())?;
         let needed = shared_memory_bytes(&settings, config.replay.shards)?;
-        shared_memory::is_granted(shared_memory::check_room(needed))
+        shared_memory::granted(shared_memory::check_room(needed)).is_some()
     };
     let mut launch = Launch {
         config,
