@@ -15,54 +15,52 @@ const VALUE_MAX: u64 = 1 << 40;
 /// Maximum versions of weights whose arrival is remembered. Older versions count as replaced when the oldest of these arrived.
 const VERSIONS_MAX: usize = 4096;
 
-/// Distributions since the start; times in microseconds.
+/// Distributions since the start.
+#[derive(Default)]
 pub(super) struct Timings {
-    replies: Histogram<u64>,
-    inserts: Histogram<u64>,
-    weights_lag: Histogram<u64>,
-    weights_lag_updates: Histogram<u64>,
+    replies: Distribution,
+    inserts: Distribution,
+    weights_lag: Distribution,
+    weights_lag_updates: Distribution,
     /// The version of each weights upload, its number of updates, and when it arrived; oldest first.
     versions: VecDeque<(u64, u64, Instant)>,
 }
 
-fn empty_histogram() -> Histogram<u64> {
-    Histogram::new_with_bounds(1, VALUE_MAX, DIGITS)
-        .expect("bounds and digits that a histogram can have")
-}
+/// A distribution of counts, or of times in microseconds.
+struct Distribution(Histogram<u64>);
 
-fn quantiles(histogram: &Histogram<u64>, unit: f64) -> Option<Quantiles> {
-    let at = |quantile| histogram.value_at_quantile(quantile) as f64 / unit;
-    (!histogram.is_empty()).then(|| Quantiles {
-        p50: at(0.5),
-        p99: at(0.99),
-        max: at(1.0),
-    })
-}
-
-fn record_time(times: &mut Histogram<u64>, time: Duration) {
-    times.saturating_record(u64::try_from(time.as_micros()).unwrap_or(u64::MAX));
-}
-
-impl Default for Timings {
+impl Default for Distribution {
     fn default() -> Self {
-        Self {
-            replies: empty_histogram(),
-            inserts: empty_histogram(),
-            weights_lag: empty_histogram(),
-            weights_lag_updates: empty_histogram(),
-            versions: VecDeque::new(),
-        }
+        let empty = Histogram::new_with_bounds(1, VALUE_MAX, DIGITS);
+        Self(empty.expect("bounds and digits that a histogram can have"))
+    }
+}
+
+impl Distribution {
+    fn record_time(&mut self, time: Duration) {
+        let time = u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
+        self.0.saturating_record(time);
+    }
+
+    fn quantiles(&self, unit: f64) -> Option<Quantiles> {
+        let at = |quantile| self.0.value_at_quantile(quantile) as f64 / unit;
+        (!self.0.is_empty()).then(|| Quantiles {
+            p50: at(0.5),
+            p99: at(0.99),
+            max: at(1.0),
+        })
     }
 }
 
 impl Timings {
     pub(super) fn record_reply(&mut self, after: Duration) {
-        record_time(&mut self.replies, after);
+        self.replies.record_time(after);
     }
 
     /// Notes that a chunk was stored whose actions were chosen by weights of `version`.
     pub(super) fn record_insert(&mut self, version: u64, arrived: Instant, now: Instant) {
-        record_time(&mut self.inserts, now.saturating_duration_since(arrived));
+        self.inserts
+            .record_time(now.saturating_duration_since(arrived));
         let Some(&(_, newest_updates, _)) = self.versions.back() else {
             return;
         };
@@ -71,10 +69,10 @@ impl Timings {
         let behind = replaced.map_or(Duration::ZERO, |&(_, _, at)| {
             now.saturating_duration_since(at)
         });
-        record_time(&mut self.weights_lag, behind);
+        self.weights_lag.record_time(behind);
         let acted = self.versions.get(newer.saturating_sub(1));
         let updates = acted.map_or(0, |&(_, updates, _)| newest_updates.saturating_sub(updates));
-        self.weights_lag_updates.saturating_record(updates);
+        self.weights_lag_updates.0.saturating_record(updates);
     }
 
     pub(super) fn record_weights(&mut self, weights: &WeightsHeader, now: Instant) {
@@ -98,10 +96,10 @@ impl Timings {
 
     /// Sets the timing fields of a status.
     pub(super) fn fill_status(&self, status: &mut ReplayStatus) {
-        status.answer_ms = quantiles(&self.replies, 1e3);
-        status.insert_ms = quantiles(&self.inserts, 1e3);
-        status.weights_behind_s = quantiles(&self.weights_lag, 1e6);
-        status.weights_behind_updates = quantiles(&self.weights_lag_updates, 1.0);
+        status.answer_ms = self.replies.quantiles(1e3);
+        status.insert_ms = self.inserts.quantiles(1e3);
+        status.weights_behind_s = self.weights_lag.quantiles(1e6);
+        status.weights_behind_updates = self.weights_lag_updates.quantiles(1.0);
     }
 }
 
