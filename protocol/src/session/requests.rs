@@ -95,20 +95,19 @@ pub(crate) fn send<M>(
 impl<M: Message> PendingReply<M> {
     /// Waits for a reply without a payload.
     pub fn wait(mut self) -> Result<M, SessionError> {
-        let spec_hash = self.spec_hash;
-        self.wait_for(|bytes| decode(bytes, spec_hash))
+        self.wait_for(decode)
     }
 
     /// Waits for the reply for at most `wait_max`; returns `None` if it has not arrived by then.
     pub fn wait_within(&mut self, wait_max: Duration) -> Result<Option<M>, SessionError> {
-        let (deadline, spec_hash) = (Instant::now() + wait_max, self.spec_hash);
+        let deadline = Instant::now() + wait_max;
         loop {
             let reply = match self.replies.recv_deadline(deadline) {
                 Ok(None) => return Ok(None),
                 Ok(reply) => reply,
                 Err(_) => None,
             };
-            if let Some(answer) = self.read(reply, |bytes| decode(bytes, spec_hash))? {
+            if let Some(answer) = self.read(reply, decode)? {
                 return Ok(Some(answer));
             }
         }
@@ -116,8 +115,7 @@ impl<M: Message> PendingReply<M> {
 
     /// Waits for the reply and copies its payload into private memory from `pool`.
     pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
-        let spec_hash = self.spec_hash;
-        self.wait_for(|bytes| codec::decode_from(bytes.reader(), bytes.len(), pool, spec_hash))
+        self.wait_for(|bytes, hash| codec::decode_from(bytes.reader(), bytes.len(), pool, hash))
     }
 }
 
@@ -126,10 +124,10 @@ fn decode<M: Message>(bytes: &ZBytes, spec_hash: Option<u64>) -> Result<M, Codec
 }
 
 impl<M> PendingReply<M> {
-    /// Waits for the first reply that `read` accepts. Without certificates, foreign processes may reply too.
+    /// Waits for the first reply whose bytes `read` accepts. Without certificates, foreign processes may reply too.
     fn wait_for<T>(
         &mut self,
-        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+        read: impl Fn(&ZBytes, Option<u64>) -> Result<T, CodecError>,
     ) -> Result<T, SessionError> {
         loop {
             let reply = self.replies.recv().ok();
@@ -143,7 +141,7 @@ impl<M> PendingReply<M> {
     fn read<T>(
         &mut self,
         reply: Option<Reply>,
-        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+        read: impl Fn(&ZBytes, Option<u64>) -> Result<T, CodecError>,
     ) -> Result<Option<T>, SessionError> {
         let key = || self.key.clone();
         let Some(reply) = reply else {
@@ -151,7 +149,7 @@ impl<M> PendingReply<M> {
             return Err(self.failed.take().unwrap_or_else(none));
         };
         let failed = match reply.into_result() {
-            Ok(sample) => match read(sample.payload()) {
+            Ok(sample) => match read(sample.payload(), self.spec_hash) {
                 Ok(answer) => return Ok(Some(answer)),
                 Err(why) => SessionError::Unreadable { key: key(), why },
             },
@@ -183,7 +181,7 @@ pub fn ask(
     timeout: Duration,
 ) -> Result<ZBytes, SessionError> {
     send::<()>(session, key.into(), payload, priority, timeout, None)?
-        .wait_for(|bytes| Ok(bytes.clone()))
+        .wait_for(|bytes, _| Ok(bytes.clone()))
 }
 
 /// Answers `query` with `payload`. If the requester has gone away, this is logged and ignored.
