@@ -155,27 +155,3 @@ pub(crate) fn read_greeting(endpoint: &str) -> Option<String> {
     let is_text = line.len() >= 4 && line.chars().all(|it| !it.is_control());
     is_text.then(|| line.to_owned())
 }
-
-#[cfg(test)]
-mod tests {
-    use std::os::unix::net::UnixListener;
-
-    use super::*;
-
-    fn error_at(endpoint: &str) -> String {
-        check_listening(endpoint).unwrap_err().to_string()
-    }
-
-    #[test]
-    fn each_cause_has_its_sentence() {
-        assert!(error_at("quic/no-such-host.invalid:7447").contains("is unknown"));
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("s");
-        let endpoint = format!("unixsock-stream/{}", path.display());
-        assert!(error_at(&endpoint).contains("there is no such socket"));
-        let listener = UnixListener::bind(&path).unwrap();
-        assert!(check_listening(&endpoint).is_ok());
-        drop(listener);
-        assert!(error_at(&endpoint).contains("left by a process that has ended"));
-    }
-}

@@ -4,6 +4,7 @@
 use std::{
     io::{Read, Write},
     ops::Range,
+    os::unix::net::UnixListener,
     thread,
     time::{Duration, Instant},
 };
@@ -52,6 +53,9 @@ fn a_closed_port_differs_from_an_unknown_host() {
     });
     fails_within(&system, &system.connect_args("watch"), 0..5)
         .expect_stderr("there is no such socket. Start the replay server first");
+    drop(UnixListener::bind(system.path("s")).unwrap());
+    fails_within(&system, &system.connect_args("watch"), 0..5)
+        .expect_stderr("its socket was left by a process that has ended");
     system.run("status").expect_code(64);
 }
 
