@@ -85,42 +85,17 @@ impl Sampling {
 mod tests {
     use super::*;
 
-    fn rule(numbers: [f64; 3], beta_updates: u64) -> Sampling {
-        let [alpha, beta_start, beta_end] = numbers;
-        Sampling::Prioritised {
-            alpha,
-            beta_start,
-            beta_end,
-            beta_updates,
-        }
-    }
-
     #[test]
     fn beta_rises_in_a_straight_line_and_stays() {
-        let rule = rule([0.5, 0.4, 1.0], 600);
+        let rule = Sampling::Prioritised {
+            alpha: 0.5,
+            beta_start: 0.4,
+            beta_end: 1.0,
+            beta_updates: 600,
+        };
         for (updates, beta) in [(0, 0.4), (300, 0.7), (600, 1.0), (u64::MAX, 1.0)] {
             assert!((rule.beta(updates) - beta).abs() < 1e-12);
         }
         assert_eq!(Sampling::Uniform {}.beta(7), 0.0);
-    }
-
-    #[test]
-    fn numbers_out_of_range_are_named() {
-        assert_eq!(rule([0.5, 0.4, 1.0], 600).validate(), Ok(()));
-        assert_eq!(Sampling::Uniform {}.validate(), Ok(()));
-        for (numbers, beta_updates, key) in [
-            ([-0.1, 0.4, 1.0], 600, "alpha"),
-            ([f64::NAN, 0.4, 1.0], 600, "alpha"),
-            ([f64::INFINITY, 0.4, 1.0], 600, "alpha"),
-            ([0.5, 1.5, 1.0], 600, "beta_start"),
-            ([0.5, 0.4, 2.0], 600, "beta_end"),
-            ([0.5, 0.4, 0.3], 600, "beta_end"),
-            ([0.5, 0.4, 1.0], 0, "beta_updates"),
-        ] {
-            let said = rule(numbers, beta_updates).validate();
-            let said = said.unwrap_err().to_string();
-            let key = format!("replay.sampling.{key} = ");
-            assert!(said.starts_with(&key), "{said}");
-        }
     }
 }
