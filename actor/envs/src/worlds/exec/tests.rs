@@ -270,14 +270,6 @@ fn a_world_that_offers_it_continues_where_it_was_saved() {
 }
 
 #[test]
-fn a_world_that_does_not_offer_it_is_not_asked() {
-    let mut world = ExecWorld::new(&config(numbered("")), 2, 1).unwrap();
-    assert!(matches!(world.save(), Err(EnvError::NotSaved(_))));
-    // The process gets no request, and continues.
-    step(&mut world, &[0, 1]);
-}
-
-#[test]
 fn a_state_of_another_world_is_refused_by_name() {
     let world =
         |arguments: &str, copies| ExecWorld::new(&config(numbered(arguments)), copies, 1).unwrap();
