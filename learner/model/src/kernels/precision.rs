@@ -68,18 +68,3 @@ impl FromStr for Precision {
         known.ok_or_else(|| format!("{name:?} is not a precision: use f32 or bf16"))
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_are_read_back() {
-        for precision in Precision::ALL {
-            let parsed: Precision = precision.to_string().parse().unwrap();
-            assert_eq!(parsed, precision);
-        }
-        let error = "f16".parse::<Precision>().unwrap_err();
-        assert!(error.contains("use f32 or bf16"), "{error}");
-    }
-}
