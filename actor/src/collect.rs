@@ -172,13 +172,10 @@ impl Collector {
 
 #[cfg(test)]
 mod tests {
-    use driml_envs::{ChainConfig, WorldConfig};
-    use driml_model::{Compute, ConvLayer, InputSize, ModelConfig, Parameters};
-    use driml_protocol::config::TransportConfig;
+    use driml_model::{Compute, Parameters};
 
     use super::*;
-    use crate::config::{Config, EpsilonLadder, tests::CONFIG};
-    use crate::policy::tests::model;
+    use crate::config::EpsilonLadder;
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
@@ -189,49 +186,14 @@ mod tests {
         earlier_incarnations: 0,
     };
 
+    /// The preset `smoke` on the chain, with more environments and a constant epsilon.
     fn settings(epsilon: f64) -> ActorSettings {
-        ActorSettings {
-            spec: RunSpec {
-                world: "chain".into(),
-                seed: 5,
-                frame_height: 12,
-                frame_width: 12,
-                num_actions: 3,
-                ..RunSpec::smallest()
-            },
-            world: WorldConfig::Chain(ChainConfig {
-                cells: 8,
-                height: 12,
-                width: 12,
-                step_limit: 30,
-                reward_left: 0.1,
-                reward_right: 1.0,
-            }),
-            input: InputSize {
-                height: 12,
-                width: 12,
-                frame: None,
-            },
-            model: ModelConfig {
-                height: 12,
-                width: 12,
-                num_actions: 3,
-                conv: vec![ConvLayer::new(2, 4, 4)],
-                ..model()
-            },
-            actor: Config {
-                envs: ENVS,
-                steps_per_chunk: STEPS,
-                epsilon_start: epsilon,
-                epsilon_end: epsilon,
-                epsilon_decay_frames: 0,
-                ..CONFIG
-            },
-            transport: TransportConfig {
-                shared_memory: false,
-            },
-            actors_planned: 1,
-        }
+        let smoke = include_str!("../../tests/decoders/fuzz/corpus/config/chain");
+        let mut settings = ActorSettings::from_toml(smoke).unwrap();
+        let actor = &mut settings.actor;
+        (actor.envs, actor.steps_per_chunk) = (ENVS, STEPS);
+        (actor.epsilon_start, actor.epsilon_end) = (epsilon, epsilon);
+        settings
     }
 
     fn collector(settings: ActorSettings, incarnation: Incarnation) -> Result<Collector, ActError> {

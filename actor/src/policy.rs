@@ -143,7 +143,7 @@ impl Policy for NetworkPolicy {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use driml_model::{Compute, ConvLayer, HeadConfig, Parameters};
     use rand::SeedableRng;
 
@@ -152,7 +152,7 @@ pub(crate) mod tests {
     const ACTIONS: usize = 5;
     const STATES: usize = 4000;
 
-    pub(crate) fn model() -> ModelConfig {
+    fn model() -> ModelConfig {
         ModelConfig {
             height: 4,
             width: 4,
