@@ -59,22 +59,6 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
     }
 }
 
-const IMPALA: [&str; 2] = ["model.torso=impala", "model.channels=[4,6]"];
-const IMPOOLA: [&str; 2] = ["model.torso=impoola", "model.channels=[4,6]"];
-
-/// A random crop reads the border, which no convolution of the whole frame reads. Convolutions of a residual torso read it, too.
-#[test]
-fn where_a_border_is_read_frames_stay_whole() {
-    for torso in [&IMPALA, &IMPOOLA] {
-        let config = config("chain", "driml-ada", 400, torso);
-        assert_eq!(frame(&config), (12, 12));
-    }
-    let config = config("chain", "curl", 400, &WIDE_CHAIN);
-    assert_eq!(frame(&config), (15, 17));
-    assert_eq!((config.model.height, config.model.width), (15, 17));
-    weights(&config);
-}
-
 /// Begins a run, and saves it after `rounds` rounds.
 fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lockstep) {
     let folder = tempfile::tempdir().unwrap();
@@ -85,6 +69,8 @@ fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lo
     (folder, run_dir, lockstep)
 }
 
+const IMPALA: [&str; 2] = ["model.torso=impala", "model.channels=[4,6]"];
+const IMPOOLA: [&str; 2] = ["model.torso=impoola", "model.channels=[4,6]"];
 const PRIORITISED: &str =
     "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
 
