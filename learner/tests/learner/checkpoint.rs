@@ -19,7 +19,7 @@ use tempfile::tempdir;
 
 use crate::synthetic::{
     ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, check_says, model, new_agent, random_batch,
-    settings,
+    settings, values,
 };
 
 /// A learner's state before its first update, in a run with earlier learners.
@@ -179,20 +179,15 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
             resumed.update(&rows.batch()).unwrap(),
         );
         assert!((a.total - b.total).abs() < total * a.total, "{a:?}\n{b:?}");
-        let (mut sum, mut count) = (0.0, 0);
-        for (name, var) in run.agent.online().iter() {
-            let other = resumed.online().get(name).unwrap();
-            let difference = (var.as_tensor() - other.as_tensor()).unwrap();
-            let difference = difference.abs().unwrap();
-            let largest = difference.max_all().unwrap();
-            let largest = largest.to_scalar::<f32>().unwrap();
-            assert!(largest < parameter, "{name}: {largest}");
-            let all = difference.sum_all().unwrap();
-            sum += all.to_scalar::<f32>().unwrap();
-            count += difference.elem_count();
-        }
+        let [ours, theirs] = [&run.agent, &resumed].map(|it| values(it.online()));
+        let pairs = ours
+            .iter()
+            .flat_map(|(name, it)| it.iter().zip(&theirs[name]));
+        let differences: Vec<f32> = pairs.map(|(a, b)| (a - b).abs()).collect();
+        assert!(differences.iter().all(|it| *it < parameter));
         // Without the moments, the steps of moving parameters would differ by 0.4 learning rates or more.
-        assert!(sum / (count as f32) < mean, "{sum} of {count}");
+        let found = differences.iter().sum::<f32>() / differences.len() as f32;
+        assert!(found < mean, "{found}");
     }
 }
 
