@@ -136,22 +136,3 @@ impl AuxiliarySettings<'_> {
         )))
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_the_heads_of_weighted_pairs_are_needed() {
-        for (weights, needed) in [
-            ([0.0; 4], [false; 5]),
-            ([0.0, 0.0, 0.0, 1.0], [false, false, true, true, true]),
-            ([0.0, 0.5, 0.0, 0.0], [true, false, false, true, true]),
-            ([1.0, 0.0, 0.0, 1.0], [true; 5]),
-        ] {
-            let it = Lambda::from_values(weights).dim_heads(true);
-            let parts = [it.psi3, it.phi3, it.psi4, it.phi4, it.action];
-            assert_eq!(parts, needed, "{weights:?}");
-        }
-    }
-}
