@@ -73,7 +73,7 @@ pub use run_spec::{FRAME_STACK_MAX, Horizon, RunSpec, TimeoutRule};
 pub use sampling::Sampling;
 pub use session::PendingReply;
 pub use wire::{
-    buffers::{Buffer, BufferPool},
+    buffers::{Buffer, BufferPool, is_readable},
     codec::{self, PROTOCOL_VERSION},
     error::CodecError,
     keys::{Keys, Peer, ProcessName},

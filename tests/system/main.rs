@@ -42,6 +42,7 @@ mod tensorboard;
 mod tiny_replay;
 mod tls;
 mod watch;
+mod written_off;
 
 use std::net::{Ipv4Addr, TcpListener};
 

@@ -11,7 +11,8 @@ use std::{
 use anyhow::bail;
 use driml_protocol::{
     ActorJoin, BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter,
-    PendingReply, RunClient, Shutdown, Silence, fail_point, lock, session::SessionError,
+    PendingReply, RunClient, Shutdown, Silence, fail_point, is_readable, lock,
+    session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
@@ -26,8 +27,8 @@ const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 const WINDOW_TRIAL_CHUNKS: u64 = 64;
 /// Pause between two tries when the replay server is out of reach or has no room.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// How often the thread checks for `Shutdown` while it waits for a reply.
-const SHUTDOWN_CHECK_INTERVAL: Duration = Duration::from_millis(50);
+/// How often the thread checks for `Shutdown`, and for the memory of its chunk, while it waits for a reply.
+const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 /// How long `Leave` is retried, not counting the time in which the replay server reads its replay back from disk.
 const LEAVE_RETRY_MAX: Duration = Duration::from_secs(5);
 /// Time-out of one `Leave`. Several must fit into [`LEAVE_RETRY_MAX`], as a message may be lost.
@@ -41,6 +42,15 @@ struct OutgoingChunk {
     pending: Option<PendingReply<InsertReply>>,
     /// The replay server has the chunk and will store it, so that a poll is enough.
     is_kept: bool,
+}
+
+impl OutgoingChunk {
+    fn copy_out_of_shared_memory(&mut self) {
+        if self.in_shared_memory {
+            self.payload = ZBytes::from(self.payload.to_bytes().into_owned());
+            self.in_shared_memory = false;
+        }
+    }
 }
 
 /// The result for the first chunk in the queue.
@@ -181,7 +191,8 @@ impl DeliveryWorker {
         }
         let reply = self.send_window().and_then(|()| self.wait_for_first());
         let Some(reply) = reply.transpose() else {
-            // A poll with `leaving` set takes the chunk past the rate limiter at once. On a slow link, a second copy would take too long.
+            // A poll tells whether the chunk has arrived, and with `leaving` set takes it past the rate limiter at once. On a slow link, a
+            // second copy would take too long.
             let sent = self.outgoing.iter_mut().take(self.window);
             sent.for_each(|it| it.is_kept = true);
             return Ok(self.prepare_resend());
@@ -279,16 +290,18 @@ impl DeliveryWorker {
         }
     }
 
-    /// Waits for the reply to the first chunk. Returns `None` on a shutdown of which the replay server does not know yet.
+    /// Waits for the reply to the first chunk. Returns `None` on a shutdown of which the replay server does not know yet, and if the server
+    /// may have dropped the chunk, because its memory is no longer readable.
     fn wait_for_first(&mut self) -> Result<Option<InsertReply>, SessionError> {
         let first = &mut self.outgoing[0];
         let Some(mut reply) = first.pending.take() else {
             unreachable!("the window has room for one");
         };
         loop {
-            match reply.wait_within(SHUTDOWN_CHECK_INTERVAL)? {
+            match reply.wait_within(CHECK_INTERVAL)? {
                 Some(reply) => return Ok(Some(reply)),
                 None if self.shutdown.is_set() && !first.header.leaving => return Ok(None),
+                None if !first.is_kept && !is_readable(&first.payload) => return Ok(None),
                 None => {}
             }
         }
@@ -327,10 +340,8 @@ impl DeliveryWorker {
     }
 
     fn copy_out_of_shared_memory(&mut self) {
-        for it in self.outgoing.iter_mut().filter(|it| it.in_shared_memory) {
-            it.payload = ZBytes::from(it.payload.to_bytes().into_owned());
-            it.in_shared_memory = false;
-        }
+        let outgoing = self.outgoing.iter_mut();
+        outgoing.for_each(OutgoingChunk::copy_out_of_shared_memory);
     }
 
     fn send_window(&mut self) -> Result<(), SessionError> {
@@ -342,6 +353,10 @@ impl DeliveryWorker {
         for it in self.outgoing.iter_mut().take(self.window) {
             if it.pending.is_some() {
                 continue;
+            }
+            // A chunk that has waited here for its turn may have lost its memory meanwhile.
+            if !it.is_kept && !is_readable(&it.payload) {
+                it.copy_out_of_shared_memory();
             }
             let header = &mut it.header;
             header.leaving |= leaving;

@@ -14,8 +14,8 @@ use zenoh::{
     Wait,
     bytes::ZBytes,
     shm::{
-        Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder,
-        ZShmMut,
+        Defragment, GarbageCollect, PosixShmProviderBackend, ShmBuf, ShmProvider,
+        ShmProviderBuilder, ZShmMut,
     },
 };
 
@@ -149,6 +149,12 @@ impl Buffer {
             private => ZBytes::from(bytes::Bytes::from_owner(Self(private))),
         }
     }
+}
+
+/// Whether other processes can still read `payload`. zenoh writes off shared memory of a process that seems dead: whose thread for that
+/// purpose got no processor for 100 ms. Receivers silently drop messages in it, while this process can still read it.
+pub fn is_readable(payload: &ZBytes) -> bool {
+    payload.as_shm().is_none_or(|shared| shared.is_valid())
 }
 
 impl From<Vec<u8>> for Buffer {
