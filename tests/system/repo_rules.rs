@@ -15,7 +15,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 10_550),
     ("replay-server", 11_050),
     ("learner", 21_960),
-    ("deploy", 30_965),
+    ("deploy", 31_030),
     ("tests", 10_370),
 ];
 /// The most lines of one file.

@@ -26,6 +26,32 @@ pub(super) struct WatchedRun {
     /// Shows the run from its beginning, as far as that is known.
     pub(super) display: Display,
     recorder: Option<RunRecorder>,
+    uptimes: Uptimes,
+}
+
+/// The uptime of each server when it last answered, seconds.
+#[derive(Default)]
+struct Uptimes(Vec<f64>);
+
+impl Uptimes {
+    /// Takes each server's uptime and whether its replay is kept on disk; `None` for a server that did not answer. Returns the number of a
+    /// server that was started again without its replay: its counts begin anew.
+    fn find_begun_anew(
+        &mut self,
+        answers: impl ExactSizeIterator<Item = Option<(f64, bool)>>,
+    ) -> Option<usize> {
+        self.0.resize(answers.len(), 0.0);
+        let mut found = None;
+        for (number, (last_s, answer)) in self.0.iter_mut().zip(answers).enumerate() {
+            if let Some((up_s, is_kept)) = answer {
+                if up_s < *last_s && !is_kept {
+                    found = Some(number);
+                }
+                *last_s = up_s;
+            }
+        }
+        found
+    }
 }
 
 impl WatchedRun {
@@ -47,7 +73,11 @@ impl WatchedRun {
             // The bar's clock shows the time of the run. All clones of a bar are the same bar.
             drop(bar.clone().with_elapsed(up));
         }
-        Ok(Self { display, recorder })
+        Ok(Self {
+            display,
+            recorder,
+            uptimes: Uptimes::default(),
+        })
     }
 
     /// Shows and records the poller's last answers. Returns true if the run is over.
@@ -56,6 +86,19 @@ impl WatchedRun {
             bail!(
                 "{} now serves a run with other settings: start `driml watch` again, with another --run-dir",
                 other.endpoint
+            );
+        }
+        let answers = poller.view.servers.iter().map(|it| {
+            let status = it.processes.as_ref()?;
+            Some((status.up_s, status.log.is_some()))
+        });
+        // Rows of two lives in one table would contradict each other.
+        if let Some(number) = self.uptimes.find_begun_anew(answers)
+            && self.recorder.is_some()
+        {
+            bail!(
+                "{} was started again with an empty replay: start `driml watch` again",
+                poller.view.servers[number].endpoint
             );
         }
         let recorder = self.recorder.as_mut();
@@ -192,4 +235,25 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
         after_updates,
         frames_max: u64::MAX,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_that_was_started_again_without_its_replay_is_found() {
+        for (is_kept, found) in [(false, Some(1)), (true, None)] {
+            let mut uptimes = Uptimes::default();
+            let mut find = |up_s: [Option<f64>; 2]| {
+                uptimes.find_begun_anew(up_s.into_iter().map(|it| Some((it?, is_kept))))
+            };
+            // The second server does not answer for a while, and is then another process.
+            for up_s in [[Some(2.0), Some(3.0)], [Some(4.0), None]] {
+                assert_eq!(find(up_s), None, "{up_s:?}");
+            }
+            assert_eq!(find([Some(6.0), Some(1.0)]), found);
+            assert_eq!(find([Some(8.0), Some(3.0)]), None);
+        }
+    }
 }
