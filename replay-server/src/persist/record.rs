@@ -69,6 +69,8 @@ pub(super) enum RecordError {
     Torn,
     /// Bytes that are not a record, followed by others.
     Damaged,
+    /// A chunk that this replay cannot hold, and why.
+    Misfit(String),
 }
 
 impl RecordError {

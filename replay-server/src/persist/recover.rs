@@ -224,6 +224,11 @@ impl LogReader<'_> {
         self.recovery.found = true;
         self.position.next_ordinal = ordinal + 1;
         let (at, ended) = self.read_records(bytes, at);
+        if let Err(RecordError::Misfit(why)) = ended {
+            return Err(unusable(format!(
+                "{why}. Start with the settings of before"
+            )));
+        }
         let cut = bytes.len() - at;
         self.recovery.bytes += at as u64;
         self.position.segments.push_back(Segment {
@@ -242,7 +247,7 @@ impl LogReader<'_> {
             Err(RecordError::Torn) => tracing::info!(
                 "the last record of {name} was not written whole: its {cut} bytes are cut off"
             ),
-            Err(RecordError::Damaged) => self.warn(format!(
+            Err(_) => self.warn(format!(
                 "{name} is damaged at byte {at}: the {cut} bytes from there on are cut off, as nothing after them can be trusted. What was stored \
                  and served then is lost"
             )),
@@ -267,13 +272,11 @@ impl LogReader<'_> {
                 Ok(record) => record,
                 Err(error) => return (at, Err(error)),
             };
-            let applied = match !is_closed && record.ordinal == self.position.next_ordinal {
-                true => self.apply(&record),
-                false => Err("it is not the next record".into()),
-            };
-            if let Err(why) = applied {
-                tracing::debug!("record {}: {why}", record.ordinal);
+            if is_closed || record.ordinal != self.position.next_ordinal {
                 return (at, Err(RecordError::Damaged));
+            }
+            if let Err(error) = self.apply(&record) {
+                return (at, Err(error));
             }
             self.position.next_ordinal += 1;
             is_closed = record.kind == RecordKind::Closed;
@@ -282,23 +285,32 @@ impl LogReader<'_> {
         (at, Ok(is_closed))
     }
 
-    fn apply(&mut self, record: &Record<'_>) -> Result<(), String> {
+    fn apply(&mut self, record: &Record<'_>) -> Result<(), RecordError> {
+        let damaged = |why: String| {
+            tracing::debug!("record {}: {why}", record.ordinal);
+            RecordError::Damaged
+        };
         match record.kind {
             RecordKind::Closed => Ok(()),
-            RecordKind::Segment => Err("a segment begins within another".into()),
+            RecordKind::Segment => Err(damaged("a segment begins within another".into())),
             RecordKind::Chunk => {
                 let (hash, len) = (self.folder.id.spec_hash, record.body.len());
                 let chunk = codec::decode_from(record.body, len, &self.pool, Some(hash))
                     .and_then(|(header, payload)| Chunk::from_payload(header, payload))
-                    .map_err(|e| e.to_string())?;
-                self.replay.check_chunk(&chunk)?;
-                self.replay.state.actors.check_sender(&chunk.header)?;
+                    .map_err(|e| damaged(e.to_string()))?;
+                // It fitted when it was written: another capacity does not make it damaged.
+                self.replay
+                    .check_chunk(&chunk)
+                    .map_err(RecordError::Misfit)?;
+                let actors = &self.replay.state.actors;
+                actors.check_sender(&chunk.header).map_err(damaged)?;
                 let packed = self.packer.pack(Cow::Owned(chunk));
                 self.replay.store(&packed);
                 Ok(())
             }
             RecordKind::Event => {
-                match codec::decode_value(record.body).map_err(|e| e.to_string())? {
+                let event = codec::decode_value(record.body);
+                match event.map_err(|e| damaged(e.to_string()))? {
                     ProcessEvent::ActorJoined(join) => self.replay.join_actor(join).map(drop),
                     ProcessEvent::Forgotten(actors) => {
                         self.replay.state.actors.forget(&actors);
@@ -307,6 +319,7 @@ impl LogReader<'_> {
                     ProcessEvent::Leave(leave) => self.replay.leave(&leave).map_or(Ok(()), Err),
                     ProcessEvent::LearnerJoined(join) => self.replay.join_learner(join).map(drop),
                 }
+                .map_err(damaged)
             }
         }
     }
