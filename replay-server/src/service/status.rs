@@ -18,8 +18,8 @@ use crate::persist::journal::Journal;
 const CHECK_PERIOD: Duration = Duration::from_secs(1);
 /// How long a replay server waits for the other processes to leave when the run is over.
 const LEAVE_WAIT_MAX: Duration = Duration::from_secs(30);
-/// The same if its launcher has died: the other processes notice that too and deliver their data.
-const ORPHANED_WAIT_MAX: Duration = Duration::from_secs(10);
+/// The same if its launcher has died: the other processes notice that too and deliver their data, an actor within 20 s.
+const ORPHANED_WAIT_MAX: Duration = Duration::from_secs(25);
 /// How long a process may be missing before it is logged.
 const MISSING_MAX: Duration = Duration::from_secs(10);
 
