@@ -270,8 +270,9 @@ impl DeliveryWorker {
                 if let Some(suppressed) = self.retry_log.admit() {
                     tracing::warn!("retrying chunk {sequence}: {e}{suppressed}");
                 }
+                let is_late = matches!(e, SessionError::TimedOut { .. });
                 // A chunk that is late alone does not tell how many a link can take.
-                if self.window > 1 && matches!(e, SessionError::TimedOut { .. }) {
+                if is_late && self.window > 1 {
                     self.window_max = self.window / 2;
                 }
                 // A chunk without a reply may not have arrived, whatever an earlier reply said. A poll at the end is just sent again: its
@@ -280,7 +281,7 @@ impl DeliveryWorker {
                     self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
                 }
                 // The replay server may be unable to read shared memory: these chunks and the next ones go through the socket.
-                if self.outgoing[0].in_shared_memory {
+                if is_late && self.outgoing[0].in_shared_memory {
                     self.pool.report_shared_loss();
                 }
                 self.copy_out_of_shared_memory();
