@@ -22,6 +22,8 @@ pub(crate) struct RunSelection {
     connect: Vec<String>,
     /// Folder of a run that `driml train` started on this machine
     #[arg(value_name = "RUN", group = "whose")]
+    folder: Option<PathBuf>,
+    #[arg(long, value_name = "DIR", group = "whose", hide = true)]
     run: Option<PathBuf>,
     /// Prefix of the run's keys
     #[arg(long, value_name = "NS", default_value = DEFAULT_NAMESPACE)]
@@ -87,6 +89,7 @@ impl RunSelection {
     }
 
     fn folder(&self) -> Option<RunFolder> {
-        self.run.as_ref().map(RunFolder::new)
+        let folder = self.folder.as_ref().or(self.run.as_ref());
+        folder.map(RunFolder::new)
     }
 }
