@@ -7,7 +7,7 @@ use anyhow::Context;
 use driml_launch::{
     console::Screen,
     endpoint::wait_until_listening,
-    managed_process::{ManagedProcess, THREADS_VARIABLE},
+    managed_process::{ManagedProcess, THREADS_VARIABLE, program_command},
 };
 use driml_machine::process_env;
 use driml_protocol::Shutdown;
@@ -38,7 +38,8 @@ pub(super) fn start(
     let run = ["--env", world, "--agent", agent, "--preset", "paper"];
     let sets: Vec<_> = sets.iter().flat_map(|&set| ["--set", set]).collect();
     let args = [args, &["--listen", endpoint], &run, &sets].concat();
-    let mut process = ManagedProcess::start(name, &args, 1, folder, &Screen::default(), None)?;
+    let command = program_command(&args, 1);
+    let mut process = ManagedProcess::start(name, command, folder, &Screen::default())?;
     // A benchmark does not listen for signals.
     wait_until_listening(endpoint, &Shutdown::default(), || process.check_alive())?;
     Ok(process)

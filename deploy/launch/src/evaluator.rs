@@ -15,7 +15,7 @@ use crate::{
     checkpoint_choice::{CheckpointChoice, WeightsChoice, checkpoint_path, read_config},
     console::Screen,
     evaluate::{Levels, Player, PolicyKind},
-    managed_process::ManagedProcess,
+    managed_process::{ManagedProcess, program_command},
     output::check_file,
     run_folder::{Candidate, EvaluationRow, RunFolder},
     stats::mean_and_deviation,
@@ -166,7 +166,7 @@ impl Evaluator {
         let mut args: Vec<_> = words.split(' ').map(OsStr::new).collect();
         args.push(self.run_dir.path().as_os_str());
         let logs = self.run_dir.logs();
-        match ManagedProcess::start("evaluation", &args, 1, &logs, screen, None) {
+        match ManagedProcess::start("evaluation", program_command(&args, 1), &logs, screen) {
             Ok(process) => self.process = Some(process),
             Err(e) => screen.print_line(&format!(
                 "cannot evaluate the checkpoint after {}: {e:#}",

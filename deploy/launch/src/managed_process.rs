@@ -20,7 +20,7 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::{console::Screen, process_log::ProcessLog, rendezvous::Rendezvous};
+use crate::{console::Screen, process_log::ProcessLog};
 
 /// A process that fails within this time of its start would fail again after a restart.
 const EARLY_FAILURE_MAX: Duration = Duration::from_secs(10);
@@ -47,38 +47,26 @@ pub fn exit_with_parent_flags() -> [String; 2] {
     ["--exit-with-parent".into(), std::process::id().to_string()]
 }
 
+/// The command that starts this program with other arguments and `threads` threads for arithmetic. The child exits when this process
+/// does, from which it inherits the rest of its environment.
+pub fn program_command(args: &[impl AsRef<OsStr>], threads: u32) -> Command {
+    let mut command = Command::new(program_path());
+    command.env(THREADS_VARIABLE, threads.to_string());
+    command.args(args).args(exit_with_parent_flags());
+    command.stdin(Stdio::null());
+    command
+}
+
 impl ManagedProcess {
-    /// Starts this program with other arguments, in its own process group so that Ctrl-C does not reach the child. The child exits
-    /// when this process does. Its log is written into the folder `logs`, and its warnings are shown on `screen`. The folder of
-    /// `rendezvous` stays as long as the child lives.
+    /// Starts a process in its own process group, so that Ctrl-C does not reach it. Its log is written into the folder `logs`, and its
+    /// warnings are shown on `screen`.
     pub fn start(
         name: &str,
-        args: &[impl AsRef<OsStr>],
-        threads: u32,
+        mut command: Command,
         logs: &Path,
         screen: &Screen,
-        rendezvous: Option<&Rendezvous>,
     ) -> anyhow::Result<Self> {
-        let log = ProcessLog::open(name, logs)?;
-        let lock = rendezvous.map(Rendezvous::lock_handle).transpose();
-        let lock = lock.with_context(|| format!("starting {name}"))?;
-        let stdin = lock.map_or_else(Stdio::null, Stdio::from);
-        let mut command = Command::new(program_path());
-        // The child inherits the rest of its environment from this process.
-        command
-            .env(THREADS_VARIABLE, threads.to_string())
-            .args(args)
-            .args(exit_with_parent_flags())
-            .stdin(stdin);
-        Self::spawn(name, command, log, screen)
-    }
-
-    fn spawn(
-        name: &str,
-        mut command: Command,
-        mut log: ProcessLog,
-        screen: &Screen,
-    ) -> anyhow::Result<Self> {
+        let mut log = ProcessLog::open(name, logs)?;
         let mut child = command
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -243,9 +231,9 @@ mod tests {
         let stopped = |script: &str, ask| {
             let mut command = Command::new("sh");
             command.args(["-c", script]).stdin(Stdio::null());
-            let log = ProcessLog::open("script", logs.path()).unwrap();
             let screen = Screen::default();
-            let mut process = ManagedProcess::spawn("script", command, log, &screen).unwrap();
+            let started = ManagedProcess::start("script", command, logs.path(), &screen);
+            let mut process = started.unwrap();
             stop_processes([&mut process], ask, Duration::from_secs(60), &|| false)
         };
         assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);

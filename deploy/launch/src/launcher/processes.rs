@@ -6,14 +6,14 @@ use std::{
     path::PathBuf,
 };
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use driml_machine::error::EXIT_USAGE;
 use driml_protocol::{GracefulShutdown, session};
 use driml_settings::config::RunConfig;
 
 use crate::{
     evaluator::Evaluator,
-    managed_process::{ManagedProcess, is_orderly_exit},
+    managed_process::{ManagedProcess, is_orderly_exit, program_command},
     rendezvous::Rendezvous,
     run_folder::{ResumePoint, RunFolder, RunRecorder},
     view::{Display, Poller},
@@ -146,9 +146,11 @@ impl Launch<'_> {
                 }
             }
         }
-        let (logs, screen) = (self.run_dir.logs(), &self.display.screen);
-        let (name, rendezvous) = (&self.names[number], Some(&self.rendezvous));
-        ManagedProcess::start(name, &args, threads, &logs, screen, rendezvous)
+        let name = &self.names[number];
+        let lock = self.rendezvous.lock_handle();
+        let mut command = program_command(&args, threads);
+        command.stdin(lock.with_context(|| format!("starting {name}"))?);
+        ManagedProcess::start(name, command, &self.run_dir.logs(), &self.display.screen)
     }
 
     /// Whether an actor has exited although frames are missing. Asks the replay server again, so that its answer is newer than the exit.
