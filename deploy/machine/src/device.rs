@@ -27,8 +27,8 @@ pub fn check_device(device: DeviceName) -> Result<Option<String>, Usage> {
     let DeviceName::Cuda(ordinal) = device else {
         return Ok(None);
     };
-    let described = device_count().and_then(|count| match ordinal < count {
-        true => describe_cuda(ordinal),
+    let described = gpu_count().and_then(|count| match ordinal < count {
+        true => describe_gpu(ordinal),
         false => Err(format!(
             "the driver finds {}, numbered from cuda:0",
             units::count(count, "device")
@@ -38,23 +38,14 @@ pub fn check_device(device: DeviceName) -> Result<Option<String>, Usage> {
     Ok(Some(described))
 }
 
-/// A GPU's device name, such as `cuda:0`, and its description, or why this program cannot compute there.
-pub(crate) type GpuCheck = (String, Result<String, String>);
-
-/// Every GPU that the driver finds, or why there is none.
-pub(crate) fn gpus() -> Result<Vec<GpuCheck>, String> {
-    let check = |ordinal| (format!("cuda:{ordinal}"), describe_cuda(ordinal));
-    device_count().map(|count| (0..count).map(check).collect())
-}
-
-/// The number of devices that the driver finds, at least one, or why there is none.
+/// The number of GPUs that the driver finds, at least one, or why there is none.
 #[cfg(not(feature = "cuda"))]
-fn device_count() -> Result<usize, String> {
+pub(crate) fn gpu_count() -> Result<usize, String> {
     Err(BUILD_HINT.to_owned())
 }
 
 #[cfg(feature = "cuda")]
-fn device_count() -> Result<usize, String> {
+pub(crate) fn gpu_count() -> Result<usize, String> {
     use candle_core::cuda_backend::cudarc::driver::CudaContext;
 
     match CudaContext::device_count() {
@@ -64,14 +55,14 @@ fn device_count() -> Result<usize, String> {
     }
 }
 
-/// Describes a device: its name, compute capability and memory. An error if the query fails or the program was not built for it.
+/// Describes a GPU: its name, compute capability and memory. An error if the query fails or the program was not built for it.
 #[cfg(not(feature = "cuda"))]
-fn describe_cuda(_ordinal: usize) -> Result<String, String> {
+pub(crate) fn describe_gpu(_ordinal: usize) -> Result<String, String> {
     Err(BUILD_HINT.to_owned())
 }
 
 #[cfg(feature = "cuda")]
-fn describe_cuda(ordinal: usize) -> Result<String, String> {
+pub(crate) fn describe_gpu(ordinal: usize) -> Result<String, String> {
     use candle_core::cuda_backend::cudarc::driver::{CudaContext, DriverError};
 
     let query = || -> Result<_, DriverError> {
@@ -127,6 +118,6 @@ mod tests {
         let said = check_device(DeviceName::Cuda(0)).unwrap_err().to_string();
         assert!(said.starts_with("cuda:0 cannot be used: this program"));
         assert!(said.contains("--features cuda"), "{said}");
-        assert!(gpus().is_err());
+        assert!(gpu_count().is_err());
     }
 }

@@ -10,7 +10,7 @@ use std::path::Path;
 use anyhow::ensure;
 
 use self::fact::{Fact, State};
-use crate::device::{self, GpuCheck};
+use crate::device;
 
 /// The facts about this machine: for training on the CPU, for CUDA, and about the certificates.
 #[derive(Debug)]
@@ -23,12 +23,13 @@ pub struct Report {
 /// Examines this machine. `run_dir` is where runs would be written; `tls_dir` holds the certificates, if any.
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     // Training on the CPU needs no GPU.
-    let gpu_fact = |(name, found): GpuCheck| match found {
-        Ok(text) => Fact::new(name, State::Ok.with(text)),
-        Err(why) => Fact::new(name, State::Missing.with(why)),
+    let gpu_fact = |ordinal| {
+        let found = device::describe_gpu(ordinal);
+        let found = found.map_or_else(|why| State::Missing.with(why), |it| State::Ok.with(it));
+        Fact::new(format!("cuda:{ordinal}"), found)
     };
-    let cuda = match device::gpus() {
-        Ok(gpus) => gpus.into_iter().map(gpu_fact).collect(),
+    let cuda = match device::gpu_count() {
+        Ok(count) => (0..count).map(gpu_fact).collect(),
         Err(why) => vec![Fact::new("cuda", State::Note.with(why))],
     };
     Report {
