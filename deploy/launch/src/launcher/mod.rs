@@ -69,7 +69,6 @@ pub fn run(
     // Before the run folder gets files.
     let rendezvous = Rendezvous::create()?;
     let recorder = RunRecorder::open(run_dir, config, names.clone(), resumed, events)?;
-    let resume_point = resumed.unwrap_or_default();
     let servers = names.iter().take(config.replay.shards as usize);
     let mut endpoints: Vec<_> = servers.map(|name| rendezvous.endpoint(name)).collect();
     if let (Some(listen), None) = (&external.listen, &external.tls_dir) {
@@ -90,7 +89,6 @@ pub fn run(
         config,
         shared_memory,
         run_dir,
-        resume_point,
         endpoints,
         external,
         rendezvous,
@@ -101,7 +99,7 @@ pub fn run(
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
-        poller: Poller::starting_at(config, Vec::new(), resume_point),
+        poller: Poller::starting_at(config, resumed.unwrap_or_default()),
         recorder,
     };
 
@@ -148,7 +146,8 @@ impl Launch<'_> {
             }
             connections.push(connection?);
         }
-        self.poller = Poller::starting_at(self.config, connections, self.resume_point);
+        // All at once, as the counts of only some servers are not those of the run.
+        self.poller.servers = connections;
         self.start_up_to(self.names.len())?;
         self.watch()
     }

@@ -15,7 +15,7 @@ use crate::{
     evaluator::Evaluator,
     managed_process::{ManagedProcess, is_orderly_exit, program_command},
     rendezvous::Rendezvous,
-    run_folder::{ResumePoint, RunFolder, RunRecorder},
+    run_folder::{RunFolder, RunRecorder},
     view::{Display, Poller},
 };
 
@@ -62,7 +62,6 @@ pub(super) struct Launch<'a> {
     /// Whether chunks and batches go through shared memory: the settings ask for it, and there is enough for all processes.
     pub(super) shared_memory: bool,
     pub(super) run_dir: &'a RunFolder,
-    pub(super) resume_point: ResumePoint,
     /// The endpoint of each replay server, one per shard.
     pub(super) endpoints: Vec<String>,
     pub(super) external: ExternalAccess,

@@ -45,7 +45,7 @@ pub struct Poller {
     pub config: RunConfig,
     /// The state of the run, by the answers of its processes.
     pub view: RunView,
-    servers: Vec<ServerConnection>,
+    pub(crate) servers: Vec<ServerConnection>,
     /// The end of the last poll.
     polled: Instant,
 }
@@ -61,15 +61,11 @@ impl Poller {
         }
     }
 
-    /// The same for a run that begins now, at `point`.
-    pub(crate) fn starting_at(
-        config: &RunConfig,
-        servers: Vec<ServerConnection>,
-        point: ResumePoint,
-    ) -> Self {
+    /// A poller for a run that begins now, at `point`; it has no connection yet.
+    pub(crate) fn starting_at(config: &RunConfig, point: ResumePoint) -> Self {
         Self {
             view: RunView::starting_at(Plan::new(config), point.frames, point.updates),
-            ..Self::new(config, servers)
+            ..Self::new(config, Vec::new())
         }
     }
 
