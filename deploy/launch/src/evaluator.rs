@@ -153,13 +153,10 @@ impl Evaluator {
         if self.schedule.config.is_none() {
             return false;
         }
-        let all = checkpoint::list(&self.run_dir.checkpoints()).unwrap_or_else(|e| {
-            tracing::debug!("looking for a checkpoint to play: {e}");
-            Vec::new()
-        });
-        let newest = all.last().map(|it| it.0);
-        let due = newest.and_then(|it| Some((it, self.schedule.take_episodes(it, is_last)?)));
-        let Some((updates, episodes)) = due else {
+        let Some((updates, _)) = self.run_dir.newest_checkpoint() else {
+            return false;
+        };
+        let Some(episodes) = self.schedule.take_episodes(updates, is_last) else {
             return false;
         };
         let words = format!("evaluate --keep --checkpoint {updates} --episodes {episodes}");

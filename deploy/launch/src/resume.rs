@@ -40,18 +40,11 @@ const WAIT_POLL: Duration = Duration::from_millis(250);
 /// Whether the run in `folder`, which plays `world`, can be resumed. It needs a checkpoint, and a world that keeps no progress across
 /// episodes or whose progress the checkpoint holds.
 pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
-    let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     folder.config().exists()
-        && saved.last().is_some_and(|(_, newest)| {
-            let companion = checkpoint::read_companion(newest).unwrap_or_default();
+        && folder.newest_checkpoint().is_some_and(|(_, newest)| {
+            let companion = checkpoint::read_companion(&newest).unwrap_or_default();
             companion.map_or_else(|| world.is_resumable(), |it| !it.is_empty())
         })
-}
-
-/// The number of updates of the newest checkpoint of the run in `folder`, if it has one.
-pub fn newest_updates(folder: &RunFolder) -> Option<u64> {
-    let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
-    saved.last().map(|(updates, _)| *updates)
 }
 
 /// Prints how to resume a run that was interrupted or failed, if that is possible.

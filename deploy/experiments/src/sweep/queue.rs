@@ -304,7 +304,7 @@ impl Queue {
             return Ok(None);
         }
         resume::wait_until_free(&folder)?;
-        let newest = resume::newest_updates(&folder);
+        let newest = folder.newest_checkpoint().map(|(updates, _)| updates);
         let is_resumable = newest > job.resumed_at
             && self.runs.is_made_by(plan)
             && resume::is_resumable(&plan.call.config()?.world, &folder);

@@ -10,7 +10,6 @@ use std::{
 use anyhow::{Context, bail};
 use driml_launch::{
     checkpoint_choice::read_config,
-    resume::newest_updates,
     run_folder::{Outcome, RunFolder, Summary, read_progress, write_atomically},
 };
 use driml_machine::error::usage;
@@ -82,7 +81,7 @@ impl Runs {
         for (_, plan) in plans {
             let (folder, call) = (self.folder(plan), plan.call.with_seed(1));
             // The queue begins other runs again.
-            let is_used = self.get_finished(plan).is_some() || newest_updates(&folder).is_some();
+            let is_used = self.get_finished(plan).is_some() || folder.newest_checkpoint().is_some();
             if !self.is_made_by(plan) || !is_used {
                 continue;
             }

@@ -156,6 +156,11 @@ impl RunFolder {
         file.is_ok_and(|file| matches!(lock_file::try_lock(&file), Ok(false)))
     }
 
+    /// The updates and the path of the newest checkpoint; none if there is none, or if the checkpoints cannot be listed.
+    pub fn newest_checkpoint(&self) -> Option<(u64, PathBuf)> {
+        checkpoint::list(&self.checkpoints()).ok()?.pop()
+    }
+
     pub(crate) fn check_intact(&self) -> anyhow::Result<()> {
         let files = [self.config(), self.metrics(), self.episodes()];
         // An error of a network file system may be temporary.

@@ -249,7 +249,7 @@ pub fn read_endpoints(folder: &RunFolder) -> anyhow::Result<Vec<String>> {
     let counts =
         |it: Progress| [count(it.frames, "frame"), count(it.episodes, "episode")].join(" and ");
     let saved = || {
-        let updates = resume::newest_updates(folder)?;
+        let (updates, _) = folder.newest_checkpoint()?;
         Some(format!("a checkpoint after {}", count(updates, "update")))
     };
     let so_far = read_progress(folder).map(counts).or_else(saved);

@@ -7,7 +7,6 @@ mod encode;
 
 use std::{
     fs,
-    path::PathBuf,
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
@@ -31,7 +30,7 @@ const MARGIN: usize = 8;
 #[derive(Debug)]
 pub(super) struct Events {
     pub(super) file: AppendLog,
-    checkpoints: PathBuf,
+    folder: RunFolder,
     slow_at: Option<Instant>,
     /// The counts of the last histograms.
     k_counts: Vec<u64>,
@@ -60,7 +59,7 @@ impl Events {
         }
         Ok(Self {
             file: AppendLog::create(&path, &first)?,
-            checkpoints: folder.checkpoints(),
+            folder: folder.clone(),
             slow_at: None,
             k_counts: Vec::new(),
             action_counts: Vec::new(),
@@ -111,7 +110,7 @@ impl Events {
 
     /// Draws A of a new checkpoint. A checkpoint that cannot be read just now is tried again later.
     fn affinity(&mut self, at: EventTime) -> Option<Vec<u8>> {
-        let (updates, path) = checkpoint::list(&self.checkpoints).ok()?.pop()?;
+        let (updates, path) = self.folder.newest_checkpoint()?;
         if self.drawn_updates.is_some_and(|drawn| drawn >= updates) {
             return None;
         }
