@@ -29,7 +29,8 @@ fn derived_settings() -> impl Iterator<Item = (&'static str, &'static str)> {
     lines.flat_map(|(paths, how)| paths.split(' ').map(move |path| (path, how)))
 }
 
-/// The settings that follow from others unless they are set by hand.
+/// The settings that follow from others unless they are set by hand: the number of actors on the epsilon ladder, the visible action to
+/// which each action amounts, and the updates over which beta rises.
 const FOLLOWING: [&str; 3] = [
     "actor.epsilon_ladder.actors",
     "learner.affinity.visible",
@@ -160,9 +161,13 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
         insert(table, path, value);
     }
     fill_in_loss_layers(table, &update);
-    fill_in_visible_actions(table, &config, set);
-    fill_in_ladder_actors(table);
-    fill_in_beta_updates(table);
+    let (ladder_actors, visible) = (ladder_actors(table), visible_actions(table, &config, set));
+    let values = [ladder_actors, visible, beta_updates(table)];
+    for (path, value) in FOLLOWING.into_iter().zip(values) {
+        if let Some(value) = value {
+            insert_missing(table, path, value);
+        }
+    }
     Ok(())
 }
 
@@ -179,46 +184,38 @@ fn fill_in_loss_layers(table: &mut Table, update: &UpdateSettings) {
     }
 }
 
-/// Fills in the number of actors on the epsilon ladder, if there is a ladder and the number is not set.
-fn fill_in_ladder_actors(table: &mut Table) {
-    if find(table, "actor.epsilon_ladder").is_some_and(Value::is_table)
-        && let Some(actors) = find(table, "local.actors").cloned()
-    {
-        insert_missing(table, "actor.epsilon_ladder.actors", actors);
-    }
+/// The actors of the run, if there is an epsilon ladder.
+fn ladder_actors(table: &Table) -> Option<Value> {
+    find(table, "actor.epsilon_ladder")?.as_table()?;
+    find(table, "local.actors").cloned()
 }
 
-/// Fills in the updates over which beta rises, those of the whole run, if rows are drawn by priority and the number is not set.
-fn fill_in_beta_updates(table: &mut Table) {
-    const PATH: &str = "replay.sampling.beta_updates";
-    let rule = find(table, "replay.sampling.rule").and_then(Value::as_str);
-    if rule != Some("prioritised") || find(table, PATH).is_some() {
-        return;
+/// The updates of the whole run, if rows are drawn by priority.
+fn beta_updates(table: &Table) -> Option<Value> {
+    if find(table, "replay.sampling.rule")?.as_str()? != "prioritised" {
+        return None;
     }
     let number = |path| read_optional::<f64>(table, path).ok().flatten();
-    let updates = || {
-        let transitions = number("replay.transitions_max")? - number("replay.warmup_transitions")?;
-        let rows = transitions * number("replay.replay_ratio")?;
-        Some(rows / number("learner.batch_size")?)
-    };
+    let transitions = number("replay.transitions_max")? - number("replay.warmup_transitions")?;
+    let rows = transitions * number("replay.replay_ratio")?;
+    let updates = rows / number("learner.batch_size")?;
     // If a number is missing or not above 0, its own check reports it.
-    if let Some(updates) = updates().filter(|updates| updates.is_finite() && *updates > 0.0) {
-        insert(table, PATH, Value::Integer((updates as i64).max(1)));
-    }
+    let is_number = updates.is_finite() && updates > 0.0;
+    is_number.then(|| Value::Integer((updates as i64).max(1)))
 }
 
-/// Fills in the visible action to which each action amounts, if the affinity's alphabet is `visible` and the map is not set.
-fn fill_in_visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
-    let asked = find(table, "learner.affinity.alphabet").and_then(Value::as_str) == Some("visible");
-    if asked && find(table, "learner.affinity.visible").is_none() {
-        let map = match set {
-            ActionSet::All => world.visible_actions(),
-            // These actions differ already.
-            ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
-        };
-        let map: Vec<_> = map.into_iter().map(i64::from).collect();
-        insert(table, "learner.affinity.visible", map.into());
+/// The visible action to which each action amounts, if the affinity's alphabet is `visible`.
+fn visible_actions(table: &Table, world: &WorldConfig, set: ActionSet) -> Option<Value> {
+    if find(table, "learner.affinity.alphabet")?.as_str()? != "visible" {
+        return None;
     }
+    let map = match set {
+        ActionSet::All => world.visible_actions(),
+        // These actions differ already.
+        ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
+    };
+    let map: Vec<_> = map.into_iter().map(i64::from).collect();
+    Some(map.into())
 }
 
 /// Reads the text of a file that driml wrote. An error if a derived setting differs from what follows from the others.
