@@ -68,15 +68,6 @@ pub struct Flags {
     pub server_alone: bool,
 }
 
-impl Flags {
-    /// The number of replay servers that these flags ask for.
-    pub fn shards(&self) -> u32 {
-        let set = |text: &String| Override::parse(text).ok()?.whole("replay.shards");
-        let set = self.sets.iter().rev().find_map(set);
-        set.or(self.replay_shards).unwrap_or(1)
-    }
-}
-
 /// Returns the settings that the flags ask for, and the name of their source.
 pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
     let (source, from) = match &args.config {

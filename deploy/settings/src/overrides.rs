@@ -34,13 +34,6 @@ impl Override {
         })
     }
 
-    /// The value, if it is a whole number for this path.
-    pub(crate) fn whole(&self, path: &str) -> Option<u32> {
-        let value = as_whole(&self.value).unwrap_or_else(|| self.value.clone());
-        let number = value.as_integer().filter(|_| self.path == path)?;
-        number.try_into().ok()
-    }
-
     /// Puts the value into `table`; returns whether the key is new.
     ///
     /// A new key is accepted in an existing table; the reader of that table decides whether the key is a setting.

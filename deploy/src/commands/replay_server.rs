@@ -50,8 +50,19 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     let mut connection = args.tls.connection(role, namespace, args.connect.clone())?;
     connection.endpoints.listen.clone_from(&args.listen);
     args.run.flags.server_alone = true;
-    keep_capacity(&mut args);
-    let (config, _) = flags::resolve(&args.run, &Machine::detect())?;
+    let machine = Machine::detect();
+    let (mut config, _) = flags::resolve(&args.run, &machine)?;
+    if let (None, Some(dir)) = (&args.run.config, &args.replay_dir)
+        && let Some(capacity) = kept_capacity(dir, args.shard, config.replay.shards)
+    {
+        // An earlier start may have found more free memory, and a smaller replay would delete transitions.
+        let dir = dir.display();
+        tracing::info!("the replay in {dir} holds up to {capacity} transitions");
+        let kept = format!("replay.capacity_transitions={capacity}");
+        // First, so that the user's own --set replaces it.
+        args.run.flags.sets.insert(0, kept);
+        (config, _) = flags::resolve(&args.run, &machine)?;
+    }
     let (shard, shards) = (args.shard, config.replay.shards);
     if shard >= shards {
         let shards = count(shards, "replay shard");
@@ -87,22 +98,4 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         Some(PersistError::Unusable(..)) => usage!("{e:#}").into(),
         _ => e,
     }))
-}
-
-/// Keeps the capacity of the log in the replay's folder, unless the user sets one: an earlier start may have found more free memory, and a
-/// smaller replay would delete transitions.
-fn keep_capacity(args: &mut ReplayServerArgs) {
-    let flags = &mut args.run.flags;
-    if let (None, Some(dir)) = (&args.run.config, &args.replay_dir)
-        && let Some(capacity) = kept_capacity(dir, args.shard, flags.shards())
-    {
-        tracing::info!(
-            "the replay in {} holds up to {capacity} transitions",
-            dir.display()
-        );
-        // First, so that the user's own --set replaces it.
-        flags
-            .sets
-            .insert(0, format!("replay.capacity_transitions={capacity}"));
-    }
 }
