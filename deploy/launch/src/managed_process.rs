@@ -186,7 +186,7 @@ pub fn ask_to_stop(child: &Child, name: &str) {
     }
 }
 
-/// Waits for processes to end, after SIGTERM to each if `ask`. Kills those that do not end in time, and reports failures. A process
+/// Waits for processes to end, after SIGTERM to each if `send_sigterm`. Kills those that do not end in time, and reports failures. A process
 /// that receives SIGTERM before it listens for signals dies of it, which is not a failure: it has nothing to save.
 pub(crate) fn stop_processes<'a>(
     processes: impl IntoIterator<Item = &'a mut ManagedProcess>,

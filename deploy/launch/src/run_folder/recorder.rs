@@ -138,7 +138,7 @@ impl RunRecorder {
         self.before_replay.seconds + self.started.elapsed().as_secs_f64()
     }
 
-    /// Records the episodes that ended since the last call. `ask(shard, count)` requests the episodes of a shard after the first
+    /// Records the episodes that ended since the last call. `fetch(shard, count)` requests the episodes of a shard after the first
     /// `count`; none if the shard does not answer. Returns warnings as [`Self::record`] does; call that method next.
     pub(crate) fn record_episodes(
         &mut self,
