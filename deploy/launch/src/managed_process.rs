@@ -35,7 +35,8 @@ pub struct ManagedProcess {
     pub name: String,
     child: Child,
     started: Instant,
-    pub(crate) log: ProcessLog,
+    /// The log that this process writes for the child; none if the child's output goes elsewhere.
+    pub(crate) log: Option<ProcessLog>,
 }
 
 /// The environment variable that sets the number of threads that a process uses for arithmetic.
@@ -58,8 +59,18 @@ pub fn program_command(args: &[impl AsRef<OsStr>], threads: u32) -> Command {
 }
 
 impl ManagedProcess {
-    /// Starts a process in its own process group, so that Ctrl-C does not reach it. Its log is written into the folder `logs`, and its
-    /// warnings are shown on `screen`.
+    /// Starts a process in its own process group, so that Ctrl-C does not reach it.
+    pub fn spawn(name: &str, mut command: Command) -> anyhow::Result<Self> {
+        let child = command.process_group(0).spawn();
+        Ok(Self {
+            name: name.into(),
+            child: child.with_context(|| format!("starting {name}"))?,
+            started: Instant::now(),
+            log: None,
+        })
+    }
+
+    /// [`Self::spawn`] with a log, which is written into the folder `logs`. The process's warnings are shown on `screen`.
     pub fn start(
         name: &str,
         mut command: Command,
@@ -67,21 +78,13 @@ impl ManagedProcess {
         screen: &Screen,
     ) -> anyhow::Result<Self> {
         let mut log = ProcessLog::open(name, logs)?;
-        let mut child = command
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .process_group(0)
-            .spawn()
-            .with_context(|| format!("starting {name}"))?;
-        let pipes = (child.stdout.take(), child.stderr.take());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut process = Self::spawn(name, command)?;
+        let pipes = (process.child.stdout.take(), process.child.stderr.take());
         log.follow(pipes.0.expect("it is piped"), screen)?;
         log.follow(pipes.1.expect("it is piped"), screen)?;
-        Ok(Self {
-            name: name.into(),
-            child,
-            started: Instant::now(),
-            log,
-        })
+        process.log = Some(log);
+        Ok(process)
     }
 
     /// Whether the process ended in a way that a restart may fix: it exited in order, a signal other than SIGABRT killed it, or it
@@ -108,8 +111,12 @@ impl ManagedProcess {
 
     /// Asks the process to drain and exit.
     pub fn ask_to_stop(&mut self) {
-        if self.exit_status().is_none() {
-            ask_to_stop(&self.child, &self.name);
+        if self.exit_status().is_some() {
+            return;
+        }
+        // Nothing else waits for the child, so its PID cannot belong to another process yet.
+        if let Err(e) = kill(Pid::from_raw(self.child.id() as i32), Signal::SIGTERM) {
+            tracing::debug!("asking {} to stop: {e}", self.name);
         }
     }
 
@@ -130,8 +137,8 @@ impl ManagedProcess {
             std::thread::sleep(POLL);
         }
         let status = self.exit_status();
-        if status.is_some() {
-            self.log.finish();
+        if let (Some(_), Some(log)) = (status, &mut self.log) {
+            log.finish();
         }
         status
     }
@@ -157,8 +164,10 @@ impl ManagedProcess {
             }
             Some((None, None)) => "exited".into(),
         };
-        let (name, log, last) = (&self.name, self.log.path.display(), self.log.last_lines());
-        format!("{name} {how} (log: {log}){last}")
+        let log = self.log.as_ref().map_or(String::new(), |log| {
+            format!(" (log: {}){}", log.path.display(), log.last_lines())
+        });
+        format!("{} {how}{log}", self.name)
     }
 }
 
@@ -178,17 +187,9 @@ pub(crate) fn is_orderly_exit(status: ExitStatus) -> bool {
     status.success() || status.code() == Some(EXIT_INTERRUPTED.into())
 }
 
-/// Asks a child process to drain and exit. The child must not have been waited for yet.
-pub fn ask_to_stop(child: &Child, name: &str) {
-    // No caller has waited for the child, so its PID cannot belong to another process yet.
-    if let Err(e) = kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM) {
-        tracing::debug!("asking {name} to stop: {e}");
-    }
-}
-
 /// Waits for processes to end, after SIGTERM to each if `send_sigterm`. Kills those that do not end in time, and reports failures. A process
 /// that receives SIGTERM before it listens for signals dies of it, which is not a failure: it has nothing to save.
-pub(crate) fn stop_processes<'a>(
+pub fn stop_processes<'a>(
     processes: impl IntoIterator<Item = &'a mut ManagedProcess>,
     send_sigterm: bool,
     drain_max: Duration,

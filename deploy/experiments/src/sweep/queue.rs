@@ -5,14 +5,13 @@
 use std::{
     collections::VecDeque,
     fs::File,
-    os::unix::process::CommandExt,
-    process::{Child, Command, ExitStatus, Stdio},
-    time::{Duration, Instant},
+    process::{Command, ExitStatus, Stdio},
+    time::Duration,
 };
 
 use anyhow::Context;
 use driml_launch::{
-    managed_process::{ask_to_stop, exit_with_parent_flags},
+    managed_process::{ManagedProcess, exit_with_parent_flags, stop_processes},
     resume::{self, Resumption},
     run_folder::{Progress as RunProgress, read_progress},
 };
@@ -125,7 +124,7 @@ impl Job {
 
 struct RunningJob {
     job: Job,
-    child: Child,
+    process: ManagedProcess,
     done: u64,
     /// Whether the run is long enough and was asked to stop.
     has_enough: bool,
@@ -162,10 +161,9 @@ impl Queue {
             progress.advance(new_units)?;
             if has_enough && !running.has_enough {
                 running.has_enough = true;
-                ask_to_stop(&running.child, &running.job.plan.name);
+                running.process.ask_to_stop();
             }
-            let ended = running.child.try_wait();
-            match ended.with_context(|| format!("waiting for {}", running.job.plan.name))? {
+            match running.process.exit_status() {
                 None => at += 1,
                 Some(status) => {
                     let ended = self.running.remove(at);
@@ -260,17 +258,15 @@ impl Queue {
         command
             .stdin(Stdio::null())
             .stdout(log.try_clone().with_context(doing)?)
-            .stderr(log)
-            .process_group(0);
-        let starting = || format!("starting the run {}", plan.name);
-        let child = command.spawn().with_context(starting)?;
+            .stderr(log);
+        let process = ManagedProcess::spawn(&format!("the run {}", plan.name), command)?;
         let found = resumed.then(|| self.count_earlier_work(plan, progress));
         let done = found.unwrap_or(0);
         job.tries += 1;
         job.resumed_at = resumed_at;
         Ok(Some(RunningJob {
             job,
-            child,
+            process,
             done,
             has_enough: false,
         }))
@@ -330,21 +326,10 @@ impl Queue {
             return;
         }
         progress.line("stopping the runs; the same command resumes those that are not finished");
-        for running in &self.running {
-            ask_to_stop(&running.child, &running.job.plan.name);
-        }
-        let deadline = Instant::now() + DRAIN_MAX;
-        let is_over = || progress.shutdown.immediate.is_set() || Instant::now() > deadline;
-        while !self.running.is_empty() && !is_over() {
-            let is_running = |it: &mut RunningJob| matches!(it.child.try_wait(), Ok(None));
-            self.running.retain_mut(is_running);
-            std::thread::sleep(POLL);
-        }
-        for running in &mut self.running {
-            // The child may have exited by itself in the meantime.
-            let _ = running.child.kill();
-            let _ = running.child.wait();
-        }
+        let processes = self.running.iter_mut().map(|it| &mut it.process);
+        let abort = || progress.shutdown.immediate.is_set();
+        stop_processes(processes, true, DRAIN_MAX, &abort);
+        self.running.clear();
     }
 }
 

@@ -23,6 +23,7 @@ use crate::{
     last_play,
     managed_process::{ManagedProcess, stop_processes},
     open_files,
+    process_log::ProcessLog,
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_atomically},
@@ -311,7 +312,8 @@ impl Launch<'_> {
         if !view.shards.is_empty() {
             self.recorder.record(view, &[]);
         }
-        let logs = self.processes.iter().filter_map(|it| it.log.loss_message());
+        let logs = self.processes.iter().filter_map(|it| it.log.as_ref());
+        let logs = logs.filter_map(ProcessLog::loss_message);
         let missing = console::join_losses(self.recorder.loss_messages().into_iter().chain(logs));
         missing.iter().for_each(|line| console::eprintln(line));
         let mut summary = self.recorder.summarise(outcome, view);
