@@ -27,6 +27,7 @@ use driml_settings::{
 };
 
 use crate::{
+    checkpoint_choice::read_config,
     console, rendezvous,
     run_folder::{Outcome, ResumePoint, RunFolder, Summary},
 };
@@ -221,15 +222,11 @@ fn check_changes(
 /// # Errors
 /// The folder is not a run's, the settings cannot work, it has no checkpoint, or the run is still running.
 pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> {
-    let path = folder.config();
-    let name = path.display().to_string();
-    let text = std::fs::read_to_string(&path).map_err(|e| {
-        usage!("reading the settings {name}: {e}; --resume takes the folder of a run")
-    })?;
-    // Wait first: a run that is still exiting holds memory.
+    let before = read_config(folder)?;
+    // A run that is still exiting holds memory.
     wait_until_free(folder)?;
-    let before = RunConfig::parse(&name, &text)?;
-    let mut config = Source::File(name, text).resolve(flags, &Machine::detect())?;
+    let source = Source::File(folder.config().display().to_string(), before.to_toml());
+    let mut config = source.resolve(flags, &Machine::detect())?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
     let (_, newest) = all.last().with_context(|| {
