@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use driml_machine::error::Usage;
 
 use super::*;
-use crate::sweep::plan::TrainCall;
+use crate::sweep::TrainCall;
 
 struct Runs(tempfile::TempDir);
 

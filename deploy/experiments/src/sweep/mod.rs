@@ -2,9 +2,16 @@
 //! keeps each run beside the call that made it; `queue` makes the missing runs; `results` plays with their weights; `command` is
 //! `driml sweep`. Each sweep that plans runs decides what they mean and what follows from all of them.
 
-pub(crate) mod axes;
+mod axes;
 pub(crate) mod command;
-pub(crate) mod plan;
-pub(crate) mod queue;
-pub(crate) mod results;
-pub(crate) mod runs;
+mod plan;
+mod queue;
+mod results;
+mod runs;
+
+pub(crate) use self::{
+    plan::{FinishedRun, PlannedRun, PointPlan, PointRun, TrainCall, install_worlds},
+    queue::run_all,
+    results::PlaySettings,
+    runs::Runs,
+};

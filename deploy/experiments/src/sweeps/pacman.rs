@@ -18,7 +18,7 @@ use crate::{
     flags::PacmanArgs,
     plot::{Band, combine_seeds, smooth},
     stats::Spread,
-    sweep::{plan::install_worlds, queue},
+    sweep::{install_worlds, run_all},
 };
 
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
@@ -30,7 +30,7 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let report = args.queue.report;
     install_worlds(&plans, report)?;
     let mut session = Session::open("pacman", &args.flags, &settings, 0, report)?;
-    let made = queue::run_all(&mut session, plans, settings.jobs)?;
+    let made = run_all(&mut session, plans, settings.jobs)?;
     session.check_has_runs(&made)?;
     let results = Results::read(settings, made)?;
     session.save_figure("fig3", &figure(&results))?;

@@ -22,10 +22,7 @@ use crate::{
         Spread, mean,
         over_games::{Scores, improvement_chance, iqm},
     },
-    sweep::{
-        plan::{FinishedRun, PlannedRun, PointRun, install_worlds},
-        queue,
-    },
+    sweep::{FinishedRun, PlannedRun, PointRun, install_worlds, run_all},
     sweeps::published::{normalise, paper_return},
 };
 
@@ -46,7 +43,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let report = args.queue.report;
     install_worlds(&plans, report)?;
     let mut session = Session::open("procgen", &args.flags, &settings, units, report)?;
-    let made = queue::run_all(&mut session, plans, settings.jobs)?;
+    let made = run_all(&mut session, plans, settings.jobs)?;
     session.check_has_runs(&made)?;
     let mut scored = Vec::new();
     for PointRun { point, plan, run } in made {

@@ -30,12 +30,7 @@ use crate::{
     page::fill,
     plot::Run,
     stats::Spread,
-    sweep::{
-        plan::{FinishedRun, PointPlan, PointRun, install_worlds},
-        queue,
-        results::PlaySettings,
-        runs::Runs,
-    },
+    sweep::{FinishedRun, PlaySettings, PointPlan, PointRun, Runs, install_worlds, run_all},
 };
 
 /// The piece with the list of command lines that made runs in this folder.
@@ -249,7 +244,7 @@ impl Tradeoff {
         let common = self.settings.common.clone();
         // An interrupt keeps the runs that are finished.
         let commands = self.record_command()?;
-        let made = queue::run_all(&mut self.session, wanted, common.jobs)?;
+        let made = run_all(&mut self.session, wanted, common.jobs)?;
         let play = PlaySettings {
             levels: Levels::Train,
             checkpoints: 1,

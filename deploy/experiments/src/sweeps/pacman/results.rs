@@ -6,7 +6,7 @@ use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
     stats::{mean, rank_correlation},
-    sweep::plan::PointRun,
+    sweep::PointRun,
 };
 
 /// The DIM losses of the preset: the column of the metrics, and the kind of features that the loss compares.

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     flags::{self, PacmanArgs, expand_unique},
-    sweep::plan::{PlannedRun, PointPlan, TrainCall},
+    sweep::{PlannedRun, PointPlan, TrainCall},
 };
 
 /// The approximate number of frames of an episode, used only to estimate the time left.

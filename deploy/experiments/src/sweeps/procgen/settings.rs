@@ -8,10 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     flags::{self, ProcgenArgs, expand_unique},
-    sweep::{
-        plan::{PlannedRun, PointPlan, TrainCall},
-        results::PlaySettings,
-    },
+    sweep::{PlannedRun, PlaySettings, PointPlan, TrainCall},
 };
 
 const SETTINGS: &str = include_str!("../procgen.toml");

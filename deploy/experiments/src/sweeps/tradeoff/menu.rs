@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     flags::TradeoffArgs,
-    sweep::plan::{PlannedRun, TrainCall},
+    sweep::{PlannedRun, TrainCall},
 };
 
 /// A base has this many times the seeds of a level. All levels are compared with it, so chance in the base affects all differences.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::menu::{Common, Dial, DialLevel, Point};
 use crate::{
     stats::{Interval, difference, interval, mean},
-    sweep::plan::FinishedRun,
+    sweep::FinishedRun,
 };
 
 /// Numbers of the benchmark, or errors against the reference, by their column names in the data.
