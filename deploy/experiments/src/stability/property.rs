@@ -129,34 +129,30 @@ impl Property {
     /// Returns a row for each promise at each kind of extreme of which some seed has cases. For a promise without any case it adds one row,
     /// which counts as not kept.
     pub(super) fn rows(&self, seeds: Vec<Vec<Tally>>) -> Vec<Row> {
-        let row = |extreme: &str, is_drawn, (promise, bound), tally| Row {
+        let row = |extreme: &str, is_drawn, (promise, bound)| Row {
             routine: self.routine,
             range: self.range,
             extreme: extreme.to_owned(),
             is_drawn,
             promise,
             bound,
-            tally,
+            tally: Tally::default(),
         };
-        let mut totals = vec![Tally::default(); self.checks.len() * self.promises.len()];
-        for tallies in seeds {
-            assert_eq!(tallies.len(), totals.len(), "each seed has all rows");
-            for (total, tally) in totals.iter_mut().zip(tallies) {
-                total.add(tally.cases, tally.worst, || tally.input);
-            }
-        }
-        let of_checks = totals.chunks(self.promises.len());
         let mut rows = Vec::new();
-        for ((extreme, inputs, _), tallies) in self.checks.iter().zip(of_checks) {
+        for (extreme, inputs, _) in &self.checks {
             let is_drawn = matches!(inputs, Drawn(_));
-            for (&promise, tally) in self.promises.iter().zip(tallies) {
-                rows.push(row(extreme, is_drawn, promise, tally.clone()));
+            rows.extend(self.promises.iter().map(|&it| row(extreme, is_drawn, it)));
+        }
+        for tallies in seeds {
+            assert_eq!(tallies.len(), rows.len(), "each seed has all rows");
+            for (row, tally) in rows.iter_mut().zip(tallies) {
+                row.tally.add(tally.cases, tally.worst, || tally.input);
             }
         }
         rows.retain(|row| row.tally.cases > 0);
         for &promise in &self.promises {
             if rows.iter().all(|it| it.promise != promise.0) {
-                rows.push(row("none was tried", false, promise, Tally::default()));
+                rows.push(row("none was tried", false, promise));
             }
         }
         rows
