@@ -81,12 +81,8 @@ fn verdict(rows: &[Row]) -> String {
 
 fn page_values(rows: &[Row], settings: &Settings) -> Value {
     let broken = rows.iter().filter(|row| !row.is_kept()).map(|row| {
-        let (worst, bound) = (format_number(row.tally.worst), format_number(row.bound));
-        let (routine, extreme, promise) = (row.routine, &row.extreme, row.promise);
-        let input = &row.tally.input;
-        format!(
-            "**Not kept**: {routine}, {extreme}: {promise}: {worst}, promised {bound}; at {input}."
-        )
+        let [worst, bound] = [row.tally.worst, row.bound].map(format_number);
+        context! { row, worst, bound }
     });
     // Rows with a bound above 0, sorted by the share of the bound that is used.
     let share = |row: &Row| 100.0 * row.tally.worst / row.bound;

@@ -160,7 +160,7 @@ impl Property {
 }
 
 /// The result of one promise at one kind of extreme.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Row {
     pub(super) routine: &'static str,
     pub(super) range: &'static str,
