@@ -7,10 +7,7 @@ use driml_model::{conv2d_relu, multiply_in_first_cache};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{
-    learner::work_and_gflop,
-    report::{Bench, with_precision},
-};
+use crate::{learner::work_and_gflop, report::Bench};
 
 const ROWS: usize = 256;
 /// Side and channels of the maps of each stage, which has as many input channels as output channels.
@@ -22,8 +19,7 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let meter = bench.meter;
     for precision in bench.flags.precisions(DeviceName::Cpu) {
         let mut record = |what: &str, gflop: f64, calls: f64| {
-            let figures = &mut bench.figures;
-            figures.record(with_precision(what, precision), gflop * calls, "GFLOP/s");
+            bench.record(what, precision, gflop * calls, "GFLOP/s");
         };
         let gflop = multiply_in_first_cache(precision, TILES) / 1e9;
         let calls = meter.rate_by_median(|| Ok(multiply_in_first_cache(precision, TILES)))?;

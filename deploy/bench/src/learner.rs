@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     flags::BenchLearnerArgs,
-    report::{Bench, with_precision},
+    report::Bench,
     settings::{self, AGENT, WORLD},
 };
 
@@ -76,10 +76,7 @@ fn paper(
     bench: &mut Bench<'_>,
 ) -> anyhow::Result<()> {
     let meter = bench.meter;
-    let mut record = |what: &str, rate| {
-        let figures = &mut bench.figures;
-        figures.record(with_precision(what, precision), rate, "updates/s");
-    };
+    let mut record = |what: &str, rate| bench.record(what, precision, rate, "updates/s");
     for case in CASES.lines() {
         let words: Vec<&str> = case.split('|').collect();
         let (name, sets) = (words[0], &words[3..]);
@@ -119,10 +116,9 @@ fn growth(precision: Precision, compute: &Compute, bench: &mut Bench<'_>) -> any
         let (work, gflop) = work_and_gflop(AGENT, &sets, compute)?;
         let rate = bench.meter.rate_by_median(work)?;
         let name = format!("{name}: {gflop:.2} GFLOP");
-        let (what, figures) = (with_precision(&name, precision), &mut bench.figures);
-        figures.record(what, rate, "updates/s");
-        let what = with_precision(&format!("{name}, arithmetic"), precision);
-        figures.record(what, rate * gflop, "GFLOP/s");
+        bench.record(&name, precision, rate, "updates/s");
+        let what = format!("{name}, arithmetic");
+        bench.record(&what, precision, rate * gflop, "GFLOP/s");
     }
     Ok(())
 }

@@ -6,10 +6,7 @@ use driml_model::{Parameters, PolicyNetwork};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{
-    report::{Bench, with_precision},
-    settings,
-};
+use crate::{report::Bench, settings};
 
 const BATCHES: [usize; 2] = [32, 256];
 /// The name of each network in figures, its preset, and further settings.
@@ -36,8 +33,8 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
                     policy.greedy_actions(&frames, &mut actions)?;
                     Ok(())
                 })?;
-                let name = with_precision(&format!("{batch} frames of {network}"), precision);
-                bench.figures.record(name, rate * batch as f64, "frames/s");
+                let name = format!("{batch} frames of {network}");
+                bench.record(&name, precision, rate * batch as f64, "frames/s");
             }
         }
     }

@@ -23,6 +23,17 @@ pub(super) struct Bench<'a> {
     pub(super) table: Option<String>,
 }
 
+impl Bench<'_> {
+    /// Records a figure in a precision, which its name ends with if it is not f32.
+    pub(super) fn record(&mut self, what: &str, precision: Precision, value: f64, unit: &str) {
+        let what = match precision {
+            Precision::F32 => what.to_owned(),
+            other => format!("{what}, {other}"),
+        };
+        self.figures.record(what, value, unit);
+    }
+}
+
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Measurement {
     /// What was measured; unique in its bench.
@@ -63,14 +74,6 @@ impl Figures {
             ..figure
         };
         self.0.into_iter().map(median_of).collect()
-    }
-}
-
-/// Returns `what`, followed by the precision if that is not f32.
-pub(super) fn with_precision(what: &str, precision: Precision) -> String {
-    match precision {
-        Precision::F32 => what.to_owned(),
-        other => format!("{what}, {other}"),
     }
 }
 
