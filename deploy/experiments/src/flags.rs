@@ -66,7 +66,7 @@ pub struct PacmanArgs {
     pub(crate) queue: QueueFlags,
     /// Agents of (b) and (c) [default: c51,driml-fix]; the others are compared with the first
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
-    pub(crate) agents: Vec<String>,
+    pub(crate) agents: Option<Vec<String>>,
     /// Frames per run of (a), random ghosts
     #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
@@ -84,10 +84,10 @@ pub struct ProcgenArgs {
     pub(crate) queue: QueueFlags,
     /// Games, such as bigfish,starpilot, or all [default: all]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
-    pub(crate) games: Vec<String>,
+    pub(crate) games: Option<Vec<String>>,
     /// Agents, or all [default: c51,driml-ada]; driml-fix and driml-noact also with a k, as in driml-noact-k5
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
-    pub(crate) agents: Vec<String>,
+    pub(crate) agents: Option<Vec<String>>,
     /// Frames per run [default: 1000000]; the paper has 50000000
     #[arg(long, value_name = "N", value_parser = whole_number::within(500..=1_000_000_000))]
     pub(crate) frames: Option<u64>,

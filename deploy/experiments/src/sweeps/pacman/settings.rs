@@ -135,11 +135,10 @@ impl Settings {
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
     let mut settings: Settings = flags::read_settings(text, &args.flags);
-    if !args.agents.is_empty() {
-        settings.agents = expand_unique(&args.agents, |name| {
-            Ok(vec![presets::agent(name)?.name.to_owned()])
-        })?;
-    }
+    let agents = args.agents.as_ref().unwrap_or(&settings.agents);
+    settings.agents = expand_unique(agents, |name| {
+        Ok(vec![presets::agent(name)?.name.to_owned()])
+    })?;
     settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
     settings.sets.extend(args.queue.sets.iter().cloned());
     let predictability = &mut settings.predictability;

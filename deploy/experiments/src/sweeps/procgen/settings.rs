@@ -50,14 +50,8 @@ pub(super) struct Point {
 impl Settings {
     pub(super) fn from_args(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self = flags::read_settings(SETTINGS, &args.flags);
-        if !args.games.is_empty() {
-            settings.games.clone_from(&args.games);
-        }
-        if !args.agents.is_empty() {
-            settings.agents.clone_from(&args.agents);
-        }
-        settings.games = resolve_worlds(&settings.games)?;
-        settings.agents = resolve_agents(&settings.agents)?;
+        settings.games = resolve_worlds(args.games.as_ref().unwrap_or(&settings.games))?;
+        settings.agents = resolve_agents(args.agents.as_ref().unwrap_or(&settings.agents))?;
         settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
         settings.frames = args.frames.unwrap_or(settings.frames);
         settings.episodes = args.episodes.unwrap_or(settings.episodes);
