@@ -40,7 +40,7 @@ pub struct Heat {
     pub labels: (String, String),
     /// The label beside the scale: what a value means, with its unit.
     pub unit: String,
-    /// The ends of the scale.
+    /// The ends of the scale, the first below the second.
     pub range: (f64, f64),
     /// The number of decimals of values written into cells that are large enough; `None` writes no values.
     pub decimals: Option<usize>,
@@ -51,29 +51,21 @@ pub struct Heat {
 }
 
 impl Heat {
-    /// Creates a heat map without names.
+    /// Creates a heat map without names, whose scale is from 0 to 1.
     pub fn new(title: &str, side: usize, values: Vec<f64>) -> Self {
         assert_eq!(values.len(), side * side, "a square matrix");
         Self {
             title: title.to_owned(),
             side,
             values,
+            range: (0.0, 1.0),
             ..Self::default()
-        }
-    }
-
-    /// Returns the ends of the scale, or others where those span no length.
-    fn value_range(&self) -> (f64, f64) {
-        match self.range {
-            (low, high) if !(low.is_finite() && high.is_finite()) => (0.0, 1.0),
-            (low, high) if high > low => (low, high),
-            (low, _) => (low, low + 1.0),
         }
     }
 
     pub(super) fn draw(&self, canvas: &mut Canvas, area: Rect) {
         let area = draw_title(canvas, area, &self.title);
-        let (low, high) = self.value_range();
+        let (low, high) = self.range;
         let bar_ticks = ticks::linear(low, high, 5);
         let bar_labels = ticks::labels(&bar_ticks);
         let bar_labels_width = font::max_width(&bar_labels, TICK_SIZE);
@@ -107,7 +99,7 @@ impl Heat {
             }
             None => map,
         };
-        self.draw_cells(canvas, cells, cells.width / self.side as f64, (low, high));
+        self.draw_cells(canvas, cells);
         self.draw_names(canvas, map, cell, rotated);
         let style = text_style(LABEL_SIZE, Anchor::Middle).cut_at(map_side);
         let y = map.bottom() + names_below + LABEL_SIZE + 3.0;
@@ -136,7 +128,8 @@ impl Heat {
         canvas.text((far, bar.y + map_side / 2.0), &self.unit, style.upright());
     }
 
-    fn draw_cells(&self, canvas: &mut Canvas, map: Rect, cell: f64, (low, high): (f64, f64)) {
+    fn draw_cells(&self, canvas: &mut Canvas, map: Rect) {
+        let ((low, high), cell) = (self.range, map.width / self.side as f64);
         for (index, value) in self.values.iter().enumerate() {
             let (row, column) = (index / self.side, index % self.side);
             let (x, y) = (map.x + column as f64 * cell, map.y + row as f64 * cell);
