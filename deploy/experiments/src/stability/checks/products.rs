@@ -13,34 +13,26 @@ const DRAWN: &str = "fully connected, results and gradients, drawn";
 const MAPS: &str = "convolution with ReLU, results and gradients, on floats and bytes, drawn";
 const PROCGEN: &str = "both at the sizes of Procgen's network, 32 images, and of DIM's heads";
 const SPOILT: &str = "one operand infinite or not a number, before and after ReLU";
-
 const BEYOND: &str = "products beyond 3.4e38, all of one sign";
-
-const EXTREMES: [(&str, Inputs, Check); 6] = [
-    (SIZES, Listed, dense_by_size),
-    (DRAWN, Drawn(0.02), dense),
-    (MAPS, Drawn(0.02), convolution),
-    (PROCGEN, Listed, layers_of_procgen),
-    (SPOILT, Drawn(0.02), spoilt),
-    (BEYOND, Drawn(0.01), infinite),
-];
-type Check = fn(&mut Cases<'_>, Precision) -> anyhow::Result<()>;
 
 pub(super) fn properties() -> Vec<Property> {
     let finite = "operands finite, the sum of their products' sizes below 3.4e38";
     let in_bf16 = "operands within 3.38e38, the sum of their products' sizes below 3.3e38";
-    let properties = [
-        (Precision::F32, Property::new("products, f32", finite)),
-        (Precision::Bf16, Property::new("products, bf16", in_bf16)),
-    ];
-    let properties = properties.into_iter().map(|(precision, mut property)| {
-        property = property.promise(PRODUCT, 1.0).promise(HIDDEN, 0.0);
-        for (extreme, inputs, check) in EXTREMES {
-            property = property.check(extreme, inputs, move |cases| check(cases, precision));
-        }
-        property
-    });
-    properties.collect()
+    let property = |routine, range, precision| {
+        Property::new(routine, range)
+            .promise(PRODUCT, 1.0)
+            .promise(HIDDEN, 0.0)
+            .check(SIZES, Listed, move |it| dense_by_size(it, precision))
+            .check(DRAWN, Drawn(0.02), move |it| dense(it, precision))
+            .check(MAPS, Drawn(0.02), move |it| convolution(it, precision))
+            .check(PROCGEN, Listed, move |it| procgen_layers(it, precision))
+            .check(SPOILT, Drawn(0.02), move |it| spoilt(it, precision))
+            .check(BEYOND, Drawn(0.01), move |it| infinite(it, precision))
+    };
+    vec![
+        property("products, f32", finite, Precision::F32),
+        property("products, bf16", in_bf16, Precision::Bf16),
+    ]
 }
 
 /// The layers of Procgen's network and of DIM's heads.
@@ -265,7 +257,7 @@ fn convolution(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()
     layer.record_errors(cases, precision, &mut { draw_moderate })
 }
 
-fn layers_of_procgen(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+fn procgen_layers(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let layer = cases.one_of(&LAYERS);
     let mut draw = cases.one_of(&[uniform as fn(_, &mut _) -> _, draw_moderate]);
     layer.record_errors(cases, precision, &mut draw)
