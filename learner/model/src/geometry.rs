@@ -102,8 +102,9 @@ impl ConvShape {
         self.kernel * self.kernel * self.channels_in * self.channels_out
     }
 
-    pub(crate) fn parameters_len(&self) -> usize {
-        self.weight_len() + self.channels_out
+    /// The numbers of scalars in the weight and in the bias.
+    pub(crate) fn parameter_lens(&self) -> [usize; 2] {
+        [self.weight_len(), self.channels_out]
     }
 }
 

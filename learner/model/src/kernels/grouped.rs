@@ -97,9 +97,8 @@ impl GroupedLinear {
     ) {
         let mut tasks = Vec::with_capacity(self.ranges.len());
         for rows in &self.ranges {
-            let (own, rest) = std::mem::take(&mut values).split_at_mut(rows.len() * len);
-            tasks.push((rows, own));
-            values = rest;
+            let own = values.split_off_mut(..rows.len() * len);
+            tasks.push((rows, own.expect("the groups' rows are those of the values")));
         }
         let tasks = tasks.into_par_iter().enumerate();
         tasks.for_each(|(group, (rows, values))| each(group, rows, values));

@@ -135,6 +135,8 @@ pub(crate) struct Tape<E: Element> {
     argmax: Buffer<u8>,
 }
 
+const WHOLE_TAPE: &str = "a tape has a part for each convolution and each pool";
+
 impl<S: Simd> Stages<S> {
     /// Prepares stages of convolutions with these shapes. `parameters` holds each one's weight
     /// [out, in, 3, 3], then its bias [out]. `backward` says whether a backward pass follows.
@@ -196,6 +198,10 @@ impl<S: Simd> Stages<S> {
         f3: &mut [f32],
     ) {
         let simd = self.simd;
+        let mut take_input = |conv: &BorderedConvolution<S::Element>| {
+            let len = conv.shape().bordered_len::<S::Element>();
+            inputs.split_off_mut(..len).expect(WHOLE_TAPE)
+        };
         let mut first = Buffer::new(self.convolutions[0].shape().bordered_len::<S::Element>());
         let mut x = Buffer::<f32>::new(0);
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
@@ -204,7 +210,7 @@ impl<S: Simd> Stages<S> {
             let (input, scale) = if stage == 0 {
                 (&mut *first, S::Element::BYTE_SCALE)
             } else {
-                (take_input(conv, &mut inputs), 1.0)
+                (take_input(conv), 1.0)
             };
             conv.shape().write_interior(input, |from, to| match stage {
                 0 => store_bytes(simd, &image[from], to),
@@ -216,16 +222,15 @@ impl<S: Simd> Stages<S> {
                 add_bias(simd, row, scale, conv.bias(), to);
             });
             x = Buffer::new(pooled_len(conv));
-            let (own, rest) = std::mem::take(&mut argmax).split_at_mut(x.len());
-            argmax = rest;
+            let own = argmax.split_off_mut(..x.len()).expect(WHOLE_TAPE);
             pool(simd, &maps, conv.shape().output(), &mut x, own);
             for block in blocks {
                 let (conv1, conv2) = (&block[0], &block[1]);
-                let x1 = take_input(conv1, &mut inputs);
+                let x1 = take_input(conv1);
                 conv1
                     .shape()
                     .write_interior(x1, |from, to| store_relu(simd, &x[from], to));
-                let x2 = take_input(conv2, &mut inputs);
+                let x2 = take_input(conv2);
                 conv2.shape().clear_border(x2);
                 conv1.forward(simd, x1, |y, row| {
                     let to = &mut x2[conv2.shape().interior_row(y)];
@@ -285,13 +290,17 @@ impl<S: Simd> Stages<S> {
                 let own = sums.pop().expect("each convolution has sums");
                 conv.parameter_gradients(simd, input, grad, own);
             };
+        let mut take_input = |conv: &BorderedConvolution<S::Element>| {
+            let first = inputs.len() - conv.shape().bordered_len::<S::Element>();
+            inputs.split_off(first..).expect(WHOLE_TAPE)
+        };
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate().rev() {
             let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
             for block in blocks.rev() {
                 let (conv1, conv2) = (&block[0], &block[1]);
-                let x2 = take_last_input(conv2, &mut inputs);
-                let x1 = take_last_input(conv1, &mut inputs);
+                let x2 = take_input(conv2);
+                let x1 = take_input(conv1);
                 add_gradients(conv2, x2, &grad);
                 let mut grad_x2 = Buffer::<f32>::new(conv1.shape().map_len());
                 conv2.image_gradient(simd, &grad, |y, row| {
@@ -304,8 +313,8 @@ impl<S: Simd> Stages<S> {
                     add_relu_backward(simd, &x1[conv1.shape().interior_row(y)], row, to);
                 });
             }
-            let own;
-            (argmax, own) = split_tail(argmax, grad.len());
+            let first = argmax.len() - grad.len();
+            let own = argmax.split_off(first..).expect(WHOLE_TAPE);
             let mut grad_maps = Buffer::zeros(conv.shape().map_len());
             unpool(simd, &grad, conv.shape().output(), own, &mut grad_maps);
             if stage == 0 {
@@ -317,7 +326,7 @@ impl<S: Simd> Stages<S> {
                 add_gradients(conv, &input, &grad_maps);
                 return;
             }
-            add_gradients(conv, take_last_input(conv, &mut inputs), &grad_maps);
+            add_gradients(conv, take_input(conv), &grad_maps);
             grad = Buffer::new(conv.shape().locations() * conv.shape().channels_in);
             conv.image_gradient(simd, &grad_maps, |y, row| {
                 grad[y * row.len()..][..row.len()].copy_from_slice(row);
@@ -330,28 +339,6 @@ impl<S: Simd> Stages<S> {
 fn pooled_len<E: Element>(conv: &BorderedConvolution<E>) -> usize {
     let (height, width, channels) = pooled_size(conv.shape().output());
     height * width * channels
-}
-
-/// Takes the memory for the input of `conv` off the start of `inputs`.
-fn take_input<'a, E: Element>(
-    conv: &BorderedConvolution<E>,
-    inputs: &mut &'a mut [E],
-) -> &'a mut [E] {
-    let (own, rest) = std::mem::take(inputs).split_at_mut(conv.shape().bordered_len::<E>());
-    *inputs = rest;
-    own
-}
-
-/// Takes the input of `of` off the end of `inputs`.
-fn take_last_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a [E]) -> &'a [E] {
-    let own;
-    (*inputs, own) = split_tail(inputs, of.shape().bordered_len::<E>());
-    own
-}
-
-/// Splits `values` into all but the last `len`, and the last `len`.
-fn split_tail<T>(values: &[T], len: usize) -> (&[T], &[T]) {
-    values.split_at(values.len() - len)
 }
 
 vectorized! {

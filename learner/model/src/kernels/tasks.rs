@@ -68,9 +68,11 @@ impl Tasks {
     }
 }
 
+const ALL_PARAMETERS: &str = "a vector of parameters has those of each shape";
+
 /// Returns the number of scalars in all layers' parameters.
 pub(crate) fn parameters_len(shapes: &[ConvShape]) -> usize {
-    shapes.iter().map(ConvShape::parameters_len).sum()
+    shapes.iter().flat_map(ConvShape::parameter_lens).sum()
 }
 
 /// Cuts `parameters` into the weight and the bias of each convolution.
@@ -78,13 +80,9 @@ pub(crate) fn split_parameters<'a>(
     shapes: &[ConvShape],
     mut parameters: &'a [f32],
 ) -> Vec<[&'a [f32]; 2]> {
-    let mut parts = Vec::with_capacity(shapes.len());
-    for shape in shapes {
-        let (own, rest) = parameters.split_at(shape.parameters_len());
-        parts.push(own.split_at(shape.weight_len()).into());
-        parameters = rest;
-    }
-    parts
+    let mut take = |len: usize| parameters.split_off(..len).expect(ALL_PARAMETERS);
+    let parts = shapes.iter().map(ConvShape::parameter_lens);
+    parts.map(|lens| lens.map(&mut take)).collect()
 }
 
 /// As [`split_parameters`], but mutable.
@@ -92,13 +90,9 @@ pub(crate) fn split_parameters_mut<'a>(
     shapes: &[ConvShape],
     mut parameters: &'a mut [f32],
 ) -> Vec<[&'a mut [f32]; 2]> {
-    let mut parts = Vec::with_capacity(shapes.len());
-    for shape in shapes {
-        let (own, rest) = std::mem::take(&mut parameters).split_at_mut(shape.parameters_len());
-        parts.push(own.split_at_mut(shape.weight_len()).into());
-        parameters = rest;
-    }
-    parts
+    let mut take = |len: usize| parameters.split_off_mut(..len).expect(ALL_PARAMETERS);
+    let parts = shapes.iter().map(ConvShape::parameter_lens);
+    parts.map(|lens| lens.map(&mut take)).collect()
 }
 
 /// Calls `prepare` with each convolution's index, shape, weight and bias. Runs on the pool, because every task waits for the result.
