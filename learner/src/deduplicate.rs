@@ -109,25 +109,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn states_that_repeat_are_found() {
-        let states: Vec<StateBytes<'_>> = [Some([1, 1]), None, Some([2, 2]), Some([1, 1]), None]
-            .iter()
-            .map(|state| state.as_ref().map(|it: &[u8; 2]| &it[..]))
-            .collect();
-        let input = PassInput::new(&states, &[], 2, true);
-        assert_eq!(input.indices.unwrap(), [0, 1, 2, 0, 1]);
-        assert_eq!(*input.bytes, [1, 1, 0, 0, 2, 2]);
-    }
-
-    #[test]
-    fn states_of_one_checksum_are_told_apart() {
+    fn states_that_repeat_are_found_and_those_of_one_checksum_are_told_apart() {
         // "plumless" and "buckeroo" have the same CRC-32.
         let [a, b] = [b"plumless", b"buckeroo"].map(|it| Some(&it[..]));
-        let states = [a, b, a, b];
         assert_eq!(crc32fast::hash(b"plumless"), crc32fast::hash(b"buckeroo"));
-        let input = PassInput::new(&states, &[], 8, true);
-        assert_eq!(input.indices.unwrap(), [0, 1, 0, 2]);
-        assert_eq!(*input.bytes, *b"plumlessbuckeroobuckeroo");
+        let input = PassInput::new(&[a, None, b, a, b, None], &[], 8, true);
+        assert_eq!(input.indices.unwrap(), [0, 1, 2, 0, 3, 1]);
+        assert_eq!(*input.bytes, *b"plumless\0\0\0\0\0\0\0\0buckeroobuckeroo");
     }
 
     #[test]
