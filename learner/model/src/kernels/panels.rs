@@ -308,13 +308,10 @@ impl<'a, E: Element> PackedRows<'a, E> {
 
     pub(crate) fn operand_from(&self, row: usize) -> LeftOperand<'_, E> {
         LeftOperand {
-            values: &self.values,
             start: row * self.row_stride,
-            row_stride: self.row_stride,
             step_stride: self.step_stride,
             steps: self.steps,
-            run_stride: 0,
-            runs: 1,
+            ..LeftOperand::rows(&self.values, self.row_stride)
         }
     }
 }
