@@ -85,10 +85,9 @@ impl<'a> Batch<'a> {
         }
         let state_bytes = model.frame_len();
         let positives = self.positives;
-        if !required.accepts(positives, self.anchors.is_some()) {
+        if let Err(needed) = required.check_batch(positives, self.anchors.is_some()) {
             return invalid(format!(
-                "it has {positives} positives a row; this agent needs {}",
-                required.describe_accepted()
+                "it has {positives} positives a row; this agent needs {needed}"
             ));
         }
         let anchors = self.anchors.unwrap_or(self.states_t);

@@ -246,9 +246,9 @@ impl RunConfig {
     /// Checks that the replay serves as many positives as the auxiliary loss needs and no more.
     fn check_auxiliary_loss(&self) -> Result<(), Usage> {
         let auxiliary_loss = self.learner.update.auxiliary_loss;
-        let positives = auxiliary_loss.positives();
+        let needed = auxiliary_loss.positives().served();
         let served = self.run.horizon.positives();
-        if positives.served_counts().contains(&served) {
+        if needed.counts.contains(&served) {
             return Ok(());
         }
         let later = match served {
@@ -260,8 +260,8 @@ impl RunConfig {
             "run.horizon serves {} a row, but learner.update.auxiliary_loss = {} looks at {}: --set 'run.horizon={}', or take another --agent",
             later,
             auxiliary_loss.name(),
-            positives.describe_served(),
-            positives.example_horizon()
+            needed.words,
+            needed.example_horizon
         ))
     }
 }

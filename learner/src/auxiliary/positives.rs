@@ -16,51 +16,46 @@ pub enum Positives {
     OtherView,
 }
 
-impl Positives {
-    /// The numbers of later states per row that the replay server may serve.
-    pub const fn served_counts(self) -> RangeInclusive<usize> {
-        match self {
-            Self::None | Self::OtherView => 0..=0,
-            Self::One => 1..=1,
-            Self::Several => 1..=usize::MAX,
-        }
-    }
-
-    /// [`Positives::served_counts`] in words.
-    pub const fn describe_served(self) -> &'static str {
-        match self {
-            Self::None | Self::OtherView => "no later state",
-            Self::One => "one later state",
-            Self::Several => "one or more later states",
-        }
-    }
-
+/// The later states that a loss needs the replay server to serve.
+#[derive(Clone, Debug)]
+pub struct ServedStates {
+    /// The numbers per row that fit.
+    pub counts: RangeInclusive<usize>,
+    /// These numbers in words.
+    pub words: &'static str,
     /// A value of `run.horizon` that serves such a number, as TOML.
-    pub const fn example_horizon(self) -> &'static str {
-        match self {
-            Self::None | Self::OtherView => r#"{rule="none"}"#,
-            Self::One => r#"{rule="fixed",k=1}"#,
-            Self::Several => r#"{rule="all",k_max=5}"#,
+    pub example_horizon: &'static str,
+}
+
+impl Positives {
+    /// The later states per row that the replay server may serve.
+    pub fn served(self) -> ServedStates {
+        let (counts, words, example_horizon) = match self {
+            Self::None | Self::OtherView => (0..=0, "no later state", r#"{rule="none"}"#),
+            Self::One => (1..=1, "one later state", r#"{rule="fixed",k=1}"#),
+            Self::Several => {
+                let any = 1..=usize::MAX;
+                (any, "one or more later states", r#"{rule="all",k_max=5}"#)
+            }
+        };
+        ServedStates {
+            counts,
+            words,
+            example_horizon,
         }
     }
 
-    /// Whether a batch with `count` positives per row fits; `has_views` says whether the batch contains augmented s_t.
-    pub const fn accepts(self, count: usize, has_views: bool) -> bool {
-        match self {
-            Self::None => true,
-            Self::One => count == 1,
-            Self::Several => count >= 1,
-            Self::OtherView => count == 1 && has_views,
-        }
-    }
-
-    /// The requirement of [`Positives::accepts`] in words.
-    pub const fn describe_accepted(self) -> &'static str {
-        match self {
-            Self::None => "any number",
-            Self::One => "one",
-            Self::Several => "one or more",
-            Self::OtherView => "two views of each state",
-        }
+    /// Checks that a batch with `count` positives per row fits; `has_views` says whether the batch contains augmented s_t.
+    ///
+    /// # Errors
+    /// The requirement in words.
+    pub fn check_batch(self, count: usize, has_views: bool) -> Result<(), &'static str> {
+        let (fits, needed) = match self {
+            Self::None => (true, "any number"),
+            Self::One => (count == 1, "one"),
+            Self::Several => (count >= 1, "one or more"),
+            Self::OtherView => (count == 1 && has_views, "two views of each state"),
+        };
+        fits.then_some(()).ok_or(needed)
     }
 }
