@@ -63,7 +63,6 @@ impl ExactAffinity {
     }
 
     pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
-        self.alphabet.check_valid()?;
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         check_array("counts", &self.counts, m * m)?;
@@ -71,32 +70,23 @@ impl ExactAffinity {
         check_probabilities("matrix", &self.ratios(), m * m)
     }
 
-    /// A by raw actions [n, n].
-    pub(super) fn matrix(&self) -> Vec<f32> {
-        self.alphabet.expand_matrix(&self.ratios())
-    }
-
-    pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) -> Result<(), UpdateError> {
-        let pairs = self.alphabet.index_pairs(pairs)?;
-        if pairs.is_empty() {
-            return Ok(());
-        }
+    /// Learns from pairs of dense indices.
+    pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) {
         for count in &mut self.counts {
             *count *= self.settings.decay;
         }
-        for (i, j) in pairs {
+        for &(i, j) in pairs {
             self.counts[usize::from(i) * self.alphabet.len() + usize::from(j)] += 1.0;
         }
-        Ok(())
     }
 
-    /// Computes A_ij = q_ij / sum_j q_ij, the row softmax of ln q, with q_ij = (c_ij + s) / (e_ij + s) and smoothing s. The count that
+    /// Computes A [m, m] by dense index: A_ij = q_ij / sum_j q_ij, the row softmax of ln q, with q_ij = (c_ij + s) / (e_ij + s) and smoothing s. The count that
     /// independent actions would have is e_ij = sum_j c_ij * sum_i c_ij / sum c.
     ///
     /// q is p(j | i) / p(j) for frequent pairs, and 1 if nothing is known: in the row or column of an action that was never taken, and if
     /// only one action was ever taken. Adding s to c alone would bias the ratio there.
     /// Source of the form: DuMouchel 1999, the shrinking of a ratio of counts towards 1.
-    fn ratios(&self) -> Vec<f64> {
+    pub(super) fn ratios(&self) -> Vec<f64> {
         let m = self.alphabet.len();
         let row = |i: usize| self.counts[i * m..(i + 1) * m].iter().sum::<f64>();
         let column = |j: usize| (0..m).map(|i| self.counts[i * m + j]).sum::<f64>();

@@ -40,7 +40,7 @@ pub struct LearnedAffinity {
     second_moments: Vec<f64>,
     updates: u64,
     /// Smoothed A [m, m] by dense index.
-    smoothed: Vec<f64>,
+    pub(super) smoothed: Vec<f64>,
 }
 
 /// Largest number of hidden units; larger settings are rejected.
@@ -93,7 +93,6 @@ impl LearnedAffinity {
     }
 
     pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
-        self.alphabet.check_valid()?;
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         let count = parameter_count(m, self.settings.hidden);
@@ -105,23 +104,10 @@ impl LearnedAffinity {
         check_probabilities("smoothed", &self.smoothed, m * m)
     }
 
-    /// A by raw actions [n, n].
-    pub(super) fn matrix(&self) -> Vec<f32> {
-        self.alphabet.expand_matrix(&self.smoothed)
-    }
-
     /// Takes one Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
-    /// `ln p(i, j) / (p(i) p(j))`. The joint pairs are the batch's; the marginal pairs have their second actions shuffled by `rng`.
-    /// Then A moves towards the new row softmax. Source: Mazoure et al. 2020, section 4; Hjelm et al. 2019, equation 4.
-    pub(super) fn observe(
-        &mut self,
-        pairs: &[(u8, u8)],
-        rng: &mut ChaCha8Rng,
-    ) -> Result<(), UpdateError> {
-        let pairs = self.alphabet.index_pairs(pairs)?;
-        if pairs.is_empty() {
-            return Ok(());
-        }
+    /// `ln p(i, j) / (p(i) p(j))`. The joint pairs are the batch's, by dense index; the marginal pairs have their second actions shuffled
+    /// by `rng`. Then A moves towards the new row softmax. Source: Mazoure et al. 2020, section 4; Hjelm et al. 2019, equation 4.
+    pub(super) fn observe(&mut self, pairs: &[(u8, u8)], rng: &mut ChaCha8Rng) {
         let mut shuffled: Vec<u8> = pairs.iter().map(|&(_, j)| j).collect();
         shuffled.shuffle(rng);
         let m = self.alphabet.len();
@@ -142,7 +128,6 @@ impl LearnedAffinity {
         for (old, new) in self.smoothed.iter_mut().zip(new) {
             *old = keep * *old + (1.0 - keep) * new;
         }
-        Ok(())
     }
 
     /// Offsets of w_to, b, out and c in `parameters`.
@@ -279,9 +264,9 @@ mod tests {
             learned.updates = updates;
             for _ in 0..20 {
                 let pairs = [(0, 1), (1, 2), (2, 0)];
-                learned.observe(&pairs, &mut rng).unwrap();
+                learned.observe(&pairs, &mut rng);
             }
-            learned.matrix()
+            learned.smoothed
         };
         for updates in [1 << 31, 1 << 32, 1 << 40, 1 << 53] {
             assert_eq!(after(updates), after(1 << 24), "{updates}");
@@ -292,6 +277,6 @@ mod tests {
     fn it_starts_uniform() {
         let (alphabet, rng) = (Alphabet::new(&[1, 1, 2]), &mut ChaCha8Rng::seed_from_u64(3));
         let learned = LearnedAffinity::new(alphabet.unwrap(), SETTINGS, rng).unwrap();
-        assert_eq!(learned.matrix(), [0.5; 9]);
+        assert_eq!(learned.smoothed, [0.5; 4]);
     }
 }

@@ -31,9 +31,12 @@ impl AffinityEstimator {
     /// An action that the alphabet does not have: nothing has then changed. Numbers that are no longer finite: the estimate is then
     /// unusable.
     pub fn observe(&mut self, pairs: &[(u8, u8)], rng: &mut ChaCha8Rng) -> Result<(), UpdateError> {
-        match self {
-            Self::Learned(learned) => learned.observe(pairs, rng)?,
-            Self::Exact(exact) => exact.observe(pairs)?,
+        let pairs = self.alphabet().index_pairs(pairs)?;
+        if !pairs.is_empty() {
+            match self {
+                Self::Learned(learned) => learned.observe(&pairs, rng),
+                Self::Exact(exact) => exact.observe(&pairs),
+            }
         }
         self.check_valid()
     }
@@ -44,6 +47,7 @@ impl AffinityEstimator {
     /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
     /// are not probabilities.
     pub fn check_valid(&self) -> Result<(), UpdateError> {
+        self.alphabet().check_valid()?;
         match self {
             Self::Learned(learned) => learned.check_valid(),
             Self::Exact(exact) => exact.check_valid(),
@@ -54,8 +58,8 @@ impl AffinityEstimator {
     /// A row sums to 1 over one representative of each visible action.
     pub fn matrix(&self) -> Vec<f32> {
         match self {
-            Self::Learned(learned) => learned.matrix(),
-            Self::Exact(exact) => exact.matrix(),
+            Self::Learned(learned) => learned.alphabet.expand_matrix(&learned.smoothed),
+            Self::Exact(exact) => exact.alphabet.expand_matrix(&exact.ratios()),
         }
     }
 
@@ -67,9 +71,13 @@ impl AffinityEstimator {
         }
     }
 
+    fn alphabet(&self) -> &Alphabet {
+        self.settings().0
+    }
+
     /// The number of raw actions n, the side of the matrix.
     pub fn num_actions(&self) -> usize {
-        self.settings().0.num_actions()
+        self.alphabet().num_actions()
     }
 }
 
