@@ -114,10 +114,7 @@ pub struct Compute {
 
 impl Compute {
     /// The CPU with this project's kernels.
-    pub const CPU: Self = Self {
-        device: Device::Cpu,
-        kernels: Kernels::FUSED,
-    };
+    pub const CPU: Self = Self::cpu(Precision::F32);
 
     /// The CPU with this project's kernels, products in `precision`.
     pub const fn cpu(precision: Precision) -> Self {

@@ -80,8 +80,8 @@ impl ExactAffinity {
         }
     }
 
-    /// Computes A [m, m] by dense index: A_ij = q_ij / sum_j q_ij, the row softmax of ln q, with q_ij = (c_ij + s) / (e_ij + s) and smoothing s. The count that
-    /// independent actions would have is e_ij = sum_j c_ij * sum_i c_ij / sum c.
+    /// Computes A [m, m] by dense index: A_ij = q_ij / sum_j q_ij, the row softmax of ln q, with q_ij = (c_ij + s) / (e_ij + s) and
+    /// smoothing s. The count that independent actions would have is e_ij = sum_j c_ij * sum_i c_ij / sum c.
     ///
     /// q is p(j | i) / p(j) for frequent pairs, and 1 if nothing is known: in the row or column of an action that was never taken, and if
     /// only one action was ever taken. Adding s to c alone would bias the ratio there.

@@ -122,7 +122,7 @@ pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<V
     command.args(["--threads", &flags.threads.to_string()]);
     command.args(flags.quick.then_some("--quick"));
     for precision in &flags.precision {
-        command.args(["--precision", precision.name()]);
+        command.args(["--precision", &precision.to_string()]);
     }
     let text = run_for_stdout(command, &format!("the bench of the {}", component.name()))?;
     let report: Report = serde_json::from_str(&text).context("reading a bench's figures")?;

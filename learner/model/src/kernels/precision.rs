@@ -44,19 +44,12 @@ impl Precision {
             Self::Bf16 => terms as f64 * least * (2.0 + 2.0 * largest),
         }
     }
-
-    /// The name that settings and flags use.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::Bf16 => "bf16",
-        }
-    }
 }
 
 impl fmt::Display for Precision {
+    /// Writes the name that settings and flags use.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
+        self.serialize(f)
     }
 }
 
@@ -64,7 +57,7 @@ impl FromStr for Precision {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let known = Self::ALL.into_iter().find(|it| it.name() == name);
+        let known = Self::ALL.into_iter().find(|it| it.to_string() == name);
         known.ok_or_else(|| format!("{name:?} is not a precision: use f32 or bf16"))
     }
 }
