@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Tensor};
 use driml_learner::DeviceName;
-use driml_model::{conv2d_relu, multiply_in_first_cache};
+use driml_model::{conv_stack, multiply_in_first_cache};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -28,8 +28,8 @@ pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
             let maps = random(&[ROWS, side + 2, side + 2, channels])?;
             let (weight, bias) = (random(&[channels, channels, 3, 3])?, random(&[channels])?);
             let gflop = (2 * ROWS * side * side * 9 * channels * channels) as f64 / 1e9;
-            let calls =
-                meter.rate_by_median(|| Ok(conv2d_relu(&maps, &weight, &bias, 1, precision)?))?;
+            let layer = [(&weight, &bias, 1)];
+            let calls = meter.rate_by_median(|| Ok(conv_stack(&maps, &layer, precision)?))?;
             let what = format!("convolution of 256 maps, {side}x{side}x{channels}");
             record(&what, gflop, calls);
         }

@@ -51,7 +51,7 @@ pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use heads::config::HeadConfig;
 pub use heads::noise::HeadNoise;
 pub use input::{FrameSize, InputSize, ReadArea, Resizer};
-pub use kernels::conv::{conv_stack, conv2d_relu};
+pub use kernels::conv::conv_stack;
 pub use kernels::exponentials::{exp_minus_max, soft_clip};
 pub use kernels::isa::{describe_kernels, is_bf16_fast, multiply_in_first_cache};
 pub use kernels::linear::{linear, relu};

@@ -22,17 +22,6 @@ use crate::kernels::tensors::{Input, cpu_storage, values_of};
 /// Images per task. The number is fixed, so that the order of additions does not depend on the number of threads.
 const TASK_IMAGES: usize = 16;
 
-/// relu(conv2d(images, weight) + bias) without padding: [`conv_stack`] of one layer.
-pub fn conv2d_relu(
-    images: &Tensor,
-    weight: &Tensor,
-    bias: &Tensor,
-    stride: usize,
-    precision: Precision,
-) -> Result<Tensor> {
-    conv_stack(images, &[(weight, bias, stride)], precision)
-}
-
 /// Convolutions without padding, each with bias and ReLU, differentiable in all floating-point arguments.
 ///
 /// `images` [B, H, W, C] u8 (scaled by 1/255, no gradient) or f32. Each layer is (weight [out, in, k, k] f32, bias

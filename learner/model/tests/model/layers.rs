@@ -2,7 +2,7 @@
 //! The property "products" of `driml experiment stability` compares results and gradients with candle's in f64.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{Precision, conv_stack, conv2d_relu, linear, relu};
+use driml_model::{Precision, conv_stack, linear, relu};
 
 use crate::support::{double, floats, rng, values};
 
@@ -21,7 +21,8 @@ fn a_convolution_passes_no_gradient_where_it_is_exactly_zero() -> Result<()> {
     let images = Var::zeros((1, 2, 2, 1), DType::F32, &Device::Cpu)?;
     let weight = Var::ones((1, 1, 2, 2), DType::F32, &Device::Cpu)?;
     let bias = Var::zeros(1, DType::F32, &Device::Cpu)?;
-    let grads = conv2d_relu(&images, &weight, &bias, 1, Precision::F32)?
+    let layer = (weight.as_tensor(), bias.as_tensor(), 1);
+    let grads = conv_stack(&images, &[layer], Precision::F32)?
         .sum_all()?
         .backward()?;
     for var in [&images, &weight, &bias] {
@@ -76,9 +77,9 @@ fn convolutions_of_shapes_that_do_not_match_are_errors() {
     let weight = floats(&[4, 3, 3, 3], rng);
     let bias = floats(&[4], rng);
     let fails = |images: &Tensor, weight: &Tensor, bias: &Tensor, stride| {
-        assert!(conv2d_relu(images, weight, bias, stride, Precision::F32).is_err());
+        assert!(conv_stack(images, &[(weight, bias, stride)], Precision::F32).is_err());
     };
-    assert!(conv2d_relu(&images, &weight, &bias, 1, Precision::F32).is_ok());
+    assert!(conv_stack(&images, &[(&weight, &bias, 1)], Precision::F32).is_ok());
     fails(&images, &weight, &bias, 0);
     fails(&images, &floats(&[4, 2, 3, 3], rng), &bias, 1);
     fails(&images, &floats(&[4, 3, 3, 2], rng), &bias, 1);

@@ -2,7 +2,7 @@
 //! The kernels are in the model crate, which tests their parts against candle's kernels.
 
 use candle_core::{DType, Device, Tensor, Var};
-use driml_model::{Precision, conv2d_relu, linear, relu};
+use driml_model::{Precision, conv_stack, linear, relu};
 
 use crate::stability::property::*;
 
@@ -117,7 +117,7 @@ impl Layer {
     fn error(&self, operands: &Operands, precision: Precision) -> anyhow::Result<f64> {
         let found = backprop(operands, |[x, w, b]| match self.is_convolution() {
             false => linear(x, w, b, precision),
-            true => conv2d_relu(x, w, b, self.stride, precision),
+            true => conv_stack(x, &[(w.as_tensor(), b.as_tensor(), self.stride)], precision),
         })?;
         let has_bytes = operands[0].dtype() == DType::U8;
         let mut exact = operands.clone();
