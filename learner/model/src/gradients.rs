@@ -5,14 +5,14 @@
 //! use this sink let their matrix products add to the sum in place instead.
 
 use std::cell::RefCell;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
-use candle_core::{Result, Tensor, TensorId, Var, backprop::GradStore, bail};
+use candle_core::{Result, Tensor, TensorId, Var, bail};
 
 type Sums = HashMap<TensorId, Vec<f32>>;
 
 thread_local! {
-    /// The gradient sums of the backward pass on this thread, if [`Backward::of`] runs it.
+    /// The gradient sums of the backward pass on this thread, if [`backward`] runs it.
     ///
     /// A pool thread that waits for its products may steal another learner's whole update. A pass that starts here
     /// therefore sets the outer pass's sums aside and restores them. The cell is never borrowed while other work may run.
@@ -28,37 +28,30 @@ impl Drop for RestoreOuterPass {
     }
 }
 
-/// The gradients of a loss.
-#[derive(Debug)]
-pub struct Backward {
-    store: GradStore,
-    sums: Sums,
-}
-
-impl Backward {
-    /// Runs the backward pass of `loss`, a scalar.
-    pub fn of(loss: &Tensor) -> Result<Self> {
-        let _restore = RestoreOuterPass(SUMS.replace(Some(Sums::new())));
-        let store = loss.backward();
-        let sums = SUMS.take().unwrap_or_default();
-        Ok(Self {
-            store: store?,
-            sums,
-        })
-    }
-
-    /// Removes and returns the gradient of `var`, in its shape; `None` if the loss does not depend on `var`.
-    pub fn remove(&mut self, var: &Var) -> Result<Option<Tensor>> {
-        let sum = self.sums.remove(&var.id());
+/// Runs the backward pass of `loss`, a scalar. Returns the gradients of `variables`, in their shapes, by their names. A variable on
+/// which the loss does not depend has none.
+pub fn backward<'a>(
+    loss: &Tensor,
+    variables: impl Iterator<Item = (&'a str, &'a Var)>,
+) -> Result<BTreeMap<String, Tensor>> {
+    let restore = RestoreOuterPass(SUMS.replace(Some(Sums::new())));
+    let store = loss.backward();
+    let mut sums = SUMS.take().unwrap_or_default();
+    drop(restore);
+    let (mut store, mut gradients) = (store?, BTreeMap::new());
+    for (name, var) in variables {
+        let sum = sums.remove(&var.id());
         let sum = sum.map(|sum| Tensor::from_vec(sum, var.shape(), var.device()));
         // candle leaves some gradients attached to their pass. Optimizer moments made of them would keep every pass alive.
-        let stored = self.store.remove(var);
+        let stored = store.remove(var);
         let stored = stored.map(|gradient| gradient.contiguous()).transpose()?;
-        match (sum.transpose()?, stored.map(|gradient| gradient.detach())) {
-            (Some(sum), Some(stored)) => (sum + stored).map(Some),
-            (one, other) => Ok(one.or(other)),
-        }
+        let gradient = match (sum.transpose()?, stored.map(|gradient| gradient.detach())) {
+            (Some(sum), Some(stored)) => Some((sum + stored)?),
+            (one, other) => one.or(other),
+        };
+        gradients.extend(gradient.map(|it| (name.to_owned(), it)));
     }
+    Ok(gradients)
 }
 
 /// Returns the gradient of `parameter` as `add` computes it. `None` if none is wanted, or if [`try_add_in_place`] added it to a sum.
@@ -70,18 +63,18 @@ pub(crate) fn accumulate(
     is_wanted.then(|| add(None))
 }
 
-/// Adds to the gradient of `parameter`. Does nothing if it is not a variable. Fails if [`Backward::of`] does not run this pass.
+/// Adds to the gradient of `parameter`. Does nothing if it is not a variable. Fails if [`backward`] does not run this pass.
 pub(crate) fn accumulate_in_place(
     parameter: &Tensor,
     add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
 ) -> Result<()> {
     if parameter.is_variable() && !try_add_in_place(parameter, add) {
-        bail!("a backward pass through these layers has to be one of Backward::of");
+        bail!("a backward pass through these layers has to be one of `backward`");
     }
     Ok(())
 }
 
-/// Adds to the gradient of `parameter` in place if it is a variable and [`Backward::of`] runs this pass. Returns whether it did.
+/// Adds to the gradient of `parameter` in place if it is a variable and [`backward`] runs this pass. Returns whether it did.
 ///
 /// `add` receives the sum so far, in the parameter's layout, and returns the sum including the new gradient.
 fn try_add_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> bool {

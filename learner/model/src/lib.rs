@@ -46,7 +46,7 @@ pub use config::{DimHeads, LossLayer, ModelConfig};
 pub use cost::LayerCost;
 pub use error::{ModelError, Result};
 pub use geometry::ConvLayer;
-pub use gradients::Backward;
+pub use gradients::backward;
 pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use heads::config::HeadConfig;
 pub use heads::noise::HeadNoise;

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Tensor};
-use driml_model::{Backward, Kernels, Parameters, values_of};
+use driml_model::{Kernels, Parameters, backward, values_of};
 use rayon::prelude::*;
 
 use crate::error::UpdateError;
@@ -25,14 +25,9 @@ pub struct Gradients {
 impl Gradients {
     /// Computes the gradients of the scalar `loss` by `parameters`.
     pub fn compute(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
-        let mut backward = Backward::of(loss)?;
-        let mut by_name = BTreeMap::new();
-        for (name, var) in parameters.iter() {
-            if let Some(gradient) = backward.remove(var)? {
-                by_name.insert(name.to_owned(), gradient);
-            }
-        }
-        Ok(Self { by_name })
+        Ok(Self {
+            by_name: backward(loss, parameters.iter())?,
+        })
     }
 
     /// The gradient of a parameter, if the loss touches it.

@@ -34,7 +34,7 @@ pub(crate) struct BlockParameters {
 /// Computes `out(relu(hidden([x, joined]))) + skip([x, joined])`, [..., outputs], of x [..., features].
 ///
 /// Each row of `joined` [groups, joined] serves an equal share of consecutive rows of x, without a copy per row. Gradients of
-/// parameters that are variables are summed in place, so only [`Backward::of`](crate::Backward::of) can run the backward pass.
+/// parameters that are variables are summed in place, so only [`backward`](crate::backward) can run the backward pass.
 /// Gradients of other parameters are not computed. The bits of results and gradients do not depend on the number of threads.
 pub(crate) fn residual_block(
     x: &Tensor,

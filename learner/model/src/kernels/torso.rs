@@ -22,7 +22,7 @@ use crate::kernels::tensors::{Input, cpu_storage, values_of};
 /// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack).
 ///
 /// Gradients of `weight` [outputs, inputs] and `bias` [outputs] are summed in place, so only
-/// [`Backward::of`](crate::Backward::of) can run the backward pass.
+/// [`backward`](crate::backward) can run the backward pass.
 pub(crate) fn torso(
     images: &Tensor,
     layers: &[ConvLayerTensors<'_>],

@@ -2,7 +2,7 @@
 //! The layers before the head are tested in `network`.
 
 use candle_core::Result;
-use driml_model::{Backward, Kernels, LossLayer, ModelConfig, Network};
+use driml_model::{Kernels, LossLayer, ModelConfig, Network, backward};
 
 use crate::support::{NOISY, floats, frames, parameters, rng, small, small_with, values};
 
@@ -85,8 +85,8 @@ fn a_loss_s_own_layer_is_linear_and_only_the_online_network_s() -> Result<()> {
     for (next, wanted) in values(&next).into_iter().zip(wanted) {
         assert!((next - wanted).abs() < 1e-5, "{next}, {wanted}");
     }
-    let mut found = Backward::of(&next.sum_all()?)?;
-    assert_eq!(values(&found.remove(bias)?.unwrap()), [4.0; 6]);
+    let found = backward(&next.sum_all()?, parameters.iter())?;
+    assert_eq!(values(&found["dim.next.bias"]), [4.0; 6]);
     assert!(network.loss_layer("other", &f4).is_err());
     assert_eq!(
         config.without_dim().parameter_shapes(),

@@ -3,8 +3,8 @@
 
 use candle_core::{DType, Device, Tensor};
 use driml_model::{
-    Backward, DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network, Parameters,
-    Precision, TorsoName,
+    DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network, Parameters, Precision,
+    TorsoName, backward,
 };
 
 use crate::support::{bits, configs, floats, frames, parameters, pool, residual, rng, small};
@@ -28,10 +28,9 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
             let phi3 = network.phi3(features.require_f3().unwrap()).unwrap();
             let [logits_loss, phi3_loss] =
                 [&logits, &phi3].map(|it| it.sqr().unwrap().sum_all().unwrap());
-            let mut grads = Backward::of(&(logits_loss + phi3_loss).unwrap()).unwrap();
-            let vars = parameters.iter().map(|(_, var)| var);
-            let grads = vars.filter_map(|var| grads.remove(var).unwrap().as_ref().map(bits));
-            (bits(&logits), grads.collect::<Vec<_>>())
+            let grads = backward(&(logits_loss + phi3_loss).unwrap(), parameters.iter());
+            let grads = grads.unwrap();
+            (bits(&logits), grads.values().map(bits).collect::<Vec<_>>())
         };
         let one = pool(1).install(run);
         let shapes = config.parameter_shapes();
