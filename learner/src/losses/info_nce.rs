@@ -43,13 +43,18 @@ pub fn info_nce(dots: &[f32], valid: &[u8], clip: ScoreClip, gradient: &mut [f32
         gradient.fill(0.0);
         return 0.0;
     }
-    let weight = 1.0 / (locations * candidates.len()) as f64;
+    let count = candidates.len();
+    let weight = 1.0 / (locations * count) as f64;
     let losses: Vec<f64> = dots
         .par_chunks_exact(rows)
         .zip(gradient.par_chunks_exact_mut(rows))
         .enumerate()
         .map_init(
-            || Scratch::new(candidates.len()),
+            || Scratch {
+                dots: vec![0.0; count],
+                scores: vec![0.0; count],
+                slopes: vec![0.0; count],
+            },
             |scratch, (at, (dots, gradient))| {
                 gradient.fill(0.0);
                 let anchor = at % rows;
@@ -70,16 +75,6 @@ struct Scratch {
     /// First the scores, then their exponentials.
     scores: Vec<f64>,
     slopes: Vec<f64>,
-}
-
-impl Scratch {
-    fn new(candidates: usize) -> Self {
-        Self {
-            dots: vec![0.0; candidates],
-            scores: vec![0.0; candidates],
-            slopes: vec![0.0; candidates],
-        }
-    }
 }
 
 /// Returns one anchor's `ln sum exp(s) - s_positive`; writes the derivative, times `weight`, to its row `gradient`.
