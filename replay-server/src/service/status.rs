@@ -132,7 +132,12 @@ impl Service {
                 && since.elapsed() > *due
             {
                 let since = since.elapsed().as_secs();
-                tracing::info!("{missing}; waiting for {since} s so far. See `driml status`");
+                // A log does not tell whether the learner has finished.
+                let hint = match all_stored {
+                    true => ". If the learner has finished this run, stop this process",
+                    false => "",
+                };
+                tracing::info!("{missing}; waiting for {since} s so far{hint}. See `driml status`");
                 *due *= 2;
             }
         }
