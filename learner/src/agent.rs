@@ -4,13 +4,13 @@
 use driml_model::{
     Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, WeightDtype, is_dim,
 };
-use driml_protocol::fail_point;
+use driml_protocol::{LearnerStatus, fail_point};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batch::Batch,
     error::UpdateError,
-    evaluation::{Evaluation, Networks, UpdateNoise, UpdateReport, detached_logits},
+    evaluation::{Evaluation, Networks, UpdateNoise, detached_logits},
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -29,6 +29,38 @@ pub struct NetworkParameters {
     pub target: Parameters,
     /// The key encoder, torso and Psi_4; `None` unless the auxiliary loss has one, as CURL does.
     pub key_encoder: Option<Parameters>,
+}
+
+/// The results of one update, as in a row of metrics.
+#[derive(Clone, Debug, PartialEq)]
+pub struct UpdateReport {
+    /// Mean over rows of `KL(projected target || prediction)`, in nats; each row is multiplied by its importance weight, if it has one.
+    pub c51_kl: f32,
+    /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
+    pub row_kls: Vec<f32>,
+    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
+    pub losses: Vec<(&'static str, f32)>,
+    /// `c51_kl + sum of weight * loss`.
+    pub total: f32,
+    /// Global 2-norm of the gradients before clipping.
+    pub grad_norm: f64,
+    /// Mean over rows of the taken action's value, in units of return.
+    pub q_mean: f32,
+    /// Share of the rows whose target's mean lies beyond the atoms.
+    pub share_beyond: f64,
+}
+
+impl UpdateReport {
+    /// Writes the results of the last of `updates` updates into `status`.
+    pub fn write_status(&self, updates: u64, status: &mut LearnerStatus) {
+        status.updates = updates;
+        status.c51_kl = self.c51_kl;
+        let losses = self.losses.iter();
+        status.losses = losses.map(|&(name, loss)| (name.into(), loss)).collect();
+        status.total = self.total;
+        status.grad_norm = self.grad_norm;
+        status.q_mean = self.q_mean;
+    }
 }
 
 /// An agent: online and target network, key encoder, optimiser, count of updates.

@@ -22,25 +22,6 @@ use crate::{
     tensors::{read_finite, states_tensor, to_vec_f32},
 };
 
-/// The results of one update, as in a row of metrics.
-#[derive(Clone, Debug, PartialEq)]
-pub struct UpdateReport {
-    /// Mean over rows of `KL(projected target || prediction)`, in nats; each row is multiplied by its importance weight, if it has one.
-    pub c51_kl: f32,
-    /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
-    pub row_kls: Vec<f32>,
-    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
-    pub losses: Vec<(&'static str, f32)>,
-    /// `c51_kl + sum of weight * loss`.
-    pub total: f32,
-    /// Global 2-norm of the gradients before clipping.
-    pub grad_norm: f64,
-    /// Mean over rows of the taken action's value, in units of return.
-    pub q_mean: f32,
-    /// Share of the rows whose target's mean lies beyond the atoms.
-    pub share_beyond: f64,
-}
-
 /// The losses of a batch, what they were computed from, and the gradients, before any optimiser step.
 #[derive(Debug)]
 pub struct Evaluation {

@@ -4,17 +4,16 @@
 use std::path::Path;
 
 use driml_model::Compute;
-use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
+use driml_protocol::{AffinityUpdate, Batch as WireBatch, Weights, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
     affinity::AffinityEstimator,
-    agent::Agent,
+    agent::{Agent, UpdateReport},
     checkpoint::{self, CheckpointError, Extras, LearnerState},
     config::LearnerConfig,
     error::UpdateError,
-    evaluation::UpdateReport,
     importance::resample_evenly,
     prepare::{Columns, Preparation},
     run_counts::RunCounts,
@@ -167,17 +166,6 @@ impl Learner {
                 4.0 * v_max
             );
         }
-    }
-
-    /// Writes the results of the last update into `status`.
-    pub fn write_status(&self, report: &UpdateReport, status: &mut LearnerStatus) {
-        status.updates = self.updates();
-        status.c51_kl = report.c51_kl;
-        let losses = report.losses.iter();
-        status.losses = losses.map(|&(name, loss)| (name.into(), loss)).collect();
-        status.total = report.total;
-        status.grad_norm = report.grad_norm;
-        status.q_mean = report.q_mean;
     }
 
     /// Makes the next weights' version larger than `version`. Actors accept only weights newer than theirs, which may be those of a

@@ -74,14 +74,14 @@ mod tensors;
 pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
-pub use agent::{Agent, NetworkParameters};
+pub use agent::{Agent, NetworkParameters, UpdateReport};
 pub use augment::{AugmentSettings, Augmenter};
 pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
 pub use batch::{Batch, OwnedBatch};
 pub use config::{AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerConfig};
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
-pub use evaluation::{Evaluation, UpdateNoise, UpdateReport};
+pub use evaluation::{Evaluation, UpdateNoise};
 pub use learner::Learner;
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};

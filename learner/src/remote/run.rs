@@ -234,7 +234,7 @@ fn learn(
         }
         let ended = Instant::now();
         publisher.update_status(|status| {
-            learner.write_status(&report, status);
+            report.write_status(learner.updates(), status);
             status.waiting_s += (started - waiting_since).as_secs_f64();
             status.computing_s += (ended - started).as_secs_f64();
         });

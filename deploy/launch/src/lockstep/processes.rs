@@ -276,7 +276,7 @@ impl Lockstep {
             set.map_err(anyhow::Error::msg)
                 .context("the replay rejected priorities")?;
         }
-        self.learner.write_status(&report, &mut self.turn.status);
+        report.write_status(number, &mut self.turn.status);
         if let Some(affinity) = self.learner.affinity_update(LEARNER_ID) {
             let set = self.replay.set_affinity(&affinity);
             set.map_err(anyhow::Error::msg)?;
