@@ -99,7 +99,7 @@ columns! {
         "Norm of the last update's gradient before clipping.",
         Value::Gauge(|it| last_update(it, |it| it.grad_norm));
     "q_mean", "discounted return", "learning", "Mean Q value":
-        "Mean Q value of the last update's states.",
+        "Mean value of the actions that the last update's rows took.",
         Value::Gauge(|it| last_update(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
         "Mean k of rows with a positive; of several the furthest.",

@@ -255,7 +255,7 @@ pub struct LearnerStatus {
     pub total: f32,
     /// Global gradient norm of the last update, before clipping.
     pub grad_norm: f64,
-    /// Mean Q value of the last update's states.
+    /// Mean over the last update's rows of the taken action's value.
     pub q_mean: f32,
     /// Version of the newest weights.
     pub weights_version: u64,
