@@ -44,6 +44,11 @@ macro_rules! messages {
             $(#[doc = $doc] $name = $number,)+
         }
 
+        impl Kind {
+            /// All kinds, in the order of the table.
+            pub const ALL: &'static [Self] = &[$(Self::$name),+];
+        }
+
         $(
             impl Message for $message {
                 const KIND: u16 = Kind::$name as u16;

@@ -73,7 +73,7 @@ fn read_batch(bytes: &[u8]) {
 }
 
 /// Every kind of message and how it is read, in the order of their numbers.
-const KINDS: [(Kind, ReadFn); 24] = [
+const KINDS: [(Kind, ReadFn); Kind::ALL.len()] = [
     (Kind::Chunk, read_chunk),
     (Kind::InsertReply, read::<InsertReply>),
     (Kind::BatchRequest, read::<BatchRequest>),
