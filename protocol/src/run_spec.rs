@@ -64,6 +64,11 @@ impl Horizon {
             Self::Uniform { k_max } | Self::Nhg { k_max } | Self::All { k_max } => k_max,
         }
     }
+
+    /// Whether the rule reads the action affinity, which the learner then estimates.
+    pub const fn reads_affinity(&self) -> bool {
+        matches!(self, Self::Nhg { .. })
+    }
 }
 
 /// What a time-out means for the return.

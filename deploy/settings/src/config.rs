@@ -8,7 +8,7 @@ use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
 use driml_protocol::{
-    Horizon, RunSpec,
+    RunSpec,
     config::{TransportConfig, describe},
 };
 use rand::SeedableRng;
@@ -230,7 +230,7 @@ impl RunConfig {
         self.check_auxiliary_loss()?;
         let rng = &mut ChaCha8Rng::seed_from_u64(0);
         check(learner.affinity.make_estimator(self.model.num_actions, rng))?;
-        let needs_affinity = matches!(self.run.horizon, Horizon::Nhg { .. });
+        let needs_affinity = self.run.horizon.reads_affinity();
         let learns_affinity = learner.affinity.estimator != EstimatorKind::None;
         match (needs_affinity, learns_affinity) {
             (true, false) => Err(usage!(

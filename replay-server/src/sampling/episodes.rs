@@ -143,8 +143,8 @@ impl RowAssembler {
         self.actions
             .extend(actions.take(self.horizon.k_max() as usize));
         let furthest = horizon::draw_k(self.horizon, affinity, &self.actions, rng);
-        let k_first = match self.horizon {
-            Horizon::All { .. } => 1,
+        let k_first = match self.horizon.positives() {
+            2.. => 1,
             _ => furthest,
         };
         let scalars = RowScalars {
