@@ -15,7 +15,7 @@ use crate::{
     config::RunConfig,
     derived, memory,
     overrides::{Override, find, insert, insert_missing, remove},
-    presets::Choice,
+    presets::{Choice, agents},
 };
 
 /// The limit on a compressed replay, which the machine's memory decides if the user does not.
@@ -28,8 +28,8 @@ pub struct RunFlags {
     /// driml_env.py around a Gymnasium environment
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
-    /// Agent: c51, rainbow, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
-    #[arg(long, value_name = "AGENT")]
+    /// Agent; the help lists all, also those that a program adds.
+    #[arg(long, value_name = "AGENT", help = agent_help())]
     pub agent: Option<String>,
     /// Named settings [default: tuned on Procgen, paper elsewhere]; `driml presets` lists them
     #[arg(long, value_name = "NAME")]
@@ -40,6 +40,11 @@ pub struct RunFlags {
     /// What applies over them.
     #[command(flatten)]
     pub flags: Flags,
+}
+
+fn agent_help() -> String {
+    let names: Vec<_> = agents().into_iter().map(|it| it.name).collect();
+    format!("Agent: {} [default: driml-ada]", names.join(", "))
 }
 
 /// Flags over the source; `--set` applies after the others.
