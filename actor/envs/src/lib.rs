@@ -20,7 +20,7 @@
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
 //! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`],
 //! and the world itself, which implements [`Environment`] (or, if its environments are stepped one by one, [`SingleEnv`] for one of them);
-//! then give it a line in `registry.rs`.
+//! then give it a line in `worlds/mod.rs`, and a preset as `deploy/docs/src/how-to/own-world.md` says.
 //!
 //! ```
 //! use driml_envs::{ChainConfig, FrameStack, StepEnd, WorldConfig};
@@ -67,9 +67,10 @@ pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
 pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
-pub use registry::{WorldConfig, WorldName};
+pub use registry::WorldName;
 pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{BuildResult, Variants, WorldSettings};
+pub use worlds::WorldConfig;
 pub use worlds::chain::{ChainConfig, ChainWorld};
 pub use worlds::exec::{ExecConfig, ExecWorld, probe_command as probe_exec_command};
 pub use worlds::ising::{Boundary, IsingConfig, IsingWorld};

@@ -1,6 +1,5 @@
-//! The registry of worlds, and their names on a command line. A new world is a line in `worlds!` and a file in `worlds/`.
-//! `plugin` adds the worlds that a program registers without a change here.
-//! The registry holds no numbers: each world's settings are described beside that world.
+//! The names of worlds on a command line, and their settings by kind: of the menu in `worlds`, and of those that a program registers.
+//! It holds no numbers: each world's settings are described beside that world.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -9,69 +8,14 @@ use std::str::FromStr;
 use std::sync::{Mutex, PoisonError};
 
 use serde::de::Error;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Deserializer};
 use toml::Table;
 
 use crate::error::{EnvError, require};
 use crate::plugin::{self, CustomWorld};
 use crate::restricted::ActionSet;
 use crate::settings::{Variants, WorldSettings};
-use crate::worlds::chain::ChainConfig;
-use crate::worlds::exec::ExecConfig;
-use crate::worlds::ising::IsingConfig;
-use crate::worlds::pacman::PacmanConfig;
-use crate::worlds::procgen::ProcgenConfig;
-
-/// Makes [`WorldConfig`] and the list of kinds from one line per world.
-macro_rules! worlds {
-    ($($(#[$doc:meta])* $kind:literal $World:ident($Settings:ty);)+) => {
-        /// The settings of one world; `kind` in the file says which world.
-        #[derive(Clone, Debug, PartialEq, Serialize)]
-        #[serde(tag = "kind")]
-        pub enum WorldConfig {
-            $($(#[$doc])* #[serde(rename = $kind)] $World($Settings),)+
-            /// A world that the program registered.
-            #[serde(untagged)]
-            Custom(CustomWorld),
-        }
-
-        /// The `kind` of each world of this crate in a settings file.
-        const KIND_NAMES: &[&str] = &[$($kind),+];
-
-        /// Every world of this crate: its kind, and a function that returns its variants.
-        const KINDS: &[(&str, fn() -> Variants)] = &[$(($kind, <$Settings>::variants)),+];
-
-        impl WorldConfig {
-            fn settings(&self) -> (&'static str, &(dyn WorldSettings + 'static)) {
-                match self {
-                    $(Self::$World(settings) => ($kind, settings),)+
-                    Self::Custom(custom) => (custom.kind(), custom.settings()),
-                }
-            }
-
-            /// Reads the settings of this crate's world `kind`; `None` if the crate has no such world.
-            fn parse_built_in(kind: &str, fields: &Table) -> Option<Result<Self, toml::de::Error>> {
-                match kind {
-                    $($kind => Some(fields.clone().try_into().map(Self::$World)),)+
-                    _ => None,
-                }
-            }
-        }
-    };
-}
-
-worlds! {
-    /// One of Procgen's games.
-    "procgen" Procgen(ProcgenConfig);
-    /// Ms. PacMan.
-    "mspacman" MsPacman(PacmanConfig);
-    /// The Ising patch in noise.
-    "ising" Ising(IsingConfig);
-    /// The corridor.
-    "chain" Chain(ChainConfig);
-    /// A process that a command starts.
-    "exec" Exec(ExecConfig);
-}
+use crate::worlds::{KIND_NAMES, KINDS, WorldConfig, procgen::ProcgenConfig};
 
 /// The prefix of `libenv:PATH:GAME`: one of Procgen's games, run by another build of its library.
 const LIBENV_PREFIX: &str = "libenv";

@@ -1,5 +1,5 @@
 //! The interface of a world's settings: what a run must know of a world before it is built, and how to build it.
-//! `registry` lists the worlds.
+//! `worlds` lists the worlds.
 
 use std::time::Duration;
 

@@ -33,7 +33,7 @@ macro_rules! layers {
 
 const BASE: Layer = Layer::built_in("base", "base", include_str!("../presets/base.toml"));
 
-/// The layer of each kind of world in the registry of worlds.
+/// The layer of each kind of world in the menu of worlds.
 const WORLDS: &[Layer] = layers!("world/": "procgen" "mspacman" "chain" "ising" "exec");
 
 /// Every preset, `paper` first. It is laid over base and world, under the agent: a preset does not change what defines an agent, such as
