@@ -169,6 +169,8 @@ fn a_world_of_wrong_settings_is_not_built() {
 
 #[test]
 fn a_built_world_is_as_its_settings_say_and_rejects_wrong_buffers_and_actions() {
+    let count = KIND_NAMES.len();
+    assert_eq!(configs().len() + 1, count, "`configs` lacks a new world");
     let with_engine = procgen::tests::engine().map(|_| procgen(0, 500));
     for config in configs().into_iter().chain(with_engine) {
         assert!(config.build(0, 1, 0).is_err());
