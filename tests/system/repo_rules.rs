@@ -224,8 +224,9 @@ fn the_code_stays_within_its_budget() {
             .iter()
             .filter(|it| Path::new(&it.name).starts_with(folder));
         let lines: usize = inside.map(|it| it.text.lines().count()).sum();
-        let range = 1..=lines_max;
-        assert!(range.contains(&lines), "{folder}: {lines} of {range:?}");
+        let hint = "cut lines, or raise LINES_MAX and say in the commit what they add";
+        let is_within = (1..=lines_max).contains(&lines);
+        assert!(is_within, "{folder}: {lines} of {lines_max}; {hint}");
     }
     for Source { name, text } in &files {
         let lines = text.lines().count();
