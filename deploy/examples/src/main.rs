@@ -1,4 +1,4 @@
-//! `driml` with a custom world and auxiliary loss: `cargo run --release -p driml-examples -- local --env island --agent predictive`.
+//! `driml` with a custom world and auxiliary loss: `cargo run --release -p driml-examples -- train --env island --agent predictive`.
 //! The additions are in two files beside this one; the project itself is unchanged. Your own package looks the same, with git dependencies
 //! on the crates. The launcher starts every process from this same program, so all have both additions.
 
