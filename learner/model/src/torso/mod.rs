@@ -1,5 +1,5 @@
-//! The menu of torsos, one arm of [`TorsoName::build`] each. `impoola` is `impala` with another last layer.
-//! The interface of a torso is in `interface`.
+//! The menu of torsos: each is a file here, a variant of [`TorsoName`], and an arm of each `match` here and of two in the learner, which
+//! describe it in checkpoints and set its tolerance in parity cases. `impoola` is `impala` with another last layer.
 
 mod impala;
 pub(crate) mod interface;
