@@ -78,7 +78,8 @@ fn every_number_has_its_source_beside_it() {
                     _ => true,
                 };
                 let what = format!("{name}: {path} = {value} has the comment {comment:?}");
-                assert!(has_source, "{what}");
+                let hint = "name one of SOURCES in it, and for f16 or bf16 a price in %";
+                assert!(has_source, "{what}: {hint}");
             }
         }
     }
