@@ -10,6 +10,7 @@ use crate::{
 };
 
 /// Version of the fields of [`RunSpec`], for their hash. The protocol version may change while checkpoints stay valid.
+/// A new field is optional and not serialised when absent: the hash of earlier runs, which their checkpoints contain, then stays.
 const FIELDS_VERSION: u16 = 1;
 
 /// Most positives that a row can carry; a rule that needs more is rejected.
