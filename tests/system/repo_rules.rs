@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_560),
-    ("actor", 10_550),
-    ("replay-server", 11_050),
-    ("learner", 21_960),
-    ("deploy", 31_030),
-    ("tests", 10_370),
+    ("protocol", 7_550),
+    ("actor", 10_535),
+    ("replay-server", 11_150),
+    ("learner", 21_900),
+    ("deploy", 31_060),
+    ("tests", 10_430),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -45,9 +45,7 @@ impl FromStr for CheckpointChoice {
             ),
             _ => whole_number::within(1..=u64::MAX)(text)
                 .map(Self::After)
-                .map_err(|e| {
-                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
-                }),
+                .map_err(|_| "give the updates of a checkpoint, \"best\" or \"newest\"".to_owned()),
         }
     }
 }

@@ -39,6 +39,9 @@ pub fn within(
         let (least, most) = (range.start(), range.end());
         match range.contains(&number) {
             true => Ok(number),
+            false if *most >= i64::MAX as u64 => {
+                Err(format!("{number} is too few: give {least} or more"))
+            }
             false => Err(format!("{number} is not in {least}..={most}")),
         }
     }
