@@ -39,7 +39,8 @@ pub fn within(
         let (least, most) = (range.start(), range.end());
         match range.contains(&number) {
             true => Ok(number),
-            false if *most >= i64::MAX as u64 => {
+            // The largest number of 64 bits helps no user.
+            false if number < *least && *most >= i64::MAX as u64 => {
                 Err(format!("{number} is too few: give {least} or more"))
             }
             false => Err(format!("{number} is not in {least}..={most}")),
@@ -94,5 +95,7 @@ mod tests {
         let few = within(1..=10);
         assert_eq!(few("1e1"), Ok(10));
         assert_eq!(few("11").unwrap_err(), "11 is not in 1..=10");
+        let seed = within(0..=i64::MAX as u64);
+        assert!(seed("1e19").unwrap_err().contains("is not in 0..="));
     }
 }
