@@ -111,6 +111,7 @@ fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
         })
     };
     let shown_scores = Spread::of(first.maps.iter().flatten().copied());
+    let shown_scores = shown_scores.filter(|it| it.min < it.max);
     let range = shown_scores.map_or((0.0, 1.0), |it| (it.min, it.max));
     let fields = ReceptiveFields::of(&task.model);
     let title = format!("Scores, t = {} to {early_t}", settings.from_t);
