@@ -184,7 +184,7 @@ mod tests {
             ("{{ [1.0] | length | counted('run') }}", "1 run"),
             ("{{ 1234567 | thousands }}", "1,234,567"),
             ("{{ [2.0] | mean | factor }}", "x2.00"),
-            ("{{ none | mean | sci }}", "-"),
+            ("{{ [] | mean | sci }}", "-"),
             ("{{ [] | minus(base) }}{{ none | fixed(3) }}", "--"),
             ("{{ [1.0] | minus(base) }}", "+0.98 (one seed)"),
             ("{{ more | minus(base) }}", "+1.14 [+0.93, +1.34]"),
