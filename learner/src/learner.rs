@@ -29,7 +29,7 @@ pub struct Learner {
     config: LearnerConfig,
     state: LearnerState,
     preparation: Preparation,
-    /// Share of the targets beyond C51's atoms, over about the last 100 updates; `None` once that was warned of.
+    /// Share of the targets beyond C51's atoms, over about the last 100 updates; `None` after the warning.
     share_beyond: Option<f64>,
 }
 
@@ -149,19 +149,16 @@ impl Learner {
         Ok(report)
     }
 
-    /// Warns once if C51 clips many of the newest targets, of which `share` of the last batch.
+    /// Warns once if C51 clips many of the newest targets. `share` is that of the last batch.
     fn warn_of_clipping(&mut self, share: f64) {
-        let Some(mean) = &mut self.share_beyond else {
-            return;
-        };
-        *mean += (share - *mean) / 100.0;
-        if *mean > SHARE_BEYOND_MAX {
-            let percent = *mean * 100.0;
-            self.share_beyond = None;
+        let mean = self.share_beyond.map(|mean| mean + (share - mean) / 100.0);
+        self.share_beyond = mean.filter(|it| *it <= SHARE_BEYOND_MAX);
+        if let (Some(mean), None) = (mean, self.share_beyond) {
             let (v_min, v_max) = (self.config.model.v_min, self.config.model.v_max);
             tracing::warn!(
-                "{percent:.0}% of the newest targets lie beyond model.v_min = {v_min} or model.v_max = {v_max}, where C51 clips them and \
+                "{:.0}% of the newest targets lie beyond model.v_min = {v_min} or model.v_max = {v_max}, where C51 clips them and \
                  no longer tells actions apart: start a new run with a wider range, such as --set model.v_min={} --set model.v_max={}",
+                100.0 * mean,
                 4.0 * v_min,
                 4.0 * v_max
             );

@@ -80,14 +80,14 @@ pub fn share_beyond(
     let atoms = probs.len() / reward.len();
     let (v_min, v_max) = (f64::from(v_min), f64::from(v_max));
     let (spacing, margin) = ((v_max - v_min) / (atoms - 1) as f64, (v_max - v_min) * 1e-3);
-    let is_beyond = |&(row, (&reward, &discount)): &(&[f32], (&f32, &f32))| {
+    let mut beyond = 0;
+    for (row, (&reward, &discount)) in probs.chunks_exact(atoms).zip(reward.iter().zip(discount)) {
         let probs = row.iter().enumerate();
         let atom: f64 = probs.map(|(i, &p)| i as f64 * f64::from(p)).sum();
         let mean = f64::from(reward) + f64::from(discount) * (v_min + atom * spacing);
-        mean < v_min - margin || mean > v_max + margin
-    };
-    let rows = probs.chunks_exact(atoms).zip(reward.iter().zip(discount));
-    rows.filter(is_beyond).count() as f64 / reward.len() as f64
+        beyond += usize::from(mean < v_min - margin || mean > v_max + margin);
+    }
+    beyond as f64 / reward.len() as f64
 }
 
 #[cfg(test)]
