@@ -34,8 +34,8 @@ use crate::{
 
 /// How long the learner may take to save after its launcher was killed.
 const SAVING_MAX: Duration = Duration::from_secs(120);
-/// How long the other processes may then take to exit; a replay server stays for 10 s if one of them is frozen.
-const ENDING_MAX: Duration = Duration::from_secs(20);
+/// How long the other processes may then take to exit; a replay server stays for 25 s if one of them is frozen.
+const ENDING_MAX: Duration = Duration::from_secs(35);
 const WAIT_POLL: Duration = Duration::from_millis(250);
 
 /// Whether the run in `folder`, which plays `world`, can be resumed. It needs a checkpoint, and a world that keeps no progress across

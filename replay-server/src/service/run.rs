@@ -55,7 +55,7 @@ pub struct RunArgs {
     pub dir: Option<PathBuf>,
     /// Whether to keep answering after the run is over, until `drain` or `shutdown`.
     pub keep_alive: bool,
-    /// Raised when the launcher has died, which also stops the other processes. This process then waits up to 10 s until they have
+    /// Raised when the launcher has died, which also stops the other processes. This process then waits up to 25 s until they have
     /// delivered their data and left, and exits. To stop at once, raise this and `shutdown`.
     pub drain: Shutdown,
     /// The run's resolved settings, which it sends to each process that joins.
