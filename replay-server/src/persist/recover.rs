@@ -224,11 +224,6 @@ impl LogReader<'_> {
         self.recovery.found = true;
         self.position.next_ordinal = ordinal + 1;
         let (at, ended) = self.read_records(bytes, at);
-        if let Err(RecordError::Misfit(why)) = ended {
-            return Err(unusable(format!(
-                "{why}. Start with the settings of before"
-            )));
-        }
         let cut = bytes.len() - at;
         self.recovery.bytes += at as u64;
         self.position.segments.push_back(Segment {
@@ -240,6 +235,9 @@ impl LogReader<'_> {
         self.closed = matches!(ended, Ok(true)).then(|| name.clone());
         match ended {
             Ok(_) => {}
+            Err(RecordError::Misfit(why)) => {
+                return Err(unusable(format!("{why}. Start with the earlier settings")));
+            }
             Err(_) if !is_last => self.warn(format!(
                 "{name} is damaged at byte {at}: {cut} bytes of it cannot be used"
             )),
@@ -247,7 +245,7 @@ impl LogReader<'_> {
             Err(RecordError::Torn) => tracing::info!(
                 "the last record of {name} was not written whole: its {cut} bytes are cut off"
             ),
-            Err(_) => self.warn(format!(
+            Err(RecordError::Damaged) => self.warn(format!(
                 "{name} is damaged at byte {at}: the {cut} bytes from there on are cut off, as nothing after them can be trusted. What was stored \
                  and served then is lost"
             )),

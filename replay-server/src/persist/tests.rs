@@ -101,9 +101,6 @@ fn a_replay_too_small_for_a_chunk_of_the_log_leaves_the_log_as_it_is() {
     let stored = replay.stored_bytes().unwrap();
     drop(replay);
     let error = try_open(folder.path(), 7).err().unwrap().to_string();
-    assert!(
-        error.contains("Start with the settings of before"),
-        "{error}"
-    );
+    assert!(error.contains("8 transitions in one chunk"), "{error}");
     assert!(open(folder.path()).stored_bytes().unwrap() == stored);
 }
