@@ -26,32 +26,8 @@ pub(super) struct WatchedRun {
     /// Shows the run from its beginning, as far as that is known.
     pub(super) display: Display,
     recorder: Option<RunRecorder>,
-    uptimes: Uptimes,
-}
-
-/// The uptime of each server when it last answered, seconds.
-#[derive(Default)]
-struct Uptimes(Vec<f64>);
-
-impl Uptimes {
-    /// Takes each server's uptime and whether its replay is kept on disk; `None` for a server that did not answer. Returns the number of a
-    /// server that was started again without its replay: its counts begin anew.
-    fn find_begun_anew(
-        &mut self,
-        answers: impl ExactSizeIterator<Item = Option<(f64, bool)>>,
-    ) -> Option<usize> {
-        self.0.resize(answers.len(), 0.0);
-        let mut found = None;
-        for (number, (last_s, answer)) in self.0.iter_mut().zip(answers).enumerate() {
-            if let Some((up_s, is_kept)) = answer {
-                if up_s < *last_s && !is_kept {
-                    found = Some(number);
-                }
-                *last_s = up_s;
-            }
-        }
-        found
-    }
+    /// The uptime of each server when it last answered, seconds.
+    uptimes_s: Vec<f64>,
 }
 
 impl WatchedRun {
@@ -76,7 +52,7 @@ impl WatchedRun {
         Ok(Self {
             display,
             recorder,
-            uptimes: Uptimes::default(),
+            uptimes_s: vec![0.0; view.servers.len()],
         })
     }
 
@@ -92,9 +68,9 @@ impl WatchedRun {
             let status = it.processes.as_ref()?;
             Some((status.up_s, status.log.is_some()))
         });
-        // Rows of two lives in one table would contradict each other.
-        if let Some(number) = self.uptimes.find_begun_anew(answers)
-            && self.recorder.is_some()
+        // Its rows would contradict those before.
+        if self.recorder.is_some()
+            && let Some(number) = find_begun_anew(&mut self.uptimes_s, answers)
         {
             bail!(
                 "{} was started again with an empty replay: start `driml watch` again",
@@ -161,6 +137,18 @@ impl WatchedRun {
         missing.iter().for_each(|line| console::eprintln(line));
         recorder.summarise(outcome, view)
     }
+}
+
+/// Returns the number of a server that was started again without its replay, so that its counts begin anew. Each answer has a server's
+/// uptime and whether its replay is kept on disk; `None` for a server that did not answer.
+fn find_begun_anew(
+    uptimes_s: &mut [f64],
+    answers: impl Iterator<Item = Option<(f64, bool)>>,
+) -> Option<usize> {
+    let mut servers = uptimes_s.iter_mut().zip(answers);
+    servers.position(|(last_s, answer)| {
+        answer.is_some_and(|(up_s, is_kept)| up_s < std::mem::replace(last_s, up_s) && !is_kept)
+    })
 }
 
 fn open_recorder(
@@ -244,9 +232,10 @@ mod tests {
     #[test]
     fn a_server_that_was_started_again_without_its_replay_is_found() {
         for (is_kept, found) in [(false, Some(1)), (true, None)] {
-            let mut uptimes = Uptimes::default();
+            let mut uptimes_s = [0.0; 2];
             let mut find = |up_s: [Option<f64>; 2]| {
-                uptimes.find_begun_anew(up_s.into_iter().map(|it| Some((it?, is_kept))))
+                let answers = up_s.into_iter().map(|it| Some((it?, is_kept)));
+                find_begun_anew(&mut uptimes_s, answers)
             };
             // The second server does not answer for a while, and is then another process.
             for up_s in [[Some(2.0), Some(3.0)], [Some(4.0), None]] {
