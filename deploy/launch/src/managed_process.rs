@@ -28,7 +28,7 @@ const EARLY_FAILURE_MAX: Duration = Duration::from_secs(10);
 const KILLED_MAX: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(20);
 
-/// A child process that was started.
+/// A child process that was started. Dropping this kills it.
 #[derive(Debug)]
 pub struct ManagedProcess {
     /// The process's name: `replay-server`, `learner`, `actor-0`.

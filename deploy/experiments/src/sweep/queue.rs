@@ -329,7 +329,6 @@ impl Queue {
         let processes = self.running.iter_mut().map(|it| &mut it.process);
         let abort = || progress.shutdown.immediate.is_set();
         stop_processes(processes, true, DRAIN_MAX, &abort);
-        self.running.clear();
     }
 }
 

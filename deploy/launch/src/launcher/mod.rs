@@ -23,7 +23,6 @@ use crate::{
     last_play,
     managed_process::{ManagedProcess, stop_processes},
     open_files,
-    process_log::ProcessLog,
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_atomically},
@@ -312,8 +311,8 @@ impl Launch<'_> {
         if !view.shards.is_empty() {
             self.recorder.record(view, &[]);
         }
-        let logs = self.processes.iter().filter_map(|it| it.log.as_ref());
-        let logs = logs.filter_map(ProcessLog::loss_message);
+        let processes = self.processes.iter();
+        let logs = processes.filter_map(|it| it.log.as_ref()?.loss_message());
         let missing = console::join_losses(self.recorder.loss_messages().into_iter().chain(logs));
         missing.iter().for_each(|line| console::eprintln(line));
         let mut summary = self.recorder.summarise(outcome, view);
