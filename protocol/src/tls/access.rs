@@ -125,7 +125,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
     }
 }
 
-/// A rule of zenoh's access control, which allows `messages` at `keys`. `flows` and `messages` are words.
+/// A rule of zenoh's access control, which allows `messages` at `keys`. `flows` and `messages` are lists of words.
 fn allow(id: &str, flows: &str, messages: &str, keys: &[String]) -> Value {
     let words = |text: &str| text.split(' ').map(Value::from).collect::<Vec<_>>();
     let (flows, messages) = (words(flows), words(messages));
@@ -164,7 +164,7 @@ pub(crate) fn access_rules(keys: &Keys) -> String {
             json!({ "id": name, "cert_common_names": [name], "link_protocols": ["quic"] });
         (subject, role_rules(role, &grant(keys, role)))
     });
-    // The permissions of a unix socket's folder guard it.
+    // Everything is allowed through a unix socket: the permissions of its folder guard it.
     let local = json!({ "id": "this-machine", "link_protocols": ["unixsock-stream"] });
     let all = "put delete declare_subscriber query reply declare_queryable liveliness_token liveliness_query \
                declare_liveliness_subscriber";

@@ -151,8 +151,8 @@ impl Buffer {
     }
 }
 
-/// Whether other processes can still read `payload`. zenoh writes off shared memory of a process that seems dead: whose thread for that
-/// purpose got no processor for 100 ms. Receivers silently drop messages in it, while this process can still read it.
+/// Whether other processes can still read `payload`. zenoh writes off the shared memory of a process that seems dead, because its watchdog
+/// thread got no processor for 100 ms. Receivers then drop messages in it without a warning, although this process can still read it.
 pub fn is_readable(payload: &ZBytes) -> bool {
     payload.as_shm().is_none_or(|shared| shared.is_valid())
 }
