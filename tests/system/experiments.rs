@@ -3,7 +3,7 @@
 
 use std::{collections::BTreeMap, fs, os::unix::fs::MetadataExt, path::Path};
 
-use driml_tests::check_has;
+use driml_tests::{check_has, wait_until};
 
 use crate::{SMALL_NETWORK, system};
 
@@ -310,6 +310,11 @@ fn killed_and_resumed() {
     let run = system.run_folder("x/runs/mspacman-c51-seed1");
     run.wait_for_updates(0);
     process.kill();
+    // Released before its launcher notices, the learner may finish the run.
+    wait_until("the run stops", || {
+        let log = system.read("x/runs/mspacman-c51-seed1.log");
+        log.contains("stopping: ")
+    });
     system.release_learners();
     system
         .run_ok(call)
