@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use anyhow::bail;
 use clap::{ArgGroup, Args};
 use driml_launch::{
     endpoint::{DEFAULT_NAMESPACE, check_connect_endpoints},
@@ -9,13 +10,14 @@ use driml_launch::{
     view::Poller,
     watch::{self, UnreachableRun, WatchFlags, read_endpoints},
 };
+use driml_machine::error::usage;
 use driml_protocol::tls::Role;
 
 use super::join::TlsFlags;
 
 /// Flags that select a run.
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("whose").required(true))]
+#[command(group = ArgGroup::new("whose"))]
 pub(crate) struct RunSelection {
     /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", group = "whose")]
@@ -84,8 +86,13 @@ impl RunSelection {
     }
 
     fn endpoints(&self) -> anyhow::Result<Vec<String>> {
-        let of_folder = self.folder().map(|it| read_endpoints(&it));
-        of_folder.unwrap_or_else(|| Ok(self.connect.clone()))
+        match self.folder() {
+            Some(folder) => read_endpoints(&folder),
+            None if self.connect.is_empty() => bail!(usage!(
+                "no run is named: give its folder, or its replay server with --connect"
+            )),
+            None => Ok(self.connect.clone()),
+        }
     }
 
     fn folder(&self) -> Option<RunFolder> {
