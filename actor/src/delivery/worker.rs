@@ -292,7 +292,7 @@ impl DeliveryWorker {
     }
 
     /// Waits for the reply to the first chunk. Returns `None` on a shutdown of which the replay server does not know yet, and if the server
-    /// may have dropped the chunk, because its memory is no longer readable.
+    /// may have dropped the chunk, because zenoh has written off its memory.
     fn wait_for_first(&mut self) -> Result<Option<InsertReply>, SessionError> {
         let first = &mut self.outgoing[0];
         let Some(mut reply) = first.pending.take() else {

@@ -61,7 +61,7 @@ worlds! {
     "mspacman" MsPacman(pacman::PacmanConfig);
     /// The Ising patch in noise.
     "ising" Ising(ising::IsingConfig);
-    /// The corridor.
+    /// A corridor with a small reward at one end and a large one at the other.
     "chain" Chain(chain::ChainConfig);
     /// A process that a command starts.
     "exec" Exec(exec::ExecConfig);
