@@ -198,6 +198,10 @@ fn pacman() {
     let folder = system.path("experiments/pacman-smoke");
     let files = "fig3.png fig3.svg final_loss.csv ghosts.csv loss.csv noise.csv";
     check_page(&folder, &["**Results.**\n\n* ", "| --- |"], files);
+    // Two agents with 64 episodes each.
+    for returns in ["ghosts.csv", "noise.csv"] {
+        assert_eq!(count_rows(&data_files(&folder), returns), 128, "{returns}");
+    }
     let config = |name: &str| {
         let path = folder.join("runs").join(name).join("config.toml");
         fs::read_to_string(path).unwrap()

@@ -1,10 +1,12 @@
 //! The results of the runs of Fig. 3: losses over frames, and returns over episodes.
 
+use driml_launch::run_folder::{RunFolder, Table};
+use driml_protocol::RETURNS_MAX;
 use serde::Serialize;
 
 use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
-    plot::Run,
+    plot::{Run, smooth},
     stats::{mean, rank_correlation},
     sweep::PointRun,
 };
@@ -39,14 +41,14 @@ pub(super) struct Loss {
     pub(super) episodes: f64,
 }
 
-/// Training return over episodes, up to the end of the last task.
+/// Training return, the mean of the last [`RETURNS_MAX`] episodes, over episodes up to the end of the last task.
 #[derive(Serialize)]
 pub(super) struct Trace {
     pub(super) agent: String,
     pub(super) seed: u32,
     #[serde(skip)]
     pub(super) points: Points,
-    /// For each task the return at its end, and the mean over the task; `None` if the metrics have no row within the task.
+    /// For each task the return at its end, and the mean over the task; `None` if no episode of the task has a return.
     pub(super) tasks: Vec<Option<(f64, f64)>>,
 }
 
@@ -54,9 +56,10 @@ impl Results {
     pub(super) fn read(settings: Settings, made: Vec<PointRun<Point>>) -> anyhow::Result<Self> {
         let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PARTS]);
         for PointRun { point, plan, run } in made {
-            let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
+            let seed = plan.call.seed;
             match point {
                 Point::Epsilon(epsilon) => {
+                    let metrics = Run::read(&run.folder)?;
                     let frames = settings.predictability.frames as f64;
                     for (column, _) in LOSSES {
                         let points = metrics.values("frames", column)?;
@@ -73,7 +76,8 @@ impl Results {
                 }
                 Point::Tasks(part, agent) => {
                     let continual = settings.continual(part);
-                    let mut points = metrics.values("episodes", "mean_return")?;
+                    // A short run is over after few rows of metrics, so count its episodes.
+                    let mut points = smooth(&training_returns(&run.folder)?, RETURNS_MAX as f64);
                     points.retain(|point| point.0 <= continual.episodes() as f64);
                     traces[part].push(Trace {
                         agent,
@@ -107,6 +111,18 @@ impl Results {
         let pairs: Points = pairs.collect();
         Some((rank_correlation(&pairs)?, pairs.len()))
     }
+}
+
+/// Returns the number and the return of each training episode.
+fn training_returns(folder: &RunFolder) -> anyhow::Result<Points> {
+    let episodes = Table::read(&folder.episodes())?;
+    let of = |row| {
+        Some((
+            episodes.value(row, "episode")?,
+            episodes.value(row, "return")?,
+        ))
+    };
+    Ok(episodes.rows.iter().filter_map(of).collect())
 }
 
 fn mean_from(points: &Points, frames: f64) -> Option<f64> {
