@@ -141,7 +141,7 @@ fn a_narrow_link_stops_no_process() {
     let system = system();
     // Pause the learner, so that the other actor does not play all frames before this one begins.
     system.pause_learners_at(500);
-    let Some(mut run) = Run::start(system, 2, 10_000, 8) else {
+    let Some(mut run) = Run::start(system, 2, 20_000, 8) else {
         return;
     };
     wait_until("both actors", || {
@@ -155,8 +155,11 @@ fn a_narrow_link_stops_no_process() {
     wait_until("packets that wait at the link", || {
         run.network.delayed_packets("actor0") > 20
     });
-    run.wait_for_frames(6_000);
-    let status = wait_for("an answer", || run.status());
+    let status = wait_for("6,000 frames", || {
+        let inserted = |it: &Value| it["replay"]["transitions_inserted"].as_u64() >= Some(6_000);
+        run.status().filter(inserted)
+    });
+    assert!(run.processes.iter_mut().all(Process::is_running));
     let processes = &status["servers"][0]["processes"]["processes"];
     let processes = processes.as_array().unwrap();
     assert_eq!(processes.len(), 3, "a learner and two actors");
@@ -165,7 +168,6 @@ fn a_narrow_link_stops_no_process() {
         let last_seen_s = process["last_seen_s"].as_f64().unwrap();
         assert!(is_there && last_seen_s < 10.0, "{process}");
     }
-    assert!(run.processes.iter_mut().all(Process::is_running));
     run.check_end();
 }
 
