@@ -132,6 +132,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     system.fails(&watch_once, words);
     let _processes = [system.start_learner("run"), system.start_actor(0)];
     client.wait_for_the_last_update();
+    client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
 
     let ended = system.run_ok(&format!("{watch_once} --json --prometheus run.prom"));
     let json = ended.json();
