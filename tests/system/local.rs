@@ -68,7 +68,7 @@ fn clipped_returns_are_warned_of_once() {
 fn driml_ada_with_two_actors_over_tcp() {
     let (endpoint, _) = listen_on_free_port();
     let system = system().with_endpoint(endpoint);
-    // Pause the learner, so that the run does not end before its second actor starts.
+    // Pause the learner, so that the run does not end before its second actor plays.
     system.pause_learners_at(500);
     let longer = chain(2_560);
     // The alphabet maps all actions to one, so the learner's affinity A is 1 everywhere and k reaches its maximum. Without the learner's A,
@@ -78,7 +78,7 @@ fn driml_ada_with_two_actors_over_tcp() {
     let process = system.start(&system.local_args(&flags));
     system
         .connect()
-        .wait_for_replay("both actors", |replay| replay.actors == 2);
+        .wait_for_replay("both actors", |replay| replay.actors_acting == 2);
     system.release_learners();
     process.wait_ok();
     let run = system.run_folder("run");
