@@ -63,6 +63,8 @@ fn processes_end_by_themselves_when_the_run_is_over() {
     let system = system();
     let endpoints = [0, 1].map(|shard| system.socket_endpoint(&format!("e\u{301}{shard}")));
     let flags = format!("--agent driml-ada --replay-shards 2 --actors 2 {SHORT}");
+    // Pause the learner, so that the run does not end before both actors play.
+    system.pause_learners_at(100);
     let mut calls = Vec::new();
     for (shard, endpoint) in endpoints.iter().enumerate() {
         calls.push(format!(
@@ -72,7 +74,11 @@ fn processes_end_by_themselves_when_the_run_is_over() {
     }
     let all = endpoints.join(" --connect ");
     calls.push(format!("learner --connect {all} --run-dir run"));
-    let processes: Vec<_> = calls.iter().map(|it| system.start_process(it)).collect();
+    let mut processes: Vec<_> = calls.iter().map(|it| system.start_process(it)).collect();
+    for actor in [1, 3] {
+        processes[actor].wait_for_stderr("steps 4 environments");
+    }
+    system.release_learners();
     for process in processes {
         process.wait_ok();
     }
