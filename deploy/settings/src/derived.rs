@@ -98,7 +98,7 @@ pub(crate) fn drop_other_torsos(
     if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
         for key in others {
             if !is_set(&format!("model.{key}")) {
-                model.remove(*key);
+                model.remove(key);
             }
         }
     }

@@ -9,7 +9,8 @@ pub(crate) use crate::heads::config::HeadConfig;
 use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::init::Initializer;
 use crate::layers::LayerSpec;
-use crate::torso::{TorsoName, TorsoSettings, interface::Torso};
+use crate::torso::TorsoName;
+use crate::torso::interface::{Torso, TorsoSettings};
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
 const DIMENSION_MAX: usize = 1 << 16;
@@ -217,6 +218,7 @@ impl ModelConfig {
 
     fn torso_settings(&self) -> TorsoSettings<'_> {
         TorsoSettings {
+            input: (self.height, self.width, self.input_channels),
             conv: &self.conv,
             channels: &self.channels,
             scale_blocks: self.scale_blocks,
@@ -225,8 +227,7 @@ impl ModelConfig {
 
     /// Builds the torso. If the configuration is invalid, the torso is unusable.
     pub(crate) fn torso(&self) -> Box<dyn Torso> {
-        let input = (self.height, self.width, self.input_channels);
-        self.torso.build(input, &self.torso_settings())
+        self.torso.kind().build(&self.torso_settings())
     }
 
     /// Returns the height, width and channels of f3. Meaningful for a valid configuration.

@@ -1,7 +1,7 @@
 //! The description of a checkpoint's networks in safetensors' metadata, so that another program can load a single file.
 //! This program reads it only to report which setting of a checkpoint differs. A checkpoint without a description loads too.
 
-use driml_model::{InputSize, ModelConfig, TorsoName};
+use driml_model::{InputSize, ModelConfig};
 use driml_protocol::RunSpec;
 use safetensors::{SafeTensorError, SafeTensors};
 use serde::Serialize;
@@ -13,23 +13,8 @@ pub const METADATA_KEY: &str = "driml";
 const FORMAT: u32 = 1;
 /// For a reader who has nothing but the file. More: `deploy/docs/src/reference/weights.md`.
 const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [model], divided by 255; channels are the newest frame_stack \
-    frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k]TORSO; HEAD. \
+    frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k] TORSO; HEAD. \
     Atoms: v_min to v_max, evenly. Value of an action: sum of softmax(logits) * atoms.";
-
-/// The text about the torso in [`CONVENTIONS`].
-fn torso_convention(model: &ModelConfig) -> String {
-    let read = match model.torso {
-        TorsoName::Nature => {
-            return " without padding, each followed by ReLU; torso.fc takes their output as channel, row, column".into();
-        }
-        TorsoName::Impala => "ReLU of the last stage's output as channel, row, column",
-        TorsoName::Impoola => "the mean over the locations of ReLU of the last stage's output",
-    };
-    format!(
-        " with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
-         and block2; torso.fc takes {read}"
-    )
-}
 
 /// The text about the C51 head in [`CONVENTIONS`].
 const fn head_convention(model: &ModelConfig) -> &'static str {
@@ -62,7 +47,7 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
     let description = Description {
         format: FORMAT,
         conventions: CONVENTIONS
-            .replace("TORSO", &torso_convention(model))
+            .replace("TORSO", &model.torso.describe())
             .replace("HEAD", head_convention(model)),
         model,
         input,

@@ -263,7 +263,7 @@ fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = random_batch(5, 9);
     let (states_k, valid) = (later_states(&rows), [1; 5 * POSITIVES]);
     let refuses = |kind, batch: Batch<'_>, words: &str| {
-        let error = agent(kind, GLOBAL).evaluate(&batch).unwrap_err();
+        let error = agent(kind, GLOBAL).gradients(&batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
         check_says(error, &[words]);
     };

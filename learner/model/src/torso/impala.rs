@@ -4,7 +4,7 @@
 
 use candle_core::{Result, Tensor};
 
-use super::interface::{ActingTorso, Torso, TorsoParameters};
+use super::interface::{ActingTorso, Torso, TorsoKind, TorsoParameters, TorsoSettings};
 use crate::compute::Kernels;
 use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stage_shapes};
 use crate::init::Initializer;
@@ -25,15 +25,47 @@ const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "block2.conv2",
 ];
 
+#[derive(PartialEq)]
+pub(super) enum Kind {
+    Impala,
+    Impoola,
+}
+
+impl TorsoKind for Kind {
+    fn settings(&self) -> &'static [&'static str] {
+        &["channels", "scale_blocks"]
+    }
+
+    fn build(&self, settings: &TorsoSettings<'_>) -> Box<dyn Torso> {
+        Box::new(Impala {
+            input: settings.input,
+            widths: settings.channels.to_vec(),
+            scale_blocks: settings.scale_blocks,
+            takes_mean: *self == Self::Impoola,
+        })
+    }
+
+    fn describe(&self) -> String {
+        let read = match self {
+            Self::Impala => "ReLU of the last stage's output as channel, row, column",
+            Self::Impoola => "the mean over the locations of ReLU of the last stage's output",
+        };
+        format!(
+            "with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
+             and block2; torso.fc takes {read}"
+        )
+    }
+}
+
 /// The torso `impala` or `impoola`, on an input of (height, width, channels).
 #[derive(Debug)]
-pub(crate) struct Impala {
-    pub(super) input: (usize, usize, usize),
-    pub(super) widths: Vec<usize>,
+struct Impala {
+    input: (usize, usize, usize),
+    widths: Vec<usize>,
     /// Whether the initial weight of each block's second convolution is divided by the square root of the number of blocks.
-    pub(super) scale_blocks: bool,
+    scale_blocks: bool,
     /// Whether the fully connected layer takes the mean of f3 over its locations, as in `impoola`.
-    pub(super) takes_mean: bool,
+    takes_mean: bool,
 }
 
 impl Torso for Impala {

@@ -1,4 +1,4 @@
-//! The interface of a torso: its convolutions, f3 and f4 with gradients, and f4 for an actor.
+//! The interface of a torso: what the menu knows of it; its convolutions, f3 and f4 with gradients, and f4 for an actor.
 //! The list of torsos is in the folder's `mod.rs`.
 
 use std::fmt;
@@ -6,9 +6,36 @@ use std::fmt;
 use candle_core::Tensor;
 
 use crate::compute::Kernels;
+use crate::geometry::ConvLayer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
 use crate::layers::{Layer, LayerSpec};
+
+/// The settings of all torsos. Each torso reads its own.
+pub(crate) struct TorsoSettings<'a> {
+    /// Height, width and channels of the input.
+    pub(crate) input: (usize, usize, usize),
+    pub(crate) conv: &'a [ConvLayer],
+    pub(crate) channels: &'a [usize],
+    pub(crate) scale_blocks: bool,
+}
+
+/// What the menu knows of a torso.
+pub(crate) trait TorsoKind: Sync {
+    /// The names of the settings that it reads. It is made of the first, which must be given.
+    fn settings(&self) -> &'static [&'static str];
+
+    fn build(&self, settings: &TorsoSettings<'_>) -> Box<dyn Torso>;
+
+    /// Returns (height, width) of the part of `image` that it reads, from the upper left corner; `None` if `conv` does not fit. With
+    /// zero padding, every pixel is in a window.
+    fn read_size(&self, _conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+        Some(image)
+    }
+
+    /// See [`super::TorsoName::describe`].
+    fn describe(&self) -> String;
+}
 
 /// A torso of given sizes, without its parameters. It turns frames into f3, the output of its convolutions, and f4, a fully
 /// connected layer on f3. It ends before f4's ReLU, because DIM reads f4 before the ReLU and the C51 head after it.

@@ -1,5 +1,4 @@
-//! The menu of torsos: each is a file here, a variant of [`TorsoName`], and an arm of each `match` here and of two in the learner, which
-//! describe it in checkpoints and set its tolerance in parity cases. `impoola` is `impala` with another last layer.
+//! The menu of torsos: each is a file here, and a line of `torsos!`. `impoola` is `impala` with another last layer.
 
 mod impala;
 pub(crate) mod interface;
@@ -9,63 +8,52 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use self::{impala::Impala, interface::Torso, nature::Nature};
+use self::interface::{TorsoKind, TorsoSettings};
 use crate::error::{ModelError, Result};
-use crate::geometry::{ConvLayer, read_size};
 
-/// The torso of a network: `model.torso`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum TorsoName {
-    /// The convolutions of `conv`. Source: Mnih et al. 2015.
-    #[default]
-    Nature,
-    /// A residual network with a stage for each entry of `channels`. Source: Espeholt et al. 2018.
-    Impala,
-    /// As `Impala`, but f4 reads the mean of f3 over its locations. Source: Trumpp et al. 2025.
-    Impoola,
+/// Makes [`TorsoName`] from one line per torso.
+macro_rules! torsos {
+    ($($(#[$attribute:meta])* $Torso:ident = $kind:path;)+) => {
+        /// The torso of a network: `model.torso`.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+        #[serde(rename_all = "lowercase")]
+        pub enum TorsoName {
+            $($(#[$attribute])* $Torso,)+
+        }
+
+        impl TorsoName {
+            const ALL: &[Self] = &[$(Self::$Torso),+];
+
+            pub(crate) fn kind(self) -> &'static dyn TorsoKind {
+                match self {
+                    $(Self::$Torso => &$kind,)+
+                }
+            }
+        }
+    };
 }
 
-/// The settings of all torsos. Each torso reads its own.
-pub(crate) struct TorsoSettings<'a> {
-    pub(crate) conv: &'a [ConvLayer],
-    pub(crate) channels: &'a [usize],
-    pub(crate) scale_blocks: bool,
+torsos! {
+    /// The convolutions of `conv`. Source: Mnih et al. 2015.
+    #[default]
+    Nature = nature::Kind;
+    /// A residual network with a stage for each entry of `channels`. Source: Espeholt et al. 2018.
+    Impala = impala::Kind::Impala;
+    /// As `Impala`, but f4 reads the mean of f3 over its locations. Source: Trumpp et al. 2025.
+    Impoola = impala::Kind::Impoola;
 }
 
 impl TorsoName {
     /// Returns the settings that only other torsos use.
-    pub const fn settings_of_others(self) -> &'static [&'static str] {
-        match self {
-            Self::Nature => &["channels", "scale_blocks"],
-            Self::Impala | Self::Impoola => &["conv"],
-        }
+    pub fn settings_of_others(self) -> impl Iterator<Item = &'static str> {
+        let all = Self::ALL.iter().flat_map(|it| it.kind().settings());
+        all.copied()
+            .filter(move |it| !self.kind().settings().contains(it))
     }
 
-    /// Builds the torso for an input of (height, width, channels).
-    pub(crate) fn build(
-        self,
-        input: (usize, usize, usize),
-        settings: &TorsoSettings<'_>,
-    ) -> Box<dyn Torso> {
-        match self {
-            Self::Nature => Box::new(Nature::new(input, settings.conv)),
-            Self::Impala | Self::Impoola => Box::new(Impala {
-                input,
-                widths: settings.channels.to_vec(),
-                scale_blocks: settings.scale_blocks,
-                takes_mean: self == Self::Impoola,
-            }),
-        }
-    }
-
-    /// Returns (height, width) of the part of `image` that the torso reads, from the upper left corner. `None` if `conv` does not fit.
-    pub fn read_size(self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
-        match self {
-            Self::Nature => read_size(conv, image),
-            // With zero padding, every pixel is in a window.
-            Self::Impala | Self::Impoola => Some(image),
-        }
+    /// Describes for the reader of a checkpoint how the convolutions are applied, and what the fully connected layer takes.
+    pub fn describe(self) -> String {
+        self.kind().describe()
     }
 
     /// Checks that `settings` has what this torso needs and no setting of another torso.
@@ -78,13 +66,13 @@ impl TorsoName {
             ("channels", !settings.channels.is_empty()),
             ("scale_blocks", settings.scale_blocks),
         ];
-        let others = self.settings_of_others();
-        let (own, way) = match self {
-            Self::Nature => ("conv", "model.torso to impala or impoola"),
-            Self::Impala | Self::Impoola => ("channels", "model.torso to nature"),
-        };
+        let known = self.kind().settings();
+        let own = known[0];
+        let others = Self::ALL.iter().filter(|it| it.kind().settings()[0] != own);
+        let others: Vec<_> = others.map(Self::to_string).collect();
+        let way = format!("model.torso to {}", others.join(" or "));
         for (name, is_given) in given {
-            if is_given && others.contains(&name) {
+            if is_given && !known.contains(&name) {
                 return Err(ModelError::Config(format!(
                     "torso = {self} is made of model.{own}, and model.{name} is given too: leave model.{name} out, or set {way}"
                 )));

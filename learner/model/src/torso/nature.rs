@@ -3,9 +3,9 @@
 
 use candle_core::{Result, Tensor};
 
-use super::interface::{ActingTorso, Torso, TorsoParameters};
+use super::interface::{ActingTorso, Torso, TorsoKind, TorsoParameters, TorsoSettings};
 use crate::compute::Kernels;
-use crate::geometry::{ConvLayer, ConvShape};
+use crate::geometry::{ConvLayer, ConvShape, read_size};
 use crate::init::Initializer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::conv::Stack;
@@ -16,8 +16,28 @@ use crate::kernels::precision::Precision;
 use crate::kernels::torso::torso;
 use crate::layers::LayerSpec;
 
+pub(super) struct Kind;
+
+impl TorsoKind for Kind {
+    fn settings(&self) -> &'static [&'static str] {
+        &["conv"]
+    }
+
+    fn build(&self, settings: &TorsoSettings<'_>) -> Box<dyn Torso> {
+        Box::new(Nature::new(settings.input, settings.conv))
+    }
+
+    fn read_size(&self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+        read_size(conv, image)
+    }
+
+    fn describe(&self) -> String {
+        "without padding, each followed by ReLU; torso.fc takes their output as channel, row, column".into()
+    }
+}
+
 #[derive(Debug)]
-pub(crate) struct Nature {
+struct Nature {
     input: (usize, usize, usize),
     /// Shapes of the layers before the first one that does not fit.
     shapes: Vec<ConvShape>,
@@ -27,7 +47,7 @@ pub(crate) struct Nature {
 
 impl Nature {
     /// Builds the torso for an input of (height, width, channels).
-    pub(crate) fn new(input: (usize, usize, usize), conv: &[ConvLayer]) -> Self {
+    fn new(input: (usize, usize, usize), conv: &[ConvLayer]) -> Self {
         let mut maps = input;
         let shapes = conv.iter().map_while(|layer| {
             let shape = ConvShape::new(maps, *layer)?;
