@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batch::Batch,
     error::UpdateError,
-    evaluation::{Evaluation, Networks, UpdateNoise, detached_logits},
+    losses_and_gradients::{LossesAndGradients, Networks, UpdateNoise, detached_logits},
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -244,18 +244,18 @@ impl Agent {
         fail_point::hold(self.updates());
         // Runs on a thread of the pool: from another thread, each matrix product would cost a switch to the pool and back.
         rayon::scope(|_| {
-            let evaluation = self.evaluate(batch)?;
-            let grad_norm = self.apply(&evaluation.gradients)?;
-            let taken = evaluation.taken_logits.unsqueeze(1)?;
+            let computed = self.gradients(batch)?;
+            let grad_norm = self.apply(&computed.gradients)?;
+            let taken = computed.taken_logits.unsqueeze(1)?;
             let q_values = to_vec_f32(&self.networks.online.q_values(&taken)?)?;
             Ok(UpdateReport {
-                c51_kl: evaluation.c51_kl,
-                row_kls: evaluation.row_kls,
-                losses: evaluation.losses,
-                total: evaluation.total,
+                c51_kl: computed.c51_kl,
+                row_kls: computed.row_kls,
+                losses: computed.losses,
+                total: computed.total,
                 grad_norm,
                 q_mean: q_values.iter().sum::<f32>() / batch.rows as f32,
-                share_beyond: evaluation.share_beyond,
+                share_beyond: computed.share_beyond,
             })
         })
     }
@@ -274,21 +274,21 @@ impl Agent {
     ///
     /// # Errors
     /// A batch that does not fit, or losses that are not finite.
-    pub fn evaluate(&self, batch: &Batch<'_>) -> Result<Evaluation, UpdateError> {
-        self.evaluate_with(batch, &self.noise())
+    pub fn gradients(&self, batch: &Batch<'_>) -> Result<LossesAndGradients, UpdateError> {
+        self.gradients_with(batch, &self.noise())
     }
 
-    /// [`Agent::evaluate`] with the given noise of the noisy layers.
+    /// [`Agent::gradients`] with the given noise of the noisy layers.
     ///
     /// # Errors
-    /// As [`Agent::evaluate`], and noise for a head without noisy layers.
-    pub fn evaluate_with(
+    /// As [`Agent::gradients`], and noise for a head without noisy layers.
+    pub fn gradients_with(
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
-    ) -> Result<Evaluation, UpdateError> {
+    ) -> Result<LossesAndGradients, UpdateError> {
         self.check_batch(batch)?;
-        self.networks.evaluate(batch, noise)
+        self.networks.gradients(batch, noise)
     }
 
     /// Q-values [B, A] of the online network in the batch's s_t, by a separate forward pass: an update computes only the values of the

@@ -39,7 +39,7 @@
 //!
 //! [`Learner`] is an agent within a run. It takes the replay server's batches, enlarges and augments their states, estimates the
 //! action affinity ([`affinity`]), numbers the versions of the weights and saves [`checkpoint`]s. Lockstep mode runs the same code.
-//! A batch passes through the modules in this order: `learner`, `prepare`, `agent`, `evaluation`, `auxiliary::loss`, [`optimiser`].
+//! A batch passes through the modules in this order: `learner`, `prepare`, `agent`, `losses_and_gradients`, `auxiliary::loss`, [`optimiser`].
 //! [`run`] is the learner process. All communication with other processes is in [`remote`]; no other module here uses zenoh.
 //!
 //! To add an auxiliary loss, add a file to [`auxiliary`] and a line to its menu. The loss functions are in [`losses`], Adam and the
@@ -57,11 +57,11 @@ mod config;
 pub mod cost;
 mod deduplicate;
 mod error;
-mod evaluation;
 pub mod importance;
 pub mod insight;
 mod learner;
 pub mod losses;
+mod losses_and_gradients;
 pub mod optimiser;
 pub mod parity;
 mod prepare;
@@ -81,8 +81,8 @@ pub use batch::{Batch, OwnedBatch};
 pub use config::{AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerConfig};
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
-pub use evaluation::{Evaluation, UpdateNoise};
 pub use learner::Learner;
+pub use losses_and_gradients::{LossesAndGradients, UpdateNoise};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
 pub use run_counts::{BatchPart, RunCounts};

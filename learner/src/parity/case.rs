@@ -16,7 +16,7 @@ use serde::Deserialize;
 use crate::{
     auxiliary::{AuxiliaryKind, dim::DIM, positives::Positives, settings::Lambda},
     batch::{Batch, OwnedBatch},
-    evaluation::UpdateNoise,
+    losses_and_gradients::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::UpdateSettings,
     tensors::to_vec_f64,

@@ -34,8 +34,8 @@ impl UpdateDeviation {
     /// Compares `agent` on `batch` with `reference`, an agent of the same parameters on [`REFERENCE`]. Both use the noise of `agent`.
     pub fn new(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
         let noise = agent.noise();
-        let own = agent.evaluate_with(batch, &noise)?;
-        let expected = reference.evaluate_with(batch, &noise)?;
+        let own = agent.gradients_with(batch, &noise)?;
+        let expected = reference.gradients_with(batch, &noise)?;
         let (mut difference, mut dot, mut own_square, mut square) = (0.0, 0.0, 0.0, 0.0);
         for (name, var) in reference.online().iter() {
             let [got, expected] = [&own.gradients, &expected.gradients].map(|gradients| {

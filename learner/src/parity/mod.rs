@@ -21,8 +21,8 @@ use tolerance::Tolerances;
 use crate::{
     agent::{Agent, NetworkParameters},
     auxiliary::{AuxiliaryKind, dim::DIM, settings::Lambda},
-    evaluation::Evaluation,
     losses::scores::{DotProducts, ScoreClip},
+    losses_and_gradients::LossesAndGradients,
     settings::UpdateSettings,
     tensors::to_vec_f64,
 };
@@ -92,17 +92,17 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>> {
     let mut agent = case_agent(case, case.settings.clone(), compute)?;
     let forward = forward_losses(case, compute)?;
-    let evaluation = agent.evaluate_with(&case.batch(), &case.noise(agent.model())?)?;
+    let computed = agent.gradients_with(&case.batch(), &case.noise(agent.model())?)?;
     let mut check = CaseCheck {
         case,
         allowed: Tolerances::new(compute.kernels, agent.model().torso),
         lines: Vec::new(),
     };
-    check.targets(&agent, &evaluation)?;
-    check.losses(&evaluation, &forward)?;
-    check.gradients(&evaluation)?;
+    check.targets(&agent, &computed)?;
+    check.losses(&computed, &forward)?;
+    check.gradients(&computed)?;
     let expected = case.expected("grad_norm", &[1])?[0];
-    let error = (agent.apply(&evaluation.gradients)? - expected).abs();
+    let error = (agent.apply(&computed.gradients)? - expected).abs();
     check.add("grad_norm", error, check.allowed.norm * expected);
     check.updated(&agent)?;
     case.check_all_expectations_used()?;
@@ -121,7 +121,7 @@ impl CaseCheck<'_> {
     }
 
     /// Compares values of s_t, greedy actions in s_{t+n} and projected targets.
-    fn targets(&mut self, agent: &Agent, evaluation: &Evaluation) -> Result<()> {
+    fn targets(&mut self, agent: &Agent, computed: &LossesAndGradients) -> Result<()> {
         let (case, allowed, model) = (self.case, self.allowed, agent.model());
         let batch = case.batch();
         let expected = case.expected("q_values_t", &[batch.rows, model.num_actions])?;
@@ -132,7 +132,7 @@ impl CaseCheck<'_> {
         let expected = case.expected("next_action", &[batch.rows])?;
         // A row that does not bootstrap has no chosen action.
         let agree = |(&got, wanted): (&u8, &f64)| got == NO_ACTION || f64::from(got) == *wanted;
-        let chosen = evaluation.next_greedy_action.iter().zip(&expected);
+        let chosen = computed.next_greedy_action.iter().zip(&expected);
         let same: Vec<bool> = chosen.map(agree).collect();
         let others = same.iter().filter(|same| !**same).count();
         let share = others as f64 / batch.rows as f64;
@@ -143,7 +143,7 @@ impl CaseCheck<'_> {
         );
 
         let expected = case.expected("target_projection", &[batch.rows, model.atoms])?;
-        let found = to_f64(&evaluation.target_projection);
+        let found = to_f64(&computed.target_projection);
         let rows = found.chunks(model.atoms).zip(expected.chunks(model.atoms));
         let rows = rows.zip(same).filter(|(_, same)| *same);
         let errors = rows.map(|((got, expected), _)| largest_error(got, expected));
@@ -152,7 +152,7 @@ impl CaseCheck<'_> {
         Ok(())
     }
 
-    fn losses(&mut self, found: &Evaluation, forward: &[ForwardLoss]) -> Result<()> {
+    fn losses(&mut self, found: &LossesAndGradients, forward: &[ForwardLoss]) -> Result<()> {
         if !found.row_kls.is_empty() {
             let expected = self.case.expected("row_kl", &[found.row_kls.len()])?;
             let error = largest_error(&to_f64(&found.row_kls), &expected);
@@ -180,13 +180,13 @@ impl CaseCheck<'_> {
         Ok(())
     }
 
-    fn gradients(&mut self, evaluation: &Evaluation) -> Result<()> {
+    fn gradients(&mut self, computed: &LossesAndGradients) -> Result<()> {
         let (case, allowed) = (self.case, self.allowed);
         let global_norm = case.expected("grad_norm", &[1])?[0];
         let (mut worst, mut angles) = (WorstByGroup::default(), WorstByGroup::default());
         for (name, tensor) in case.online_parameters() {
             let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
-            let got = match evaluation.gradients.get(name) {
+            let got = match computed.gradients.get(name) {
                 Some(gradient) => to_vec_f64(gradient)?,
                 None => vec![0.0; expected.len()],
             };

@@ -117,7 +117,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
             (reports, values(agent.online()))
         });
         assert!(learned[0] == learned[1], "{kind:?}");
-        let found = agent(kind, lambda).evaluate(&parts).unwrap();
+        let found = agent(kind, lambda).gradients(&parts).unwrap();
         let is_ended = parts.bootstrap_discount.iter().map(|it| *it == 0.0);
         let is_none = found.next_greedy_action.iter().map(|it| *it == NO_ACTION);
         assert!(is_none.eq(is_ended), "{kind:?}");
@@ -127,7 +127,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
             states_n: &[],
             ..parts
         };
-        let found = agent(kind, lambda).evaluate(&ended).unwrap();
+        let found = agent(kind, lambda).gradients(&ended).unwrap();
         assert_eq!(found.next_greedy_action, [NO_ACTION; 6], "{kind:?}");
 
         for (states_k, states_n, what) in [
@@ -139,7 +139,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
                 states_n,
                 ..whole
             };
-            check_says(agent(kind, lambda).evaluate(&batch).unwrap_err(), &[what]);
+            check_says(agent(kind, lambda).gradients(&batch).unwrap_err(), &[what]);
         }
     }
 }
@@ -188,7 +188,7 @@ fn repeated_updates_on_one_batch_bring_the_losses_down() {
 #[test]
 fn curl_masks_no_row() {
     let (agent, mut rows) = (agent(CURL, GLOBAL), random_batch(8, 7));
-    let losses = |rows: &OwnedBatch| agent.evaluate(&curl_batch(rows)).unwrap().losses;
+    let losses = |rows: &OwnedBatch| agent.gradients(&curl_batch(rows)).unwrap().losses;
     let before = losses(&rows);
     rows.positive_valid.fill(0);
     assert_eq!(losses(&rows), before);

@@ -34,7 +34,7 @@ fn found(
     let mut model = model(lambda);
     model.dim = settings.dim_heads(model.num_actions);
     let agent = new_agent(model, settings, compute, 1).with_deduplication(deduplicate);
-    let it = agent.evaluate(batch).unwrap();
+    let it = agent.gradients(batch).unwrap();
     let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let names = agent.online().iter().map(|(name, _)| name);
     let gradient = |name: &str| Some((name.to_owned(), values(it.gradients.get(name)?)));

@@ -101,13 +101,13 @@ pub(crate) fn diverged_agent(compute: &Compute, name: &str) -> (Agent, Result<f6
     let mut settings = settings(ALL_DIM);
     settings.adam.lr = 1e33;
     let mut agent = new_agent(model(ALL_DIM), settings, compute, 1);
-    let evaluation = agent.evaluate(&random_batch(6, 31).batch()).unwrap();
-    let gradient = evaluation.gradients.get(name).unwrap();
+    let computed = agent.gradients(&random_batch(6, 31).batch()).unwrap();
+    let gradient = computed.gradients.get(name).unwrap();
     // The largest finite numbers, so that the next step overflows.
     let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);
     let var = agent.online().get(name).unwrap();
     var.set(&direction.unwrap()).unwrap();
-    let result = agent.apply(&evaluation.gradients);
+    let result = agent.apply(&computed.gradients);
     (agent, result)
 }
 

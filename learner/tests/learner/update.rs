@@ -12,9 +12,9 @@ use crate::synthetic::{
 #[test]
 fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
     let agent = agent_on(&CANDLE, NO_DIM, 1);
-    let evaluation = agent.evaluate(&random_batch(4, 1).batch()).unwrap();
+    let computed = agent.gradients(&random_batch(4, 1).batch()).unwrap();
     for (name, _) in agent.online().iter() {
-        let gradient = evaluation.gradients.get(name).unwrap();
+        let gradient = computed.gradients.get(name).unwrap();
         assert!(!gradient.track_op(), "{name}");
     }
 }
@@ -63,12 +63,12 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
     assert!(one.noise() != first && one.noise() == same.noise());
     assert_eq!(values(one.online()), values(same.online()));
     // The means alone, or another noise, give another loss.
-    let means = one.evaluate_with(&rows.batch(), &UpdateNoise::default());
-    let (noisy, means) = (one.evaluate(&rows.batch()).unwrap(), means.unwrap());
+    let means = one.gradients_with(&rows.batch(), &UpdateNoise::default());
+    let (noisy, means) = (one.gradients(&rows.batch()).unwrap(), means.unwrap());
     assert_ne!(noisy.c51_kl, means.c51_kl);
     assert!(means.gradients.get("head.value.weight_sigma").is_none());
     let plain = agent_with(HeadConfig::PLAIN, settings, 1);
     assert_eq!(plain.noise(), UpdateNoise::default());
-    let refused = plain.evaluate_with(&rows.batch(), &first).unwrap_err();
+    let refused = plain.gradients_with(&rows.batch(), &first).unwrap_err();
     check_says(refused, &["without noisy layers"]);
 }

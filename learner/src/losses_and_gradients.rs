@@ -24,7 +24,7 @@ use crate::{
 
 /// The losses of a batch, what they were computed from, and the gradients, before any optimiser step.
 #[derive(Debug)]
-pub struct Evaluation {
+pub struct LossesAndGradients {
     /// Mean KL divergence over rows, in nats; each row is multiplied by its importance weight, if it has one.
     pub c51_kl: f32,
     /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
@@ -103,11 +103,11 @@ struct BellmanTarget {
 
 impl Networks {
     /// Computes losses and gradients of `batch`, which has been checked, with the given noise of the noisy layers.
-    pub(crate) fn evaluate(
+    pub(crate) fn gradients(
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
-    ) -> Result<Evaluation, UpdateError> {
+    ) -> Result<LossesAndGradients, UpdateError> {
         // The two are independent: while one works on a single thread, the other's matrix products use the remaining threads.
         let (target, features) = rayon::join(
             || self.bellman_target(batch, noise),
@@ -145,7 +145,7 @@ impl Networks {
                 kls.into_iter().map(|kl| kl as f32).collect()
             }
         };
-        Ok(Evaluation {
+        Ok(LossesAndGradients {
             c51_kl,
             row_kls,
             losses,
