@@ -29,7 +29,7 @@ const LEGEND: &str = "mean_return: of each run's last 100 training episodes, the
                       interval (Student's t)\n";
 
 /// What all runs of a folder share. The seeds and the number of runs at once may differ between calls.
-#[derive(Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Settings {
     axes: Vec<Axis>,
     frames: Option<u64>,
@@ -43,7 +43,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         ..ExperimentFlags::default()
     };
     let stored = || settings_of::<Settings>(NAME, &flags);
-    let (settings, seeds) = resolve_settings(args, stored().filter(|_| args.report))?;
+    let (settings, seeds) = resolve_settings(args, stored())?;
     if let Some(other) = stored().filter(|it| *it != settings) {
         bail!(usage!(
             "{} holds the runs of `{}`, not of `{}`: choose another --out, or remove that folder",
@@ -100,22 +100,26 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     session.check_none_missing()
 }
 
-/// Returns the settings and the number of seeds of a call. A report that names no axis uses the `stored` settings and all seeds.
+/// Returns the settings and the number of seeds of a call. A report that names no axis uses the `stored` settings and all seeds. A call
+/// that differs from the `stored` settings in the order of its flags or values uses their order, which the names of the runs depend on.
 fn resolve_settings(args: &SweepArgs, stored: Option<Settings>) -> anyhow::Result<(Settings, u32)> {
     let given = Settings {
         axes: parse_axes(args)?,
         frames: args.frames,
         preset: args.preset.clone(),
     };
-    let Some(stored) = stored.filter(|_| given.axes.is_empty()) else {
-        return Ok((given, args.seeds));
-    };
-    let settings = Settings {
-        axes: stored.axes,
-        frames: given.frames.or(stored.frames),
-        preset: given.preset.or(stored.preset),
-    };
-    Ok((settings, SEEDS_MAX))
+    Ok(match stored {
+        Some(stored) if args.report && given.axes.is_empty() => {
+            let settings = Settings {
+                axes: stored.axes,
+                frames: given.frames.or(stored.frames),
+                preset: given.preset.or(stored.preset),
+            };
+            (settings, SEEDS_MAX)
+        }
+        Some(stored) if stored.sorted() == given.sorted() => (stored, args.seeds),
+        _ => (given, args.seeds),
+    })
 }
 
 /// Returns the axes of a call: `--env` and `--agent` first, if given, then each `--set` in the order of the command line.
@@ -144,6 +148,14 @@ fn parse_axes(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
 }
 
 impl Settings {
+    /// The same combinations in an order that does not depend on the command line.
+    fn sorted(&self) -> Self {
+        let mut sorted = self.clone();
+        sorted.axes.iter_mut().for_each(|it| it.values.sort());
+        sorted.axes.sort_by(|a, b| a.name.cmp(&b.name));
+        sorted
+    }
+
     /// The command with these settings, for a person who compares it with another.
     fn command(&self) -> String {
         let axes = self.axes.iter().map(|Axis { name, values }| {
@@ -245,6 +257,19 @@ mod tests {
         assert_eq!(of("--report", stored()), (stored().unwrap(), SEEDS_MAX));
         let given = of("--report --agent c51 --seeds 2", stored());
         assert_eq!(given, of("--agent c51 --seeds 2", None));
+    }
+
+    #[test]
+    fn the_order_of_flags_and_values_makes_no_other_sweep() {
+        let of = |line: &str, stored| resolve_settings(&parse(line), stored).unwrap();
+        let made = of("--agent c51,curl --set a.b=1,2 --set c.d=3", None).0;
+        for (line, is_same) in [
+            ("--set c.d=3 --set a.b=2,1 --agent curl,c51", true),
+            ("--set c.d=3 --set a.b=2 --agent curl,c51", false),
+        ] {
+            let found = of(line, Some(made.clone())).0;
+            assert_eq!(found == made, is_same, "{line}");
+        }
     }
 
     #[test]
