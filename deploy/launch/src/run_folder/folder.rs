@@ -94,8 +94,12 @@ impl RunFolder {
             Err(_) => self.path.is_dir(),
         };
         if taken {
+            let next = match self.newest_checkpoint() {
+                Some(_) => "resume its run with --resume",
+                None => "remove it",
+            };
             return Err(usage!(
-                "the run folder {} exists and is not empty: choose another --run-dir, or remove it",
+                "the run folder {} exists and is not empty: choose another --run-dir, or {next}",
                 self.display()
             ));
         }
@@ -243,7 +247,8 @@ mod tests {
         assert!(folder.check_free().is_err(), "it has frames");
         write(folder.metrics(), "seconds,frames\n");
         fs::create_dir(folder.checkpoints().join("checkpoint-0")).unwrap();
-        assert!(folder.check_free().is_err(), "it has a checkpoint");
+        let said = folder.check_free().unwrap_err().to_string();
+        assert!(said.ends_with("resume its run with --resume"), "{said}");
         fs::remove_dir(folder.checkpoints().join("checkpoint-0")).unwrap();
         write(root.path().join("thesis.tex"), "");
         assert!(folder.check_free().is_err(), "it has files of others");
