@@ -14,7 +14,7 @@ use driml_machine::{
 use driml_protocol::lock_file;
 use driml_settings::config::RunConfig;
 
-use super::table::{Table, write_atomically};
+use super::table::{Table, aside_path, write_atomically};
 use crate::output::check_folder;
 
 pub(super) const EVENTS_PREFIX: &str = "events.out.tfevents.";
@@ -187,7 +187,15 @@ impl RunFolder {
             program => format!("# Written by {program}.\n"),
         };
         let text = format!("{head}{program}\n{}", config.to_toml());
-        write_atomically(&self.config(), text.as_bytes())
+        let path = self.config();
+        // A resume may change settings and program: the earlier ones made what the run has.
+        if self.newest_checkpoint().is_some()
+            && let Ok(before) = fs::read(&path)
+            && before != text.as_bytes()
+        {
+            write_atomically(&aside_path(&path), &before)?;
+        }
+        write_atomically(&path, text.as_bytes())
     }
 }
 
@@ -196,6 +204,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
+    use crate::testing;
 
     #[test]
     fn a_folder_that_cannot_be_had_says_why_and_a_free_one_is_taken() {
@@ -221,6 +230,31 @@ mod tests {
         let said = RunFolder::new(path("empty")).lock().unwrap_err();
         let said = said.downcast::<Usage>().unwrap().0;
         assert!(said.contains("cannot be written: Is a directory"), "{said}");
+    }
+
+    #[test]
+    fn settings_that_a_resume_changes_stay_beside_the_new_ones() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let write = |set| {
+            let config = testing::config("smoke", "chain", "c51", &[set]);
+            folder.write_config(&config).unwrap();
+        };
+        let aside = |number| {
+            let path = root.path().join(format!("config.aside-{number}.toml"));
+            fs::read_to_string(path).unwrap_or_default()
+        };
+        write("learner.batch_size=16");
+        write("learner.batch_size=17");
+        assert_eq!(aside(1), "", "nothing was learned");
+        fs::create_dir_all(folder.checkpoints().join("checkpoint-1")).unwrap();
+        write("learner.batch_size=18");
+        write("learner.batch_size=18");
+        write("learner.batch_size=19");
+        for (number, batch_size) in [(1, "= 17\n"), (2, "= 18\n")] {
+            assert!(aside(number).contains(&format!("batch_size {batch_size}")));
+        }
+        assert_eq!(aside(3), "");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::{
     collections::VecDeque,
     fs::{self, File},
     io::{self, ErrorKind, Write},
-    path::Path,
+    path::{Path, PathBuf},
     str::FromStr,
 };
 
@@ -120,9 +120,7 @@ impl Table {
         if set_aside.rows.is_empty() {
             return Ok(false);
         }
-        let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
-        let free = (1..).map(free).find(|it| !it.exists());
-        let aside_path = free.context("no name is free beside the table")?;
+        let aside_path = aside_path(path);
         write_atomically(&aside_path, &set_aside.to_csv())?;
         let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
         console::eprintln(&format!(
@@ -200,6 +198,14 @@ impl AppendLog {
         let (name, lost) = (&self.name, count(lost, self.unit));
         Some(format!("lost {lost} of {name}: {error}"))
     }
+}
+
+/// An unused path beside `path` for its earlier content, such as `metrics.aside-1.csv`.
+pub(super) fn aside_path(path: &Path) -> PathBuf {
+    let extension = path.extension().unwrap_or_default().display();
+    let name = |n: u32| path.with_extension(format!("aside-{n}.{extension}"));
+    let free = (1..).map(name).find(|it| !it.exists());
+    free.expect("numbers do not end")
 }
 
 pub(super) fn open_to_append(path: &Path) -> anyhow::Result<File> {
