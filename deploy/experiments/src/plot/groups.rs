@@ -1,7 +1,7 @@
 //! Combines runs of one configuration and several seeds into one curve with a band.
 //! Values between two recorded points are interpolated linearly.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use driml_figure::Series;
 
@@ -80,6 +80,22 @@ pub(super) fn group_runs(runs: &[Run], merge_seeds: bool) -> Vec<Group<'_>> {
 }
 
 impl Group<'_> {
+    /// Whether only some of the runs have values of a column, so that its curve is of fewer seeds than the name says.
+    pub(super) fn is_partial(&self, column: &str) -> bool {
+        let with_values = self.runs.iter().filter(|run| run.has_values(column));
+        (1..self.runs.len()).contains(&with_values.count())
+    }
+
+    /// Describes replays that hold different parts of their runs. They do not separate runs, as the free memory decides their default.
+    pub(super) fn describe_replays(&self) -> Option<String> {
+        let held: BTreeSet<_> = self.runs.iter().filter_map(|run| run.replay_held).collect();
+        let (least, most) = held.first().zip(held.last()).filter(|(a, b)| a != b)?;
+        Some(format!(
+            "{}: the replays of its runs hold {least} to {most} transitions (replay.capacity_transitions); --separate draws each",
+            self.name
+        ))
+    }
+
     pub(super) fn curve(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
         let mean = self.combine_seeds(column, args)?;
         let has_spread = self.runs.iter().all(|run| run.has_values(SD_OF_K));

@@ -125,6 +125,8 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
         columns => columns.iter().map(named).collect(),
     };
     let groups = groups::group_runs(&runs, !args.separate);
+    let replays = groups.iter().filter_map(Group::describe_replays);
+    replays.for_each(|line| console::eprintln(&line));
     let is_return = |column: &String| column == RETURN || column == EVALUATED;
     if args.random.is_some() && !columns.iter().any(is_return) {
         return Err(usage!("--random draws a line over {RETURN:?}: add --column return").into());
@@ -162,7 +164,8 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(Usage(apart.pop().unwrap_or(none)).into());
         }
         apart.iter().for_each(|line| console::eprintln(line));
-        if column == RETURN || !(args.column.is_empty() || is_loss) {
+        let is_partial = groups.iter().any(|group| group.is_partial(column));
+        if column == RETURN || !is_loss && (is_partial || !args.column.is_empty()) {
             missing_messages(column, &runs).for_each(|line| console::eprintln(&line));
         }
         if is_return(column) {

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use driml_launch::run_folder::{RunFolder, Table};
 use driml_machine::error::{Usage, did_you_mean, usage};
 use driml_settings::leaves;
@@ -42,6 +42,8 @@ pub(crate) struct Run {
     pub(super) seed: Option<i64>,
     /// The settings without the seed and without those that depend on the machine; `None` if they cannot be read.
     pub(crate) settings: Option<Settings>,
+    /// How many transitions of the run its replay can hold; `None` if the settings cannot be read.
+    pub(super) replay_held: Option<i64>,
     /// The metrics and the evaluations of the run's checkpoints, with their files. Both have the columns `frames`, `updates`, `seconds`.
     tables: [(PathBuf, Table); 2],
 }
@@ -54,9 +56,7 @@ impl Run {
     /// Reads a run whose settings `compared` distinguish it from others, although they depend on the machine.
     pub(super) fn read_comparing(folder: &RunFolder, compared: &[String]) -> anyhow::Result<Self> {
         let path = folder.metrics();
-        let text = std::fs::read(&path)
-            .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
-        let metrics = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+        let metrics = Table::read(&path)?;
         ensure!(
             metrics.column_index("frames").is_some(),
             usage!(
@@ -67,6 +67,7 @@ impl Run {
         let evaluations = folder.evaluations();
         let evaluated = Table::read(&evaluations)?;
         let config = std::fs::read_to_string(folder.config()).ok();
+        let replay_held = config.as_deref().and_then(replay_held);
         let (settings, seed) = config.and_then(|it| read_settings(&it, compared)).unzip();
         let word = |name: &str| settings.as_ref()?.get(name);
         let world_agent = word("run.world").zip(word("run.agent"));
@@ -75,6 +76,7 @@ impl Run {
             name: folder_name(folder.path()),
             world_agent,
             settings,
+            replay_held,
             seed: seed.flatten(),
             folder: folder.clone(),
             tables: [(path, metrics), (evaluations, evaluated)],
@@ -154,6 +156,12 @@ pub(super) fn folder_name(folder: &Path) -> String {
     let whole = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     let name = whole.file_name().unwrap_or(folder.as_os_str());
     name.to_string_lossy().into_owned()
+}
+
+fn replay_held(config: &str) -> Option<i64> {
+    let table: toml::Table = config.parse().ok()?;
+    let number = |name: &str| table.get("replay")?.get(name)?.as_integer();
+    Some(number("capacity_transitions")?.min(number("transitions_max")?))
 }
 
 /// Returns the settings of a run's `config.toml` without the seed and without those that depend on the machine, unless they are

@@ -210,6 +210,33 @@ fn a_run_that_was_never_evaluated_stands_beside_one_that_was() {
             assert!(svg.contains("Return of checkpoints"), "{name} {columns:?}");
         }
     }
+    let runs = [a, root.0.path().join("b")].map(|it| read(&it));
+    let groups = groups::group_runs(&runs, true);
+    let partial = [RETURN, EVALUATED].map(|column| groups[0].is_partial(column));
+    assert_eq!(partial, [false, true]);
+}
+
+#[test]
+fn replays_that_hold_different_parts_of_their_runs_are_named() {
+    let root = Runs::new();
+    for (name, capacities, expected) in [
+        ("a", [300, 5_000], Some("hold 300 to 2000 transitions")),
+        ("b", [3_000, 5_000], None),
+    ] {
+        let runs = [1, 2].map(|seed| {
+            let folder = root.run(&format!("{name}{seed}"), "c51", seed, METRICS);
+            let path = folder.join("config.toml");
+            let config = std::fs::read_to_string(&path).unwrap();
+            let capacity = capacities[seed as usize - 1];
+            let replay = format!("capacity_transitions = {capacity}\ntransitions_max = 2000\n");
+            std::fs::write(path, format!("{config}[replay]\n{replay}")).unwrap();
+            read(&folder)
+        });
+        let groups = groups::group_runs(&runs, true);
+        let found = groups[0].describe_replays();
+        let is_expected = |it: &str| found.as_ref().is_some_and(|found| found.contains(it));
+        assert!(expected.map_or(found.is_none(), is_expected), "{found:?}");
+    }
 }
 
 #[test]
@@ -233,6 +260,7 @@ fn what_cannot_be_drawn_is_said() {
     let empty = root.run("e", "c51", 1, "frames,mean_return\n0,\n");
     let late = root.run("l", "c51", 2, "frames,mean_return\n90,1.5\n95,2.5\n");
     let none = root.0.path().join("none");
+    let ragged = root.run("r", "c51", 1, "frames,mean_return\n0\n");
     let mut eps = root.args(&[&a], &[]);
     eps.out = root.0.path().join("p.eps");
     let mut affinity = root.args(&[&a], &[]);
@@ -253,6 +281,7 @@ fn what_cannot_be_drawn_is_said() {
         ),
         (root.args(&[&empty], &[]), "recorded a value yet"),
         (root.args(&[&none], &[]), "is not the folder of a run"),
+        (root.args(&[&ragged], &[]), "correct or remove that line"),
         (eps, ".svg, .pdf or .png"),
         (affinity, "no checkpoint"),
     ] {
