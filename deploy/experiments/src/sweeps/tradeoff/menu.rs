@@ -190,16 +190,18 @@ impl Settings {
         let length = if smoke { menu.smoke } else { menu.full };
         let base = world_base(menu.world, world)?;
         let asked = [base.sets, length.sets, args.queue.sets.clone()];
-        let (stored_frames, stored_jobs) = stored.map(|it| (it.frames, it.jobs)).unzip();
-        let frames = args.frames.or(stored_frames);
+        let stored = stored.as_ref();
+        let frames = args.frames.or(stored.map(|it| it.frames));
+        let episodes = args.episodes.or(stored.map(|it| it.episodes));
+        let jobs = args.queue.jobs.or(stored.map(|it| it.jobs));
         Ok(Self {
             common: Common {
                 env: world.to_string(),
                 preset: length.preset,
                 sets: asked.concat(),
                 frames: frames.or(length.frames).unwrap_or(base.frames),
-                episodes: args.episodes.unwrap_or(length.episodes),
-                jobs: args.queue.jobs.or(stored_jobs).unwrap_or(1),
+                episodes: episodes.unwrap_or(length.episodes),
+                jobs: jobs.unwrap_or(1),
             },
             levels: levels(menu.dial, world, &args.dials)?,
             seeds: args.flags.seeds.unwrap_or(length.seeds),
@@ -397,12 +399,19 @@ mspacman coinrun chain|replay.shards|replay.shards=1";
         assert!(first.may_shorten);
         let found = Common {
             frames: 777,
+            episodes: 7,
             jobs: 2,
             ..first.common
         };
         let again = of("--env mspacman", Some(found)).unwrap();
-        let kept = (again.common.frames, again.common.jobs);
-        assert_eq!((kept, again.may_shorten), ((777, 2), false));
+        let Common {
+            frames,
+            episodes,
+            jobs,
+            ..
+        } = again.common;
+        assert_eq!((frames, episodes, jobs), (777, 7, 2));
+        assert!(!again.may_shorten);
         // A report measures nothing, so it does not choose a length.
         assert!(!of("--env mspacman --report", None).unwrap().may_shorten);
     }
