@@ -60,7 +60,8 @@ pub use config::{Compression, Config, RatioStart};
 pub use driml_protocol::NotReady;
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use persist::{
-    Mark, PersistArgs, PersistError, RecoveryControl, RecoveryReport, ReplayFolder, kept_capacity,
+    KeptSize, Mark, PersistArgs, PersistError, RecoveryControl, RecoveryReport, ReplayFolder,
+    kept_size,
 };
 pub use rate_limiter::RateLimiter;
 pub use replay::Replay;

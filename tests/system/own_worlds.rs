@@ -3,7 +3,7 @@
 
 use std::{fs, path::Path, process::Command};
 
-use driml_tests::{python, skipped_offline, succeeds, wait_until};
+use driml_tests::{check_has, python, skipped_offline, succeeds, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{
@@ -191,6 +191,22 @@ fn an_actor_that_is_unknown_when_its_world_starts_exits() {
     server.kill();
     let _server = system.start_replay_server(&flags);
     actor.fails("does not know this incarnation of actor 0");
+}
+
+/// The log tells a server that is started again the size of its replay, and the first settings tell it what the world declares.
+#[test]
+fn a_replay_server_that_is_started_again_starts_its_world_once() {
+    let system = system();
+    let env = numbered_world("").replace("exec:", "exec:echo >>starts; ");
+    let kept = "--replay-dir replay --set replay.compression=lz4";
+    let flags = format!("{SMALL_WORLD} --agent c51 --frames 1280 {kept} --env '{env}'");
+    for (starts, limit) in [(1, "--set replay.compressed_bytes_max=50000"), (2, "")] {
+        let server = system.start_replay_server(&format!("{flags} {limit}"));
+        let config = &system.connect().config_toml;
+        check_has(config, &["compressed_bytes_max = 50000\n"]);
+        assert_eq!(system.read("starts").lines().count(), starts);
+        server.kill();
+    }
 }
 
 /// Returns a Python with Gymnasium and ALE, installed once into cargo's folder for tests. If pip fails, reports the test as skipped.

@@ -16,7 +16,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("replay-server", 11_150),
     ("learner", 21_960),
     ("deploy", 31_060),
-    ("tests", 10_430),
+    ("tests", 10_440),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -20,7 +20,7 @@ use driml_machine::{
     units::count,
 };
 use driml_protocol::Sampling;
-use driml_replay_server::{RatioStart, kept_capacity};
+use driml_replay_server::{RatioStart, kept_size};
 use driml_settings::{
     config::RunConfig,
     flags::{Flags, Source},
@@ -199,7 +199,7 @@ fn check_changes(
         ));
     }
     let is_durable = config.local.durable && !lockstep;
-    let lost = (0..shards).filter(|&shard| kept_capacity(&replay, shard, shards).is_none());
+    let lost = (0..shards).filter(|&shard| kept_size(&replay, shard, shards).is_none());
     let lost: Vec<_> = lost.collect();
     if is_durable && (1..shards as usize).contains(&lost.len()) {
         bail!(usage!(
@@ -251,7 +251,7 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
     }
     check_changes(folder, &before, &config, lockstep)?;
     let shards = config.replay.shards;
-    let has_log = |shard| kept_capacity(&folder.replay(), shard, shards).is_some();
+    let has_log = |shard| kept_size(&folder.replay(), shard, shards).is_some();
     let replay_is_kept = lockstep || config.local.durable && (0..shards).all(has_log);
     // Before the first update, a run without its replay begins anew.
     let (frames, rows) = match updates {

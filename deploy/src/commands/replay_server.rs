@@ -10,8 +10,8 @@ use driml_launch::{
 };
 use driml_machine::{error::usage, resources::Machine, units::count};
 use driml_protocol::{GracefulShutdown, tls::Role};
-use driml_replay_server::{PersistError, kept_capacity};
-use driml_settings::flags::{self, RunFlags};
+use driml_replay_server::{Compression, PersistError, kept_size};
+use driml_settings::flags::{self, RunFlags, Source};
 
 use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_after, prepare_join};
 
@@ -51,17 +51,25 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     connection.endpoints.listen.clone_from(&args.listen);
     args.run.flags.server_alone = true;
     let machine = Machine::detect();
-    let (mut config, _) = flags::resolve(&args.run, &machine)?;
+    let (mut config, from) = flags::resolve(&args.run, &machine)?;
     if let (None, Some(dir)) = (&args.run.config, &args.replay_dir)
-        && let Some(capacity) = kept_capacity(dir, args.shard, config.replay.shards)
+        && let Some(kept) = kept_size(dir, args.shard, config.replay.shards)
     {
         // An earlier start may have found more free memory, and a smaller replay would delete transitions.
-        let dir = dir.display();
+        let (dir, capacity) = (dir.display(), kept.capacity_transitions);
         tracing::info!("the replay in {dir} holds up to {capacity} transitions");
-        let kept = format!("replay.capacity_transitions={capacity}");
-        // First, so that the user's own --set replaces it.
-        args.run.flags.sets.insert(0, kept);
-        (config, _) = flags::resolve(&args.run, &machine)?;
+        let mut sets = vec![format!("replay.capacity_transitions={capacity}")];
+        if config.replay.compression != Compression::None {
+            // Without a limit, all frames fitted.
+            let all = capacity.saturating_mul(config.run.frame_bytes() as u64);
+            let bytes = kept.compressed_bytes_max.unwrap_or(all);
+            sets.push(format!("replay.compressed_bytes_max={bytes}"));
+        }
+        // First, so that the user's own --set replaces them.
+        args.run.flags.sets.splice(0..0, sets);
+        // These settings say what the world declares, so that its command is not started again.
+        let found = Source::File(from, config.to_toml());
+        config = found.resolve(&args.run.flags, &machine)?;
     }
     let (shard, shards) = (args.shard, config.replay.shards);
     if shard >= shards {

@@ -16,7 +16,7 @@ use super::{record, snapshot::Snapshot};
 use crate::config::{Config, SEGMENT_BYTES_MIN};
 
 /// Format of the log (thousands) and of the messages in it (ones). A log of another format is rejected.
-const LOG_FORMAT: u32 = 6_000 + PROTOCOL_VERSION as u32;
+const LOG_FORMAT: u32 = 7_000 + PROTOCOL_VERSION as u32;
 /// The file that identifies the log.
 const ID_FILE: &str = "log.toml";
 /// Maximum number of a segment. Files with higher numbers do not belong to a log.
@@ -226,11 +226,23 @@ impl ReplayFolder {
     }
 }
 
-/// Returns the capacity of the whole replay whose log for shard `shard` of `shards` is in `dir`, as of the newest segment; `None` if there is no
+/// The size of a whole replay whose log is kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct KeptSize {
+    /// Its setting `replay.capacity_transitions`.
+    pub capacity_transitions: u64,
+    /// Its setting `replay.compressed_bytes_max`.
+    pub compressed_bytes_max: Option<u64>,
+}
+
+/// Returns the size of the whole replay whose log for shard `shard` of `shards` is in `dir`, as of the newest segment; `None` if there is no
 /// log that can be read.
-pub fn kept_capacity(dir: &Path, shard: u32, shards: u32) -> Option<u64> {
+pub fn kept_size(dir: &Path, shard: u32, shards: u32) -> Option<KeptSize> {
     let newest = newest_header(&shard_dir(dir, shard, shards)).ok()??;
-    Some(newest.snapshot.capacity.saturating_mul(shards.into()))
+    Some(KeptSize {
+        capacity_transitions: newest.snapshot.capacity.saturating_mul(shards.into()),
+        compressed_bytes_max: newest.snapshot.compressed_bytes_max,
+    })
 }
 
 pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {

@@ -23,5 +23,5 @@ mod upkeep;
 mod tests;
 
 pub(crate) use folder::shard_dir;
-pub use folder::{Mark, PersistArgs, PersistError, ReplayFolder, kept_capacity};
+pub use folder::{KeptSize, Mark, PersistArgs, PersistError, ReplayFolder, kept_size};
 pub use recover::{RecoveryControl, RecoveryReport};

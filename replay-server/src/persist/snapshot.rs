@@ -76,6 +76,8 @@ pub(crate) struct Snapshot {
     pub(crate) inserted: u64,
     pub(crate) oldest: u64,
     pub(crate) capacity: u64,
+    /// The setting of this name, which is for all shards.
+    pub(crate) compressed_bytes_max: Option<u64>,
     pub(crate) counts: LimiterCounts,
     pub(crate) rows: RowsState,
     pub(crate) state: ReplayState,

@@ -137,6 +137,7 @@ impl Replay {
             inserted: self.ring.inserted(),
             oldest: self.ring.oldest(),
             capacity: self.ring.capacity(),
+            compressed_bytes_max: self.config.compressed_bytes_max,
             counts: self.limiter.counts,
             rows: self.sampler.rows.state(&self.ring),
             state: ReplayState {

@@ -9,7 +9,7 @@ use std::{
 use driml_protocol::{Batch, Buffer, Horizon, RequestId, RunSpec, Shutdown};
 use driml_replay_server::{
     Compression, Config, PersistArgs, PersistError, RecoveryControl, RecoveryReport, Replay,
-    ReplayFolder, kept_capacity,
+    ReplayFolder, kept_size,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -291,13 +291,18 @@ proptest! {
 }
 
 #[test]
-fn a_log_tells_its_capacity() {
+fn a_log_tells_its_size() {
     let root = tempfile::tempdir().unwrap();
     let dir = root.path().join("ring");
-    assert_eq!(kept_capacity(&dir, 0, 1), None);
-    let setup = StoredReplay::begin(&dir, Config::unlimited(100), 2_000, 5);
-    drop(setup);
-    assert_eq!(kept_capacity(&dir, 0, 1), Some(100));
+    assert_eq!(kept_size(&dir, 0, 1), None);
+    let config = Config {
+        compression: Compression::Lz4,
+        compressed_bytes_max: Some(2_000),
+        ..Config::unlimited(100)
+    };
+    drop(StoredReplay::begin(&dir, config, 2_000, 5));
+    let size = kept_size(&dir, 0, 1).unwrap();
+    assert!(size.capacity_transitions == 100 && size.compressed_bytes_max == Some(2_000));
 }
 
 #[test]

@@ -356,9 +356,9 @@ fn a_folder_is_one_servers_and_one_runs() {
     check_refused(&args(&file, 1000), spec, config, words);
 
     let text = fs::read_to_string(&file).unwrap();
-    let ours = format!("format = 600{PROTOCOL_VERSION}");
+    let ours = format!("format = 700{PROTOCOL_VERSION}");
     fs::write(&file, text.replace(&ours, "format = 4")).unwrap();
-    let words = "holds a replay of format 4, this version reads 600";
+    let words = "holds a replay of format 4, this version reads 700";
     check_refused(own, spec, config, words);
 }
 
