@@ -40,6 +40,9 @@ const QUERY_HOLD_MAX: Duration = Duration::from_secs(2);
 /// Buffers kept for reuse by later chunks and batches.
 const SPARE_BUFFERS_MAX: usize = 8;
 
+/// Maximum connections and disconnections of processes that wait to be tracked. At the limit, the thread that reads the socket waits.
+const CHANGES_MAX: usize = 4096;
+
 const THREADS_JOIN_MAX: Duration = Duration::from_secs(2);
 
 /// The arguments of a replay server process.
@@ -303,14 +306,14 @@ impl<'a> Queries<'a> {
     }
 }
 
-/// Tracks the connected processes on a separate thread, as the thread that reads the socket must not wait for the replay. The thread ends
-/// when the subscriber is dropped.
+/// Tracks the connected processes on a separate thread, as the thread that reads the socket must not wait for the replay. It waits only if
+/// changes come faster than they can be tracked. The thread ends when the subscriber is dropped.
 fn watch_members(
     client: &RunClient,
     service: &Arc<Service>,
 ) -> zenoh::Result<(Subscriber<()>, JoinHandle<()>)> {
     let (service, keys) = (service.clone(), client.keys().clone());
-    let (sender, receiver) = mpsc::channel::<(Peer, SampleKind)>();
+    let (sender, receiver) = mpsc::sync_channel::<(Peer, SampleKind)>(CHANGES_MAX);
     let next = move || {
         fail_point::reach("members");
         receiver.recv()
