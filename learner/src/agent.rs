@@ -48,6 +48,8 @@ pub struct UpdateReport {
     pub q_mean: f32,
     /// Share of the rows whose target's mean lies beyond the atoms.
     pub share_beyond: f64,
+    /// The auxiliary loss, if any, that is stuck at chance because its scores lie beyond `tanh_clip`.
+    pub stuck_loss: Option<&'static str>,
 }
 
 impl UpdateReport {
@@ -256,6 +258,7 @@ impl Agent {
                 grad_norm,
                 q_mean: q_values.iter().sum::<f32>() / batch.rows as f32,
                 share_beyond: computed.share_beyond,
+                stuck_loss: computed.stuck_loss,
             })
         })
     }

@@ -23,6 +23,8 @@ use crate::{
 const NOISE_SEED_NAME: &str = "noisy layers";
 /// The share of targets beyond C51's atoms up to which no warning is due: only the best or the worst states are then affected.
 const SHARE_BEYOND_MAX: f64 = 0.1;
+/// The number of updates in a row after which a loss that is stuck is worth a warning.
+const STUCK_UPDATES: u64 = 100;
 
 /// A learner: its settings, its state, and the preparation of its batches.
 pub struct Learner {
@@ -31,6 +33,8 @@ pub struct Learner {
     preparation: Preparation,
     /// Share of the targets beyond C51's atoms, over about the last 100 updates; `None` after the warning.
     share_beyond: Option<f64>,
+    /// The number of updates in a row with a loss that was stuck.
+    stuck_updates: u64,
 }
 
 /// Applies the settings that an agent's state does not contain.
@@ -60,6 +64,7 @@ impl Learner {
             },
             preparation: Preparation::new(&config)?,
             share_beyond: Some(0.0),
+            stuck_updates: 0,
             config,
         })
     }
@@ -146,6 +151,7 @@ impl Learner {
         let report = self.state.agent.update(&batch)?;
         (self.state.rng, self.state.affinity) = (rng, affinity);
         self.warn_of_clipping(report.share_beyond);
+        self.warn_of_stuck_loss(report.stuck_loss);
         Ok(report)
     }
 
@@ -161,6 +167,19 @@ impl Learner {
                 100.0 * mean,
                 4.0 * v_min,
                 4.0 * v_max
+            );
+        }
+    }
+
+    /// Warns of an auxiliary loss, `stuck`, that has taught nothing for many updates.
+    fn warn_of_stuck_loss(&mut self, stuck: Option<&str>) {
+        self.stuck_updates = stuck.map_or(0, |_| self.stuck_updates + 1);
+        if let (Some(name), STUCK_UPDATES) = (stuck, self.stuck_updates) {
+            let clip = self.config.learner.update.tanh_clip;
+            tracing::warn!(
+                "the loss {name} stays at chance: its scores lie beyond the bound learner.update.tanh_clip = {clip}, where their gradient \
+                 vanishes: start a new run with a larger bound, such as --set learner.update.tanh_clip={}",
+                50.0 * clip
             );
         }
     }

@@ -41,6 +41,8 @@ pub struct LossesAndGradients {
     pub target_projection: Vec<f32>,
     /// Share of the rows whose target's mean lies beyond the atoms.
     pub share_beyond: f64,
+    /// The auxiliary loss, if any, that is stuck at chance because its scores lie beyond `tanh_clip`.
+    pub stuck_loss: Option<&'static str>,
     /// Gradients of the total, before clipping.
     pub gradients: Gradients,
 }
@@ -133,8 +135,17 @@ impl Networks {
         let gradients = Gradients::compute(&self.parameters, &total)?;
         let c51_kl = read_finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
-        for WeightedLoss { name, loss, .. } in &auxiliary {
-            losses.push((*name, read_finite(name, loss)?));
+        let mut stuck_loss = None;
+        let valid = match batch.positive_valid {
+            [] => batch.rows,
+            rows => rows.iter().filter(|it| **it != 0).count(),
+        };
+        for it in &auxiliary {
+            let nats = read_finite(it.name, &it.loss)?;
+            losses.push((it.name, nats));
+            if it.is_stuck(nats, valid, self.settings.tanh_clip)? {
+                stuck_loss = Some(it.name);
+            }
         }
         let taken_logits = taken_logits.detach();
         let row_kls = match batch.importance_weight {
@@ -154,6 +165,7 @@ impl Networks {
             next_greedy_action: target.next_greedy_action,
             target_projection: target.projection,
             share_beyond: target.share_beyond,
+            stuck_loss,
             gradients,
         })
     }

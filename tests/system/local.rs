@@ -65,6 +65,18 @@ fn clipped_returns_are_warned_of_once() {
 }
 
 #[test]
+fn a_loss_that_is_stuck_is_warned_of_once() {
+    let system = system();
+    let clip = "--set learner.update.tanh_clip";
+    let flags = format!("local --lockstep --agent driml-ada {SHORT}");
+    for (bound, warnings) in [("0.00001", 1), ("1000", 0)] {
+        let ended = system.run_ok(&format!("{flags} --run-dir {bound} {clip}={bound}"));
+        let found = ended.stderr.matches(&format!("{clip}=0.0005")).count();
+        assert_eq!(found, warnings, "{bound}: {ended:#?}");
+    }
+}
+
+#[test]
 fn driml_ada_with_two_actors_over_tcp() {
     let (endpoint, _) = listen_on_free_port();
     let system = system().with_endpoint(endpoint);

@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use candle_core::{Device, Tensor};
+use candle_core::{D, Device, Tensor};
 use driml_model::{DimHeads, Encoder, Features, LossLayer, ModelConfig, Network};
 
 use super::{
@@ -14,9 +14,14 @@ use crate::{
     batch::Batch,
     deduplicate::{PassInput, StateBytes},
     error::UpdateError,
-    losses::scores::DotProducts,
+    losses::scores::{DotProducts, ScoreClip},
     tensors::states_tensor,
 };
+
+/// A loss is at chance above this share of the logarithm of the number of candidates.
+const CHANCE_SHARE: f32 = 0.9;
+/// Scores beyond this many bounds of the soft clip have less than a hundredth of their gradient.
+const STUCK_CLIPS: f64 = 3.0;
 
 /// An item of the menu: what is known of a loss before its settings are read.
 #[derive(Debug)]
@@ -107,6 +112,28 @@ pub struct WeightedLoss {
     pub loss: Tensor,
     /// The dot products of an InfoNCE loss, else empty. The parity check tests whether their scores saturate.
     pub dot_products: Vec<DotProducts>,
+}
+
+impl WeightedLoss {
+    /// Whether this loss, of `nats` over `valid` rows, is stuck at chance because its scores lie beyond the soft clip's bound, where they have
+    /// no gradient. That happens if what all states share outweighs what tells them apart.
+    pub(crate) fn is_stuck(
+        &self,
+        nats: f32,
+        valid: usize,
+        tanh_clip: f64,
+    ) -> candle_core::Result<bool> {
+        let Some(dots) = self.dot_products.first() else {
+            return Ok(false);
+        };
+        let candidates = valid.min(dots.values.dim(D::Minus1)?);
+        if candidates < 2 || nats < CHANCE_SHARE * (candidates as f32).ln() {
+            return Ok(false);
+        }
+        let size: f32 = dots.values.abs()?.mean_all()?.to_scalar()?;
+        let score = f64::from(size) * ScoreClip::new(dots.width, tanh_clip).scale;
+        Ok(score > STUCK_CLIPS * tanh_clip)
+    }
 }
 
 /// The online network's features of all states that an update needs with a graph, from one pass through the network.
