@@ -71,7 +71,7 @@ fn a_loss_that_is_stuck_is_warned_of_once() {
     let flags = format!("local --lockstep --agent driml-ada {SHORT}");
     for (bound, warnings) in [("0.00001", 1), ("1000", 0)] {
         let ended = system.run_ok(&format!("{flags} --run-dir {bound} {clip}={bound}"));
-        let found = ended.stderr.matches(&format!("{clip}=0.0005")).count();
+        let found = ended.stderr.matches(&format!("such as {clip}=")).count();
         assert_eq!(found, warnings, "{bound}: {ended:#?}");
     }
 }
