@@ -33,7 +33,7 @@ pub struct Learner {
     preparation: Preparation,
     /// Share of the targets beyond C51's atoms, over about the last 100 updates; `None` after the warning.
     share_beyond: Option<f64>,
-    /// The number of updates in a row with a loss that was stuck.
+    /// The number of updates in a row with a loss that was stuck; [`STUCK_UPDATES`] after the warning.
     stuck_updates: u64,
 }
 
@@ -171,8 +171,11 @@ impl Learner {
         }
     }
 
-    /// Warns of an auxiliary loss, `stuck`, that has taught nothing for many updates.
+    /// Warns once of an auxiliary loss, `stuck`, that has taught nothing for many updates.
     fn warn_of_stuck_loss(&mut self, stuck: Option<&str>) {
+        if self.stuck_updates == STUCK_UPDATES {
+            return;
+        }
         self.stuck_updates = stuck.map_or(0, |_| self.stuck_updates + 1);
         if let (Some(name), STUCK_UPDATES) = (stuck, self.stuck_updates) {
             let clip = self.config.learner.update.tanh_clip;

@@ -136,10 +136,7 @@ impl Networks {
         let c51_kl = read_finite("the C51 loss", &kl)?;
         let mut losses = Vec::with_capacity(auxiliary.len());
         let mut stuck_loss = None;
-        let valid = match batch.positive_valid {
-            [] => batch.rows,
-            rows => rows.iter().filter(|it| **it != 0).count(),
-        };
+        let valid = batch.positive_valid.iter().filter(|it| **it != 0).count();
         for it in &auxiliary {
             let nats = read_finite(it.name, &it.loss)?;
             losses.push((it.name, nats));

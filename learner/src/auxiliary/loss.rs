@@ -110,7 +110,7 @@ pub struct WeightedLoss {
     pub weight: f64,
     /// The loss as a scalar, before its weight.
     pub loss: Tensor,
-    /// The dot products of an InfoNCE loss, else empty. The parity check tests whether their scores saturate.
+    /// The dot products of an InfoNCE loss, else empty. They tell whether its scores saturate.
     pub dot_products: Vec<DotProducts>,
 }
 
