@@ -36,8 +36,8 @@ fn interquartile_mean<'a>(scores: impl Iterator<Item = &'a f64>) -> f64 {
 
 /// Returns `statistic(groups)` and its interval over seeds by the jackknife: Student's interval of pseudo-values `p_i = n v - (n - 1) v_i`.
 /// `v` uses all scores, `v_i` those without seed i of each game; n is the smallest number of seeds in a game, and a game with more leaves
-/// out seeds i, i + n, .. together. A game with one seed leaves no ends. For a mean this is Student's interval itself. Sources: Tukey 1958;
-/// for groups of seeds Kott 2001.
+/// out seeds i, i + n, .. together. A game with one seed leaves no ends. For a mean over games of n seeds each this is Student's interval
+/// itself. Sources: Tukey 1958; for groups of seeds Kott 2001.
 fn jackknife(groups: &[&Scores], statistic: impl Fn(&[Scores]) -> f64) -> Option<Interval> {
     let all: Vec<Scores> = groups.iter().map(|&scores| scores.clone()).collect();
     let seeds = all.iter().flatten().map(Vec::len).min();
