@@ -306,8 +306,8 @@ impl<'a> Queries<'a> {
     }
 }
 
-/// Tracks the connected processes on a separate thread, as the thread that reads the socket must not wait for the replay. It waits only if
-/// changes come faster than they can be tracked. The thread ends when the subscriber is dropped.
+/// Tracks the connected processes on a separate thread, as the thread that reads the socket must not wait for the replay. The reading
+/// thread waits only if [`CHANGES_MAX`] changes are not tracked yet. The separate thread ends when the subscriber is dropped.
 fn watch_members(
     client: &RunClient,
     service: &Arc<Service>,
