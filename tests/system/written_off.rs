@@ -13,51 +13,76 @@ use driml_protocol::{
 };
 use driml_tests::{skip, wait_until};
 use nix::sys::signal::Signal;
+use zenoh::bytes::ZBytes;
 
 use crate::{LONG, system, tiny_replay};
 
 /// How long an actor waits for a reply before it sends its chunk again.
 const ACK_TIMEOUT: Duration = Duration::from_secs(120);
 
-/// zenoh's headers of the shared memory of this process.
-struct Headers(File);
+/// zenoh's headers of the pieces of one pool.
+struct Headers {
+    file: File,
+    /// zenoh's number of the pool's memory.
+    pool: [u8; 4],
+}
 
 impl Headers {
     /// The length of one header: 4 bytes count the references, and the next byte is 1 if the memory is written off.
     const LEN: usize = 32;
     const COUNT: usize = 1 << 15;
+    /// More references than any message has.
+    const MARK: u32 = 1000;
 
-    fn open() -> Self {
+    /// Finds the headers of the pool of `piece` among those of all processes whose memory this process reads.
+    fn of(piece: &ZBytes) -> Self {
+        let piece = piece.as_shm().unwrap();
+        let _clones = vec![piece.to_owned(); Self::MARK as usize];
         let maps = fs::read_to_string("/proc/self/maps").unwrap();
-        let mut paths = maps
+        let paths = maps
             .lines()
             .filter_map(|line| line.split_whitespace().last());
-        let path = paths.find(|path| {
+        let mut files = paths.filter(|path| {
             let is_long_enough = |it: fs::Metadata| it.len() == METADATA_BYTES as u64;
             path.ends_with(".zenoh") && fs::metadata(path).is_ok_and(is_long_enough)
         });
-        let file = File::options().read(true).write(true).open(path.unwrap());
-        Self(file.unwrap())
+        let found = files.find_map(|path| {
+            let file = File::options().read(true).write(true).open(path).ok()?;
+            let mut headers = Self::read(&file).into_iter();
+            let marked = headers.find(|it| references(it) > Self::MARK)?;
+            let pool = marked[16..20].try_into().unwrap();
+            Some(Self { file, pool })
+        });
+        found.expect("zenoh's headers look different")
     }
 
-    /// Returns the number of references to each piece of memory.
-    fn references(&self) -> Vec<u32> {
+    fn read(file: &File) -> Vec<[u8; Self::LEN]> {
         let mut bytes = vec![0; Self::COUNT * Self::LEN];
-        self.0.read_exact_at(&mut bytes, 0).unwrap();
-        let headers = bytes.chunks_exact(Self::LEN);
-        let counts = headers.map(|it| u32::from_ne_bytes([it[0], it[1], it[2], it[3]]));
-        counts.collect()
+        file.read_exact_at(&mut bytes, 0).unwrap();
+        bytes.as_chunks().0.to_vec()
     }
 
-    /// Writes off all pieces of memory that are in use.
+    /// Returns the position of each piece that is in use, and the number of references to it.
+    fn pieces(&self) -> Vec<(usize, u32)> {
+        let headers = Self::read(&self.file).into_iter().enumerate();
+        let of_pool = headers.filter(|(_, it)| it[16..20] == self.pool && references(it) > 0);
+        of_pool
+            .map(|(place, it)| (place, references(&it)))
+            .collect()
+    }
+
+    /// Writes off all pieces that are in use.
     fn write_off(&self) {
-        for (number, references) in self.references().into_iter().enumerate() {
-            if references > 0 {
-                let place = number * Self::LEN + 4;
-                self.0.write_all_at(&[1], place as u64).unwrap();
-            }
+        for (place, _) in self.pieces() {
+            let is_written_off = (place * Self::LEN + 4) as u64;
+            self.file.write_all_at(&[1], is_written_off).unwrap();
         }
     }
+}
+
+/// Returns the number of references to the piece of a header.
+fn references(header: &[u8; Headers::LEN]) -> u32 {
+    u32::from_ne_bytes([header[0], header[1], header[2], header[3]])
 }
 
 #[test]
@@ -84,7 +109,8 @@ fn a_chunk_whose_shared_memory_is_written_off_is_stored_without_a_time_out() {
         let (run, join) = (system.run_client(&client.spec), ActorJoin::new(actor, 1));
         let delivery = Delivery::start(run, join, 0, limits, pool.clone(), Shutdown::default());
         let (delivery, started) = (delivery.unwrap(), Instant::now());
-        let (headers, another) = (Headers::open(), pool.take(1).freeze());
+        let another = pool.take(1).freeze();
+        let headers = Headers::of(&another);
         assert!(is_readable(&another));
         let chunk = Chunk::with_buffer(header(actor), payload);
         if is_sent_before {
@@ -92,7 +118,10 @@ fn a_chunk_whose_shared_memory_is_written_off_is_stored_without_a_time_out() {
             server.signal(Signal::SIGSTOP);
             assert!(delivery.send(chunk));
             wait_until("a chunk is on its way", || {
-                headers.references().iter().any(|&it| it > 1)
+                headers
+                    .pieces()
+                    .iter()
+                    .any(|&(_, references)| references > 1)
             });
             headers.write_off();
             server.signal(Signal::SIGCONT);
