@@ -1,12 +1,7 @@
 //! `driml train --resume`: finds the settings of an interrupted run, and the point from which it continues.
 //! This module changes nothing in the run's folder. It waits until an earlier learner has saved there.
 
-use std::{
-    ffi::OsStr,
-    os::unix::ffi::OsStrExt,
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::{ffi::OsStr, os::unix::ffi::OsStrExt, path::Path, time::Duration};
 
 use anyhow::{Context, bail};
 use driml_envs::WorldConfig;
@@ -19,7 +14,7 @@ use driml_machine::{
     resources::Machine,
     units::count,
 };
-use driml_protocol::Sampling;
+use driml_protocol::{Sampling, Silence};
 use driml_replay_server::{RatioStart, kept_size};
 use driml_settings::{
     config::RunConfig,
@@ -130,11 +125,12 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits until `is_done` returns true, for at most `max`, and prints `why` if it has to wait.
+/// Waits until `is_done` returns true, for at most `max`, and prints `why` if it has to wait. A time in which this process was stopped
+/// hardly counts: a replay server that was stopped with it does not count that time either.
 fn wait_until(is_done: impl Fn() -> bool, max: Duration, why: &str) {
-    let started = Instant::now();
+    let mut waited = Silence::with_gap_max(2 * WAIT_POLL);
     let mut is_reported = false;
-    while !is_done() && started.elapsed() < max {
+    while !is_done() && waited.record_failure() < max {
         if !std::mem::replace(&mut is_reported, true) {
             console::eprintln(&format!("{why}: waiting"));
         }
@@ -309,4 +305,25 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
         point,
         lockstep,
     })))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[test]
+    fn the_time_in_which_this_process_was_stopped_hardly_counts() {
+        let checks = Cell::new(0);
+        let is_done = || {
+            checks.set(checks.get() + 1);
+            if checks.get() == 1 {
+                std::thread::sleep(5 * WAIT_POLL);
+            }
+            checks.get() == 2
+        };
+        wait_until(is_done, 4 * WAIT_POLL, "a process is exiting");
+        assert_eq!(checks.get(), 2);
+    }
 }
