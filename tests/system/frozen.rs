@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use driml_protocol::Silence;
 use driml_tests::{Exit, Outcome, Process, in_parallel, wait_until};
 use nix::sys::signal::Signal;
 
@@ -28,12 +29,13 @@ fn a_frozen_process_does_not_hold_the_others_up() {
 /// Suspends one of two actors, and ends the run once the learner has made its last update.
 fn a_complete_run_is_finished(end: impl FnOnce(Process) -> Exit) {
     let system = system();
-    // Pause the learner, so that the run does not end before its second actor starts.
+    // Pause the learner, so that the run does not end before its second actor plays. An actor that has only joined may hold the lock under
+    // which all processes of the machine allocate shared memory, and frozen it would keep it.
     system.pause_learners_at(100);
     let flags = format!("--agent c51 {SHORT} --actors 2");
     let process = system.start(&system.local_args(&flags));
     let client = system.connect();
-    client.wait_for_replay("both actors", |replay| replay.actors == 2);
+    client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
     system.find_process("actor").signal(Signal::SIGSTOP);
     system.release_learners();
     client.wait_for_the_last_update();
@@ -83,10 +85,16 @@ fn a_frozen_actor_does_not_stop_the_others() {
     let version = client.wait_for_updates(0).weights_version;
     client.wait_for_learner("weights to pull", |it| it.weights_version > version + 5);
     frozen.signal(Signal::SIGSTOP);
-    // Wait well beyond the time-out of a blocked link, but less than the session's lease, which would end the session anyway.
-    let started = Instant::now();
-    let late = |after_s| started.elapsed() > Duration::from_secs(after_s);
-    let rows = || client.replay_status().map_or(0, |it| it.rows_sampled);
+    // Wait well beyond the time-out of a blocked link, but less than the session's lease, which would end the session anyway. Of a time in
+    // which the whole machine stood still, at most 5 s count.
+    let mut waited = Silence::with_gap_max(Duration::from_secs(5));
+    let mut late = |after_s| waited.record_failure() > Duration::from_secs(after_s);
+    let rows = || {
+        let asked = Instant::now();
+        let status = client.replay_status().expect("an answer");
+        assert!(asked.elapsed() < Duration::from_secs(10), "a late answer");
+        status.rows_sampled
+    };
     wait_until("the time that a link may stand still", || late(12));
     let before = rows();
     wait_until("batches while an actor is frozen", || {
