@@ -1,16 +1,15 @@
 //! Processes started by hand in terminals: they share only an endpoint, and signals end them.
 //! These runs have no launcher.
 
-use std::{
-    fs,
-    time::{Duration, Instant},
-};
+use std::fs;
 
 use driml_protocol::Waiting;
-use driml_tests::{Process, TestSystem, check_nothing_lost, wait_until};
+use driml_tests::{Process, TestSystem, check_nothing_lost};
 use nix::sys::signal::Signal::{SIGHUP, SIGINT, SIGTERM};
 
-use crate::{LONG, SHORT, closed_terminal::skipped_under_nohup, system};
+use crate::{
+    LONG, SHORT, closed_terminal::skipped_under_nohup, failures::interrupt_until_it_ends, system,
+};
 
 /// Starts a run by hand, and checks that its processes find each other and exit in order.
 fn check_whole_run(system: &TestSystem) {
@@ -98,13 +97,8 @@ fn a_second_interrupt_ends_a_process_at_once() {
     server.kill();
     learner.kill();
     // It tries for 20 s to deliver its chunks.
-    actor.signal(SIGINT);
-    let asked = Instant::now();
-    wait_until("a second request", || {
-        asked.elapsed() > Duration::from_secs(1)
-    });
     actor.signal(SIGTERM);
-    let ended = actor.wait().expect_code(130);
+    let ended = interrupt_until_it_ends(actor).expect_code(130);
     ended.expect_stderr("stopped at once by a second signal");
 }
 
