@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batch::Batch,
     error::UpdateError,
-    losses_and_gradients::{LossesAndGradients, Networks, UpdateNoise, detached_logits},
+    losses_and_gradients::{Losses, LossesAndGradients, Networks, UpdateNoise, detached_logits},
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -34,32 +34,22 @@ pub struct NetworkParameters {
 /// The results of one update, as in a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UpdateReport {
-    /// Mean over rows of `KL(projected target || prediction)`, in nats; each row is multiplied by its importance weight, if it has one.
-    pub c51_kl: f32,
-    /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
-    pub row_kls: Vec<f32>,
-    /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
-    pub losses: Vec<(&'static str, f32)>,
-    /// `c51_kl + sum of weight * loss`.
-    pub total: f32,
+    /// The losses before the update.
+    pub losses: Losses,
     /// Global 2-norm of the gradients before clipping.
     pub grad_norm: f64,
     /// Mean over rows of the taken action's value, in units of return.
     pub q_mean: f32,
-    /// Share of the rows whose target's mean lies beyond the atoms.
-    pub share_beyond: f64,
-    /// The auxiliary loss, if any, that is stuck at chance because its scores lie beyond `tanh_clip`.
-    pub stuck_loss: Option<&'static str>,
 }
 
 impl UpdateReport {
     /// Writes the results of the last of `updates` updates into `status`.
     pub fn write_status(&self, updates: u64, status: &mut LearnerStatus) {
         status.updates = updates;
-        status.c51_kl = self.c51_kl;
-        let losses = self.losses.iter();
+        status.c51_kl = self.losses.c51_kl;
+        let losses = self.losses.auxiliary.iter();
         status.losses = losses.map(|&(name, loss)| (name.into(), loss)).collect();
-        status.total = self.total;
+        status.total = self.losses.total;
         status.grad_norm = self.grad_norm;
         status.q_mean = self.q_mean;
     }
@@ -251,14 +241,9 @@ impl Agent {
             let taken = computed.taken_logits.unsqueeze(1)?;
             let q_values = to_vec_f32(&self.networks.online.q_values(&taken)?)?;
             Ok(UpdateReport {
-                c51_kl: computed.c51_kl,
-                row_kls: computed.row_kls,
                 losses: computed.losses,
-                total: computed.total,
                 grad_norm,
                 q_mean: q_values.iter().sum::<f32>() / batch.rows as f32,
-                share_beyond: computed.share_beyond,
-                stuck_loss: computed.stuck_loss,
             })
         })
     }

@@ -150,8 +150,8 @@ impl Learner {
         }
         let report = self.state.agent.update(&batch)?;
         (self.state.rng, self.state.affinity) = (rng, affinity);
-        self.warn_of_clipping(report.share_beyond);
-        self.warn_of_stuck_loss(report.stuck_loss);
+        self.warn_of_clipping(report.losses.share_beyond);
+        self.warn_of_stuck_loss(report.losses.stuck_loss);
         Ok(report)
     }
 

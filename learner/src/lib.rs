@@ -31,8 +31,8 @@
 //!     positive_valid: &[1, 1],
 //!     importance_weight: None,
 //! })?;
-//! assert_eq!(report.losses[0].0, "dim_4t4");
-//! assert!(report.total.is_finite() && agent.updates() == 1);
+//! assert_eq!(report.losses.auxiliary[0].0, "dim_4t4");
+//! assert!(report.losses.total.is_finite() && agent.updates() == 1);
 //! # Ok(())
 //! # }
 //! ```
@@ -82,7 +82,7 @@ pub use config::{AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerCon
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
 pub use learner::Learner;
-pub use losses_and_gradients::{LossesAndGradients, UpdateNoise};
+pub use losses_and_gradients::{Losses, LossesAndGradients, UpdateNoise};
 pub use optimiser::adam::AdamSettings;
 pub use remote::run::{RunArgs, run};
 pub use run_counts::{BatchPart, RunCounts};

@@ -22,27 +22,34 @@ use crate::{
     tensors::{read_finite, states_tensor, to_vec_f32},
 };
 
-/// The losses of a batch, what they were computed from, and the gradients, before any optimiser step.
-#[derive(Debug)]
-pub struct LossesAndGradients {
-    /// Mean KL divergence over rows, in nats; each row is multiplied by its importance weight, if it has one.
+/// The losses of a batch.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Losses {
+    /// Mean over rows of `KL(projected target || prediction)`, in nats; each row is multiplied by its importance weight, if it has one.
     pub c51_kl: f32,
     /// The divergence of each row [B] before its weight, in nats; empty if rows have no importance weights.
     pub row_kls: Vec<f32>,
     /// The auxiliary losses, by name, before their weights; those of weight 0 are not computed.
-    pub losses: Vec<(&'static str, f32)>,
+    pub auxiliary: Vec<(&'static str, f32)>,
     /// `c51_kl + sum of weight * loss`.
     pub total: f32,
+    /// Share of the rows whose target's mean lies beyond the atoms.
+    pub share_beyond: f64,
+    /// The auxiliary loss, if any, that is stuck at chance because its scores lie beyond `tanh_clip`.
+    pub stuck_loss: Option<&'static str>,
+}
+
+/// The losses of a batch, what they were computed from, and the gradients, before any optimiser step.
+#[derive(Debug)]
+pub struct LossesAndGradients {
+    /// The losses, which the report of an update contains too.
+    pub losses: Losses,
     /// Online logits [B, N] of the actions taken in s_t, detached from the graph.
     pub taken_logits: Tensor,
     /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] if the row does not bootstrap, as its s_{t+n} is not evaluated.
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
-    /// Share of the rows whose target's mean lies beyond the atoms.
-    pub share_beyond: f64,
-    /// The auxiliary loss, if any, that is stuck at chance because its scores lie beyond `tanh_clip`.
-    pub stuck_loss: Option<&'static str>,
     /// Gradients of the total, before clipping.
     pub gradients: Gradients,
 }
@@ -134,12 +141,12 @@ impl Networks {
         // Before any number is read: reading waits for a GPU, which should have all of its work queued by then.
         let gradients = Gradients::compute(&self.parameters, &total)?;
         let c51_kl = read_finite("the C51 loss", &kl)?;
-        let mut losses = Vec::with_capacity(auxiliary.len());
+        let mut auxiliary_nats = Vec::with_capacity(auxiliary.len());
         let mut stuck_loss = None;
         let valid = batch.positive_valid.iter().filter(|it| **it != 0).count();
         for it in &auxiliary {
             let nats = read_finite(it.name, &it.loss)?;
-            losses.push((it.name, nats));
+            auxiliary_nats.push((it.name, nats));
             if it.is_stuck(nats, valid, self.settings.tanh_clip)? {
                 stuck_loss = Some(it.name);
             }
@@ -153,16 +160,19 @@ impl Networks {
                 kls.into_iter().map(|kl| kl as f32).collect()
             }
         };
-        Ok(LossesAndGradients {
+        let losses = Losses {
             c51_kl,
             row_kls,
-            losses,
+            auxiliary: auxiliary_nats,
             total: read_finite("the total loss", &total)?,
+            share_beyond: target.share_beyond,
+            stuck_loss,
+        };
+        Ok(LossesAndGradients {
+            losses,
             taken_logits,
             next_greedy_action: target.next_greedy_action,
             target_projection: target.projection,
-            share_beyond: target.share_beyond,
-            stuck_loss,
             gradients,
         })
     }

@@ -54,7 +54,7 @@ impl UpdateDeviation {
         let next = next.filter(|(own, _)| **own != NO_ACTION);
         let next: Vec<bool> = next.map(|(own, expected)| own == expected).collect();
         let same_next = next.iter().filter(|same| **same).count() as f64;
-        let [own_loss, reference_loss] = [own.total, expected.total].map(f64::from);
+        let [own_loss, reference_loss] = [&own, &expected].map(|it| f64::from(it.losses.total));
         Ok(Self {
             own_loss,
             reference_loss,

@@ -22,7 +22,7 @@ use crate::{
     agent::{Agent, NetworkParameters},
     auxiliary::{AuxiliaryKind, dim::DIM, settings::Lambda},
     losses::scores::{DotProducts, ScoreClip},
-    losses_and_gradients::LossesAndGradients,
+    losses_and_gradients::{Losses, LossesAndGradients},
     settings::UpdateSettings,
     tensors::to_vec_f64,
 };
@@ -99,7 +99,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>> {
         lines: Vec::new(),
     };
     check.targets(&agent, &computed)?;
-    check.losses(&computed, &forward)?;
+    check.losses(&computed.losses, &forward)?;
     check.gradients(&computed)?;
     let expected = case.expected("grad_norm", &[1])?[0];
     let error = (agent.apply(&computed.gradients)? - expected).abs();
@@ -152,7 +152,7 @@ impl CaseCheck<'_> {
         Ok(())
     }
 
-    fn losses(&mut self, found: &LossesAndGradients, forward: &[ForwardLoss]) -> Result<()> {
+    fn losses(&mut self, found: &Losses, forward: &[ForwardLoss]) -> Result<()> {
         if !found.row_kls.is_empty() {
             let expected = self.case.expected("row_kl", &[found.row_kls.len()])?;
             let error = largest_error(&to_f64(&found.row_kls), &expected);
@@ -163,7 +163,7 @@ impl CaseCheck<'_> {
         let mut total_saturates = false;
         for loss in forward {
             // A loss of weight 0 is not in the update: its value comes from the forward pass alone.
-            let in_update = found.losses.iter().find(|it| it.0 == loss.name);
+            let in_update = found.auxiliary.iter().find(|it| it.0 == loss.name);
             let got = in_update.map_or(loss.value, |it| it.1);
             // A case names every loss after its pair of levels. A loss without a pair compares global features.
             let pair = loss.name.split_once('_').map_or("4t4", |it| it.1);

@@ -223,7 +223,8 @@ fn learn(
         counters.updates.store(learner.updates(), Ordering::Release);
         // Numbered by updates, which only increase within one learner process.
         let (learner_id, number) = (publisher.learner_id, learner.updates());
-        if let Some(priorities) = batch.priority_update(learner_id, number, &report.row_kls) {
+        if let Some(priorities) = batch.priority_update(learner_id, number, &report.losses.row_kls)
+        {
             publisher.priorities.push(priorities);
         }
         if let Some(affinity) = learner.affinity_update(learner_id) {

@@ -26,7 +26,7 @@ fn updates_on_a_gpu_follow_those_on_the_cpu() {
         };
         let mut agent = new_agent(model, settings(ALL_DIM), compute, 1);
         (0..10)
-            .map(|_| agent.update(&rows.batch()).unwrap().total)
+            .map(|_| agent.update(&rows.batch()).unwrap().losses.total)
             .collect::<Vec<_>>()
     };
     let (cpu, gpu) = (totals(&Compute::CPU), totals(&gpu));

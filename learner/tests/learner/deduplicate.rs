@@ -39,9 +39,9 @@ fn found(
     let names = agent.online().iter().map(|(name, _)| name);
     let gradient = |name: &str| Some((name.to_owned(), values(it.gradients.get(name)?)));
     let gradients = names.filter_map(gradient).collect();
-    let mut losses = vec![it.c51_kl, it.total];
-    losses.extend(it.losses.iter().map(|(_, loss)| loss));
-    losses.extend(&it.row_kls);
+    let mut losses = vec![it.losses.c51_kl, it.losses.total];
+    losses.extend(it.losses.auxiliary.iter().map(|(_, loss)| loss));
+    losses.extend(&it.losses.row_kls);
     let logits = values(&it.taken_logits);
     let forward = (losses, logits, it.next_greedy_action, it.target_projection);
     UpdateResult { forward, gradients }

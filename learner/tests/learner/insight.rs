@@ -37,7 +37,7 @@ fn matches_are_what_the_loss_is_made_of() {
     let matches = matches.expect("this agent compares local features");
     assert_eq!(matches.len(), 4 * 2 * 3);
     let loss = -matches.iter().map(|p| p.ln()).sum::<f64>() / matches.len() as f64;
-    let (name, wanted) = agent.gradients(&rows.batch()).unwrap().losses[0];
+    let (name, wanted) = agent.gradients(&rows.batch()).unwrap().losses.auxiliary[0];
     assert_eq!(name, "dim_3t3");
     assert!((loss - f64::from(wanted)).abs() < 1e-5, "{loss}, {wanted}");
 }

@@ -65,7 +65,7 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
     // The means alone, or another noise, give another loss.
     let means = one.gradients_with(&rows.batch(), &UpdateNoise::default());
     let (noisy, means) = (one.gradients(&rows.batch()).unwrap(), means.unwrap());
-    assert_ne!(noisy.c51_kl, means.c51_kl);
+    assert_ne!(noisy.losses.c51_kl, means.losses.c51_kl);
     assert!(means.gradients.get("head.value.weight_sigma").is_none());
     let plain = agent_with(HeadConfig::PLAIN, settings, 1);
     assert_eq!(plain.noise(), UpdateNoise::default());

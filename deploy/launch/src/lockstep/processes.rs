@@ -271,7 +271,8 @@ impl Lockstep {
             inserted: batch.header.counts.inserted,
         }]);
         let number = self.learner.updates();
-        if let Some(priorities) = batch.priority_update(LEARNER_ID, number, &report.row_kls) {
+        if let Some(priorities) = batch.priority_update(LEARNER_ID, number, &report.losses.row_kls)
+        {
             let set = self.replay.set_priorities(&priorities);
             set.map_err(anyhow::Error::msg)
                 .context("the replay rejected priorities")?;
