@@ -81,7 +81,7 @@ impl Tolerances {
         match (kernels, torso) {
             (Kernels::Fused(Precision::Bf16), TorsoName::Nature) => Self::BF16,
             // In a residual torso 15 convolutions round instead of 3, and independent rounding errors grow as the root of their number.
-            (Kernels::Fused(Precision::Bf16), _) => Self {
+            (Kernels::Fused(Precision::Bf16), TorsoName::Impala | TorsoName::Impoola) => Self {
                 q_values: 5f64.sqrt() * Self::BF16.q_values,
                 projection: 5f64.sqrt() * Self::BF16.projection,
                 gradient: 5f64.sqrt() * Self::BF16.gradient,
