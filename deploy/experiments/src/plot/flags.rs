@@ -25,7 +25,7 @@ pub struct PlotArgs {
     #[arg(long, value_enum, default_value_t = Band::Range)]
     pub(crate) band: Band,
     /// Draw each run as a separate line
-    #[arg(long)]
+    #[arg(long, conflicts_with = "band")]
     pub(crate) separate: bool,
     /// Play so many episodes with a random policy, 100 unless given, and draw the mean return as a line
     #[arg(long, value_name = "EPISODES", num_args = 0..=1, default_missing_value = "100", value_parser = random_episodes)]

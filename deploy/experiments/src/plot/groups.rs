@@ -80,12 +80,6 @@ pub(super) fn group_runs(runs: &[Run], merge_seeds: bool) -> Vec<Group<'_>> {
 }
 
 impl Group<'_> {
-    /// Whether only some of the runs have values of a column, so that its curve is of fewer seeds than the name says.
-    pub(super) fn is_partial(&self, column: &str) -> bool {
-        let with_values = self.runs.iter().filter(|run| run.has_values(column));
-        (1..self.runs.len()).contains(&with_values.count())
-    }
-
     /// Describes replays that hold different parts of their runs. They do not separate runs, as the free memory decides their default.
     pub(super) fn describe_replays(&self) -> Option<String> {
         let held: BTreeSet<_> = self.runs.iter().filter_map(|run| run.replay_held).collect();

@@ -164,9 +164,10 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(Usage(apart.pop().unwrap_or(none)).into());
         }
         apart.iter().for_each(|line| console::eprintln(line));
-        let is_partial = groups.iter().any(|group| group.is_partial(column));
-        if column == RETURN || !is_loss && (is_partial || !args.column.is_empty()) {
-            missing_messages(column, &runs).for_each(|line| console::eprintln(&line));
+        if !is_loss {
+            // Not every agent has a k, which only the overview draws without being asked.
+            let all = column == RETURN || !args.column.is_empty();
+            missing_messages(column, all, &groups).for_each(|line| console::eprintln(&line));
         }
         if is_return(column) {
             series.extend(random_lines(&random, &series, groups.len()));
@@ -243,13 +244,15 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
     notes
 }
 
-/// Returns a message for each run that has no value of a drawn column.
-fn missing_messages(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
+/// Returns a message for each run that has no value of a drawn column; unless `all`, only for runs of groups that have a line.
+fn missing_messages(column: &str, all: bool, groups: &[Group<'_>]) -> impl Iterator<Item = String> {
     let why = match column {
         RETURN => "no episode has ended in it",
-        _ => "it has no value yet",
+        _ => "it has no value",
     };
-    let absent = runs.iter().filter(move |run| !run.has_values(column));
+    let named = groups.iter().map(|it| &it.runs);
+    let named = named.filter(move |it| all || it.iter().any(|run| run.has_values(column)));
+    let absent = named.flatten().filter(move |run| !run.has_values(column));
     absent.map(move |run| {
         let run = run.folder.display();
         format!("{run} is not in the chart of {column}: {why}")
