@@ -1,6 +1,8 @@
 //! `driml sweep`: makes a run for each combination of settings and each seed, then a table and a plot of all runs.
 //! `axes` decides which runs there are, and `queue` makes them.
 
+use std::collections::BTreeMap;
+
 use anyhow::bail;
 use driml_launch::console::{align_columns, print_wrapped};
 use driml_machine::{error::usage, shell::quoted};
@@ -56,13 +58,17 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let cells = cells(axes, args.seeds)?;
     // A report asks for `SEEDS_MAX` seeds; no sweep has more than `RUNS_MAX` runs.
     let seeds = seeds.min((RUNS_MAX / cells.len()) as u32);
-    let mut plans = Vec::new();
+    let (mut plans, mut known) = (Vec::new(), BTreeMap::new());
     for (at, cell) in cells.iter().enumerate() {
         let config = settings.call(cell, 1).config();
         let config = config.map_err(|e| match &describe(cell)[..] {
             "" => e,
             cell => usage!("{cell}: {e}"),
         })?;
+        if let Some(same) = known.insert(config.to_toml(), cell) {
+            let [same, cell] = [same, cell].map(describe);
+            bail!(usage!("{same} and {cell} are the same run: leave one out"));
+        }
         plans.extend((1..=seeds).map(|seed| {
             let name = format!("{}-seed{seed}", folder_name(axes, cell, at));
             let call = settings.call(cell, seed);
