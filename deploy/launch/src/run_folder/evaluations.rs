@@ -25,7 +25,7 @@ pub struct EvaluationRow {
     pub(crate) frames: Option<u64>,
     pub(crate) updates: u64,
     pub(crate) episodes: u32,
-    /// Mean undiscounted return of the episodes.
+    /// Mean undiscounted return of the episodes, rounded as in the table.
     #[serde(rename = "evaluated_return")]
     pub(crate) mean_return: f64,
     /// Standard deviation of the return over episodes; none for one episode.
@@ -72,8 +72,8 @@ impl EvaluationRow {
             frames: row.and_then(|row| metrics.value(row, "frames")),
             updates,
             episodes,
-            mean_return,
-            deviation,
+            mean_return: rounded(mean_return),
+            deviation: deviation.map(rounded),
         }
     }
 
@@ -88,8 +88,11 @@ impl EvaluationRow {
         )
     }
 
-    /// Adds the evaluation to the run's table, which is made if it does not exist.
+    /// Adds the evaluation to the run's table, which is made if it does not exist. A row that is there is not repeated.
     pub(crate) fn append_to(&self, folder: &RunFolder) -> anyhow::Result<()> {
+        if Self::all(folder)?.contains(self) {
+            return Ok(());
+        }
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
         let mut file = open_to_append(&path)?;
@@ -99,8 +102,8 @@ impl EvaluationRow {
             cell(self.frames),
             self.updates.to_string(),
             self.episodes.to_string(),
-            rounded(self.mean_return).to_string(),
-            cell(self.deviation.map(rounded)),
+            self.mean_return.to_string(),
+            cell(self.deviation),
         ]);
         let head = is_new.then(|| csv_row(HEADER.split(',')));
         // A whole row in one write, as others may read meanwhile.
@@ -192,8 +195,9 @@ mod tests {
         assert_eq!(EvaluationRow::all(&folder).unwrap(), []);
         let keep = |updates, mean, episodes| keep(&folder, updates, mean, episodes).unwrap();
         assert!(keep(10, -1.0, 4));
-        assert!(keep(20, 3.0, 4));
-        assert!(!keep(30, 3.0, 4), "the first of equals stays");
+        assert!(keep(20, 10.0 / 3.0, 4));
+        assert!(keep(20, 10.0 / 3.0, 4), "it has one row");
+        assert!(!keep(30, 10.0 / 3.0, 4), "the first of equals stays");
         assert!(!keep(40, 9.0, 1), "one episode is luck");
         let best = checkpoint::list(&folder.best()).unwrap();
         assert_eq!(best.len(), 1);
@@ -206,8 +210,8 @@ mod tests {
         let all = EvaluationRow::all(&folder).unwrap();
         let at = all.iter().map(|it| (it.frames, it.updates, it.mean_return));
         let (early, late) = (Some(300), Some(500));
-        let first = [(early, 10, -1.0), (early, 20, 3.0)];
-        let others = [(late, 30, 3.0), (late, 40, 9.0)];
+        let first = [(early, 10, -1.0), (early, 20, 3.333333)];
+        let others = [(late, 30, 3.333333), (late, 40, 9.0)];
         assert!(at.eq(first.into_iter().chain(others)), "{all:?}");
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
         let said = EvaluationRow::all(&folder).unwrap_err().to_string();
