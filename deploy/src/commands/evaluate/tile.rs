@@ -41,7 +41,7 @@ pub(super) struct ActionOutputs {
 /// The question to local DIM: which locations of a later state it recognises.
 #[derive(Debug)]
 pub(super) struct Local {
-    /// Steps from a state to the later one.
+    /// Steps from a state to the later one: the fixed k, or 1, the smallest k of the rules that draw it.
     pub(super) k: usize,
     pub(super) rows: usize,
     pub(super) columns: usize,
