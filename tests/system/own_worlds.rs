@@ -193,17 +193,19 @@ fn an_actor_that_is_unknown_when_its_world_starts_exits() {
     actor.fails("does not know this incarnation of actor 0");
 }
 
-/// The log tells a server that is started again the size of its replay, and the first settings tell it what the world declares.
+/// The log tells a server that is started again the size of its replay, and the first settings what the world declares and the preset costs.
 #[test]
 fn a_replay_server_that_is_started_again_starts_its_world_once() {
     let system = system();
     let env = numbered_world("").replace("exec:", "exec:echo >>starts; ");
     let kept = "--replay-dir replay --set replay.compression=lz4";
-    let flags = format!("{SMALL_WORLD} --agent c51 --frames 1280 {kept} --env '{env}'");
+    let fast = SMALL_WORLD.replace("smoke", "fast");
+    let flags = format!("{fast} --agent c51 --frames 1280 {kept} --env '{env}'");
     for (starts, limit) in [(1, "--set replay.compressed_bytes_max=50000"), (2, "")] {
         let server = system.start_replay_server(&format!("{flags} {limit}"));
         let config = &system.connect().config_toml;
         check_has(config, &["compressed_bytes_max = 50000\n"]);
+        check_has(&server.stderr(), &["WARN fast: "]);
         assert_eq!(system.read("starts").lines().count(), starts);
         server.kill();
     }

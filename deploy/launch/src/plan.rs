@@ -64,7 +64,8 @@ pub fn describe(
     let (processes, run_dir) = (processes(config, lockstep), run_dir.display());
     let note = |note: &String| format!("{:INDENT$}{note}\n", "note");
     let exploration = note_on_epsilon(config);
-    let notes: String = config.notes.iter().chain(&exploration).map(note).collect();
+    let notes = config.notes.iter().chain(&config.accuracy_note);
+    let notes: String = notes.chain(&exploration).map(note).collect();
     format!(
         "trains      {agent} on {world}, seed {seed}, from {source}\n\
          frames      {frames} in all, with {updates} of {rows} (replay ratio {ratio})\n\

@@ -76,9 +76,12 @@ pub struct RunConfig {
     pub transport: TransportConfig,
     /// The `[local]` table, which the launcher reads.
     pub local: LocalConfig,
-    /// Notes that are printed before the run starts.
+    /// Notes on the memory, which are printed before the run starts.
     #[serde(skip)]
     pub notes: Vec<String>,
+    /// The note on the accuracy that the preset gives up, which is printed too.
+    #[serde(skip)]
+    pub accuracy_note: Option<String>,
     /// The program and its version, which the run folder records.
     #[serde(skip)]
     pub program: String,

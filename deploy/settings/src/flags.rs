@@ -198,7 +198,7 @@ impl Source {
         memory::fit(&mut config, is_capacity_set, flags.server_alone, machine).map_err(in_file)?;
         config = config.checked().map_err(in_file)?;
         if let Self::Presets(choice) = self {
-            config.notes.extend(choice.preset.accuracy_note());
+            config.accuracy_note = choice.preset.accuracy_note();
         }
         Ok(config)
     }

@@ -69,7 +69,9 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         args.run.flags.sets.splice(0..0, sets);
         // These settings say what the world declares, so that its command is not started again.
         let found = Source::File(from, config.to_toml());
+        let accuracy_note = config.accuracy_note;
         config = found.resolve(&args.run.flags, &machine)?;
+        config.accuracy_note = accuracy_note;
     }
     let (shard, shards) = (args.shard, config.replay.shards);
     if shard >= shards {
@@ -89,7 +91,8 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         }
     }
     let shutdown = prepare_join(&args.join, GracefulShutdown::on_signals)?;
-    config.notes.iter().for_each(|it| tracing::warn!("{it}"));
+    let notes = config.notes.iter().chain(&config.accuracy_note);
+    notes.for_each(|it| tracing::warn!("{it}"));
     open_files::warn_if_limit_low(&config);
     let run = driml_replay_server::RunArgs {
         connection,

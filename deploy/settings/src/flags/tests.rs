@@ -80,7 +80,8 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
                 assert_eq!(again.to_toml(), text);
                 let mut read = RunConfig::parse("config.toml", &text).unwrap();
                 assert_eq!(read.to_toml(), text);
-                read.notes.clone_from(&config.notes);
+                (read.notes, read.accuracy_note) =
+                    (config.notes.clone(), config.accuracy_note.clone());
                 assert_eq!(read, config);
                 driml_actor::ActorSettings::from_toml(&text).unwrap();
                 resolved += 1;
@@ -176,6 +177,7 @@ fn settings_follow_from_one_another() {
         let value = |path| match find(&table, path) {
             Some(value) => format!("{path} = {value}"),
             None if path == "notes" => format!("notes: {:?}", config.notes),
+            None if path == "accuracy_note" => format!("{:?}", config.accuracy_note),
             None => format!("{path} is not set"),
         };
         asked.split(' ').map(value).collect::<Vec<_>>().join("\n")

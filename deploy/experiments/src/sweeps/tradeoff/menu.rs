@@ -379,8 +379,8 @@ mspacman coinrun chain|replay.shards|replay.shards=1";
             let mut common = common.clone();
             common.preset = preset.to_owned();
             let mut config = common.config(point).unwrap();
-            // The notes of a preset with a price say what it gives up, so the points differ in them.
-            config.notes.clear();
+            // The note of a preset with a price says what it gives up, so the points differ in it.
+            config.accuracy_note = None;
             config
         };
         let is_preset = |it: &&DialLevel| it.dial.name.starts_with("preset");
