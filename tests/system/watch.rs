@@ -22,11 +22,14 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let client = system.connect();
     let watch = system.start(&system.connect_args("watch --run-dir run --tensorboard"));
     wait_until("the folder", || system.path("run/metrics.csv").exists());
-    // Both actors start together, with the first weights: an actor that starts late would play hardly an episode.
+    // Pause the learner until both actors have played: an actor that starts late would play hardly an episode.
+    system.pause_learners_at(100);
     let actors = [system.start_actor(0), system.start_actor(1)];
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     // The learner writes into the same folder, which is then as complete as that of a launched run.
     let learner = system.start_process(&system.connect_args("learner --run-dir run"));
+    client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
+    system.release_learners();
     watch
         .wait_ok()
         .expect_stdout("finished: 1280 frames and 540 updates");
