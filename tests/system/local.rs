@@ -6,13 +6,15 @@ use std::{collections::BTreeSet, fs};
 use driml_tests::{Outcome, Summary, TestSystem, check_has, wait_until};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, chain, listen_on_free_port, system};
+use crate::{LONG, PATIENT, SHORT, chain, listen_on_free_port, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
     let system = system();
     system.pause_learners_at(100);
-    let process = system.start(&format!("local --agent c51 {SHORT} --run-dir run"));
+    let process = system.start(&format!(
+        "local --agent c51 {SHORT} {PATIENT} --run-dir run"
+    ));
     let run = system.run_folder("run");
     for name in ["rss_mib_learner", "rss_mib_actor_0"] {
         let memory = || run.table("metrics.csv").last::<f64>(name);

@@ -78,6 +78,9 @@ fn chain(frames: u64) -> String {
 /// A run on the chain that is too long to finish: the test ends the run long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
 
+/// Actors wait for a reply for longer than the machine stalls, so that they send no chunk twice.
+const PATIENT: &str = "--set actor.ack_timeout_ms=60000";
+
 /// A network of one small layer. It computes an update on Pac-Man's enlarged frames in a seventh of the time that the preset's takes.
 const SMALL_NETWORK: &str = "--set model.conv=[{out=8,kernel=8,stride=8}]";
 

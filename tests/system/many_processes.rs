@@ -7,14 +7,14 @@ use driml_actor::DeliveryLimits;
 use driml_protocol::Shutdown;
 use driml_tests::{Outcome, wait_until};
 
-use crate::{LONG, chain, synthetic::SyntheticActor, system, tiny_replay};
+use crate::{LONG, PATIENT, chain, synthetic::SyntheticActor, system, tiny_replay};
 
 /// A replay ratio of 64 makes the learner so slow that every actor waits nearly all of the time.
 #[test]
 fn twenty_four_actors_wait_for_one_learner() {
     let system = system();
     let chain = chain(2_400);
-    let flags = format!("--agent c51 {chain} --actors 24 --set replay.replay_ratio=64");
+    let flags = format!("--agent c51 {chain} {PATIENT} --actors 24 --set replay.replay_ratio=64");
     // Pause the learner, so that even on a fast machine the run does not end before the last actor waits.
     system.pause_learners_at(100);
     let process = system.start(&system.local_args(&flags));
@@ -25,7 +25,9 @@ fn twenty_four_actors_wait_for_one_learner() {
     let ended = process.wait_ok();
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
-    assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
+    // While the machine stalls, the learner may lose a batch, and warns of it.
+    let is_of_actors = |it: &&str| it.contains("WARN") && !it.contains("a batch");
+    assert_eq!(ended.stderr.lines().find(is_of_actors), None);
 }
 
 /// After Ctrl-C while all actors wait, the replay server stores what they still have.
@@ -33,7 +35,7 @@ fn twenty_four_actors_wait_for_one_learner() {
 fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     let system = system();
     let waiting = "--set replay.replay_ratio=512 --set replay.warmup_transitions=2000";
-    let flags = format!("--agent c51 {LONG} --actors 32 {waiting}");
+    let flags = format!("--agent c51 {LONG} {PATIENT} --actors 32 {waiting}");
     let process = system.start(&system.local_args(&flags));
     system
         .connect()
@@ -54,7 +56,7 @@ fn an_actor_waits_for_as_long_as_it_must() {
     let (unreachable_max, stop) = (Duration::from_secs(3), Shutdown::default());
     let limits = DeliveryLimits {
         chunks_in_flight_max: 4,
-        ack_timeout: Duration::from_secs(10),
+        ack_timeout: Duration::from_secs(60),
         unreachable_max,
     };
     let synthetic = |actor| {

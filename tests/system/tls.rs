@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use driml_tests::{Certificates, EXPIRED, Exit, FUTURE, TestSystem, in_parallel, quic_endpoint};
 use zenoh::{Session, Wait};
 
-use crate::{LONG, system};
+use crate::{LONG, PATIENT, system};
 
 /// The time within which it must be reported that nothing listens: a process tries for 30 s, and a busy machine takes longer.
 const REPORT_MAX: Duration = Duration::from_secs(60);
@@ -104,7 +104,7 @@ fn strangers_at_a_replay_server() {
     let Some(system) = system().over_tls() else {
         return;
     };
-    let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let mut server = system.start_replay_server(&format!("--agent c51 {LONG} {PATIENT}"));
     let observer = system.connect();
     let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
     observer.wait_for_updates(10);
