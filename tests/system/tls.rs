@@ -3,7 +3,9 @@
 
 use std::time::{Duration, Instant};
 
-use driml_tests::{Certificates, EXPIRED, Exit, FUTURE, TestSystem, in_parallel, quic_endpoint};
+use driml_tests::{
+    Certificates, EXPIRED, Exit, FUTURE, TestSystem, in_parallel, quic_endpoint, wait_for,
+};
 use zenoh::{Session, Wait};
 
 use crate::{LONG, PATIENT, system};
@@ -121,8 +123,8 @@ fn strangers_at_a_replay_server() {
         ("not valid yet", &new, Some("learner")),
         ("a replay server's", &good, Some("replay-server")),
     ];
-    let accepted = open_raw("connect", endpoint, &good, Some("learner"));
-    assert!(accepted.is_ok(), "else what is below says nothing");
+    let open_good = || open_raw("connect", endpoint, &good, Some("learner")).ok();
+    let _accepted = wait_for("a session, else what is below says nothing", open_good);
     // Each attempt lasts until its time-out.
     in_parallel(attempts, |(name, certificates, role)| {
         let opened = open_raw("connect", endpoint, certificates, role);
