@@ -6,11 +6,14 @@ use std::{
     io,
     path::Path,
     thread,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
-/// How long a process that another thread starts may keep the locks of this process: until its `exec` it has all files open.
-const FORK_MAX: Duration = Duration::from_millis(200);
+/// How often a lock is tried again that a process which another thread starts may keep: until its `exec` it has all files open.
+/// Tries are counted and not time, as time passes for a stopped process too.
+const RETRIES_MAX: u32 = 20;
+/// The pause after each try.
+const RETRY_PERIOD: Duration = Duration::from_millis(10);
 
 /// Creates `path` and locks it; returns `None` if another process holds the lock.
 ///
@@ -19,18 +22,18 @@ const FORK_MAX: Duration = Duration::from_millis(200);
 /// # Errors
 /// The file cannot be created; the error names no path.
 pub fn acquire(path: &Path, advice: &str) -> io::Result<Option<File>> {
-    let (file, started) = (File::create(path)?, Instant::now());
-    loop {
+    let file = File::create(path)?;
+    for _ in 0..=RETRIES_MAX {
         match try_lock(&file) {
             Ok(true) => return Ok(Some(file)),
-            Ok(false) if started.elapsed() >= FORK_MAX => return Ok(None),
-            Ok(false) => thread::sleep(FORK_MAX / 20),
+            Ok(false) => thread::sleep(RETRY_PERIOD),
             Err(e) => {
                 tracing::warn!("{} cannot be locked: {e}; {advice}", path.display());
                 return Ok(Some(file));
             }
         }
     }
+    Ok(None)
 }
 
 /// Locks `file`; returns `false` if another process holds the lock.
@@ -57,7 +60,7 @@ mod tests {
         drop(lock);
         assert!(acquire(&path, "").unwrap().is_none());
         let released = thread::spawn(|| {
-            thread::sleep(FORK_MAX / 4);
+            thread::sleep(2 * RETRY_PERIOD);
             drop(copy);
         });
         assert!(acquire(&path, "").unwrap().is_some());
