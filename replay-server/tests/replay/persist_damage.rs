@@ -118,6 +118,8 @@ fn damage(dir: &Path, rng: &mut ChaCha8Rng) {
             rng.fill(&mut bytes[at..end]);
         }
         4 => bytes = fs::read(&all[rng.random_range(0..all.len())]).unwrap(),
+        // Earlier damage may have left nothing.
+        _ if bytes.is_empty() => {}
         _ => bytes[at] ^= 1 << rng.random_range(0..8),
     }
     fs::write(path, bytes).unwrap();
