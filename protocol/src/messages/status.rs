@@ -121,7 +121,7 @@ pub struct ReplayStatus {
     /// How often each k was served; index 0 counts rows without a positive. A row of several positives counts once, under
     /// its furthest.
     pub k_histogram: Vec<u64>,
-    /// Mean age of the rows of the last batches, in transitions stored since.
+    /// Mean age of the rows of the last batches, in transitions stored since; a shard counts those of its own.
     pub mean_age: f64,
     /// How often each action was stored.
     pub action_histogram: Vec<u64>,
@@ -154,15 +154,17 @@ pub struct ReplayStatus {
 }
 
 impl ReplayStatus {
-    /// Merges the statuses of all shards. The newest returns of the shards follow one another; the mean age is weighted by rows.
+    /// Merges the statuses of all shards. The newest returns of the shards follow one another; the mean age is weighted by rows, and
+    /// in transitions of all shards, of which each stores its share.
     pub fn merged(shards: &[Self]) -> Self {
         let Some((first, others)) = shards.split_first() else {
             return Self::default();
         };
         let mut sum = first.clone();
         others.iter().for_each(|it| sum.add_shard(it));
-        let ages = shards.iter();
-        let ages: f64 = ages.map(|it| it.mean_age * it.rows_sampled as f64).sum();
+        let stored = |it: &Self| it.transitions_inserted.max(1) as f64;
+        let age = |it: &Self| it.mean_age * (stored(&sum) / stored(it)) * it.rows_sampled as f64;
+        let ages: f64 = shards.iter().map(age).sum();
         sum.mean_age = match sum.rows_sampled {
             0 => 0.0,
             rows => ages / rows as f64,
@@ -349,8 +351,8 @@ mod tests {
                 known: 33,
                 newest: vec![1.0, 1.0, 2.0, 2.0],
             },
-            // 9 rows of age 13, 18 of age 26.
-            mean_age: (9.0 * 13.0 + 18.0 * 26.0) / 27.0,
+            // 9 rows of age 13 in the shard that stored a third of the transitions, 18 of age 26 in the other.
+            mean_age: (9.0 * 13.0 * 3.0 + 18.0 * 26.0 * 1.5) / 27.0,
             waiting: Waiting::Finished,
             // The older matrix of the two shards.
             affinity_version: 18,
