@@ -44,13 +44,6 @@ impl TrainCall {
         given.flatten().collect()
     }
 
-    pub(crate) fn with_seed(&self, seed: u32) -> Self {
-        Self {
-            seed,
-            ..self.clone()
-        }
-    }
-
     /// Resolves the settings for this machine, whatever memory is free now.
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
         self.config_within(u64::MAX)
@@ -120,24 +113,19 @@ pub(crate) struct PointRun<P> {
     pub(crate) run: FinishedRun,
 }
 
-/// Resolves the settings of each call once, whatever its seed, and installs what its world needs. For a report it does nothing. Call it
-/// before anything is written, so that the user can correct the call and use the same folder.
+/// Resolves the settings of each point's first run, and installs what its world needs: the other seeds need the same. For a report it does
+/// nothing. Call it before anything is written, so that the user can correct the call and use the same folder.
 pub(crate) fn install_worlds<P>(plans: &[PointPlan<P>], report: bool) -> anyhow::Result<()> {
-    let mut known: Vec<TrainCall> = Vec::new();
-    let plans = if report { &[] } else { plans };
-    for (_, plan) in plans {
-        let call = plan.call.with_seed(1);
-        if !known.contains(&call) {
-            let config = call.config_within(Machine::detect().memory_bytes);
-            let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
-            let is_as_planned = config.run.seed == 1 && config.frames() == plan.frames;
-            ensure!(
-                is_as_planned,
-                usage!("--set changes the run's seed or frames: use --seeds and --frames")
-            );
-            config.world.install(&mut console::eprintln)?;
-            known.push(call);
-        }
+    let first = plans.iter().filter(|(_, plan)| plan.call.seed == 1);
+    for (_, plan) in first.filter(|_| !report) {
+        let config = plan.call.config_within(Machine::detect().memory_bytes);
+        let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
+        let is_as_planned = config.run.seed == 1 && config.frames() == plan.frames;
+        ensure!(
+            is_as_planned,
+            usage!("--set changes the run's seed or frames: use --seeds and --frames")
+        );
+        config.world.install(&mut console::eprintln)?;
     }
     Ok(())
 }
