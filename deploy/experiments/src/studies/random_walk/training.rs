@@ -242,10 +242,6 @@ mod tests {
     };
     use driml_protocol::GracefulShutdown;
 
-    fn settings() -> Settings {
-        flags::read_settings(SETTINGS, &ExperimentFlags::default())
-    }
-
     #[test]
     fn true_ratios_measure_as_no_error_and_constant_scores_as_the_mutual_information() {
         let chain = Chain::new(6, 0.3);
@@ -268,7 +264,7 @@ mod tests {
     fn every_sampling_learns_the_ratios_and_repeats_by_its_seed() {
         let settings = Settings {
             updates: 300,
-            ..settings()
+            ..flags::read_settings(SETTINGS, &ExperimentFlags::default())
         };
         let chain = Chain::new(4, 0.4);
         for sampling in Sampling::ALL {

@@ -404,13 +404,8 @@ mspacman coinrun chain|replay.shards|replay.shards=1";
             ..first.common
         };
         let again = of("--env mspacman", Some(found)).unwrap();
-        let Common {
-            frames,
-            episodes,
-            jobs,
-            ..
-        } = again.common;
-        assert_eq!((frames, episodes, jobs), (777, 7, 2));
+        let kept = &again.common;
+        assert_eq!((kept.frames, kept.episodes, kept.jobs), (777, 7, 2));
         assert!(!again.may_shorten);
         // A report measures nothing, so it does not choose a length.
         assert!(!of("--env mspacman --report", None).unwrap().may_shorten);
