@@ -23,7 +23,7 @@ use crate::{
     flags::{BenchFlags, BenchPeersArgs, Component},
     peers::{
         pairs::{Pair, pairs},
-        script::Script,
+        script::{Answer, Script},
     },
     recording::Recording,
     report::{self, Figures},
@@ -112,7 +112,7 @@ pub(super) fn run(
             if sides.absent.is_none() {
                 console::eprintln(&format!("round {round} of {rounds}: {}", sides.peer));
                 match script.run(folder.path()) {
-                    Ok((peer, figures)) => sides.add_theirs(peer, figures),
+                    Ok(answer) => sides.add_theirs(answer),
                     Err(why) => sides.skip(format!("{why:#}")),
                 }
             }
@@ -134,9 +134,9 @@ pub(super) fn run(
 }
 
 impl Sides {
-    fn add_theirs(&mut self, peer: String, figures: BTreeMap<String, f64>) {
-        self.peer = peer;
-        for (what, value) in figures {
+    fn add_theirs(&mut self, answer: Answer) {
+        self.peer = answer.peer;
+        for (what, value) in answer.figures {
             self.theirs.entry(what).or_default().push(value);
         }
     }

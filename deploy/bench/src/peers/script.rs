@@ -7,7 +7,7 @@ use std::{
     process::{Command, Stdio},
 };
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use driml_machine::process_env;
 use serde::Deserialize;
 
@@ -39,12 +39,12 @@ pub(super) struct Script {
     args: Vec<String>,
 }
 
-/// The line that a script prints.
+/// The line that a script prints: the peer's name with version, and its figures.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Answer {
-    peer: String,
-    figures: BTreeMap<String, f64>,
+pub(super) struct Answer {
+    pub(super) peer: String,
+    pub(super) figures: BTreeMap<String, f64>,
 }
 
 impl Script {
@@ -102,16 +102,14 @@ impl Script {
         }
     }
 
-    /// Runs the script in `folder`. Returns the peer's name with version, and its figures. Progress goes to stderr.
-    pub(super) fn run(&self, folder: &Path) -> anyhow::Result<(String, BTreeMap<String, f64>)> {
+    /// Runs the script in `folder`. Progress goes to stderr.
+    pub(super) fn run(&self, folder: &Path) -> anyhow::Result<Answer> {
         let mut command = Command::new(&self.python);
         command.arg(folder.join(self.file)).args(&self.args);
         let text = run_for_stdout(command, &format!("the script of {}", self.peer))?;
         let line = text.lines().last().unwrap_or_default();
-        match serde_json::from_str::<Answer>(line) {
-            Ok(answer) => Ok((answer.peer, answer.figures)),
-            Err(e) => bail!("the script of {} printed {line:?}: {e}", self.peer),
-        }
+        let answer = serde_json::from_str(line);
+        answer.with_context(|| format!("the script of {} printed {line:?}", self.peer))
     }
 }
 

@@ -31,7 +31,8 @@ fn pair(theirs: &str, own_figure: Option<&'static str>) -> Pair {
 fn a_ratio_is_the_median_of_the_rounds_ratios() {
     let mut sides = sides(&[("C51", &[6.0, 4.0, 9.0]), ("stock", &[0.5, 0.5, 0.5])]);
     for value in [3.0, 4.0, 3.0] {
-        sides.add_theirs("PyTorch 9".into(), [("C51".into(), value)].into());
+        let (peer, figures) = ("PyTorch 9".into(), [("C51".into(), value)].into());
+        sides.add_theirs(Answer { peer, figures });
     }
     let found = compare(&pair("C51", None), &sides).unwrap();
     let numbers = (found.ours, found.theirs, found.ratio);
