@@ -222,7 +222,7 @@ impl Chart {
             area = draw_title(canvas, area, &self.title);
         }
         if legend {
-            let height = draw_legend(canvas, area, self.named_series());
+            let height = draw_legend(canvas, area, &self.named_series());
             area = Rect::new(area.x, area.y + height, area.width, area.height - height);
         }
         let points = || self.series.iter().flat_map(|series| &series.points);
@@ -250,17 +250,14 @@ impl Chart {
     }
 
     /// Returns the series that have a legend entry.
-    pub(super) fn named_series(&self) -> impl Iterator<Item = &Series> {
-        self.series.iter().filter(|series| !series.name.is_empty())
+    pub(super) fn named_series(&self) -> Vec<&Series> {
+        let named = self.series.iter().filter(|it| !it.name.is_empty());
+        named.collect()
     }
 }
 
 /// Draws a legend at the top of `area`, in as many rows as it needs, and returns its height.
-pub(super) fn draw_legend<'a>(
-    canvas: &mut Canvas,
-    area: Rect,
-    all: impl IntoIterator<Item = &'a Series>,
-) -> f64 {
+pub(super) fn draw_legend(canvas: &mut Canvas, area: Rect, all: &[&Series]) -> f64 {
     let (mut x, mut y, mut bottom) = (area.x, area.y, area.y);
     for series in all {
         let name_width_max = area.width - LEGEND_MARK - 6.0;
@@ -288,7 +285,7 @@ pub(super) fn draw_legend<'a>(
     bottom - area.y
 }
 
-pub(super) fn legend_height<'a>(width: f64, all: impl IntoIterator<Item = &'a Series>) -> f64 {
+pub(super) fn legend_height(width: f64, all: &[&Series]) -> f64 {
     let mut scratch = Canvas::new(width, 0.0, Letters::Text);
     draw_legend(&mut scratch, Rect::new(0.0, 0.0, width, 0.0), all)
 }

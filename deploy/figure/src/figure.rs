@@ -97,13 +97,13 @@ impl Figure {
     /// only legend would lack a series.
     fn shared_legend(&self, look: Look) -> Vec<&Series> {
         let legends = self.panels.iter().map(|panel| match panel {
-            Panel::Chart(chart) => chart.named_series().collect(),
+            Panel::Chart(chart) => chart.named_series(),
             Panel::Heat(_) | Panel::Lattice(_) => Vec::new(),
         });
         let legends: Vec<Vec<&Series>> = legends.collect();
         let (width, height) = self.panel_size;
         let height_max = LEGEND_SHARE_MAX * height;
-        let is_large = |it: &Vec<&Series>| legend_height(width, it.clone()) > height_max;
+        let is_large = |it: &Vec<&Series>| legend_height(width, it) > height_max;
         let mut shared: Vec<&Series> = Vec::new();
         for series in legends.iter().flatten() {
             if shared.iter().all(|it| it.name != series.name) {
@@ -130,7 +130,7 @@ impl Figure {
         let shared = self.shared_legend(look);
         let legend = Rect::new(MARGIN, header_height, width - 2.0 * MARGIN, 0.0);
         if !shared.is_empty() {
-            header_height += legend_height(legend.width, shared.clone()) + 10.0;
+            header_height += legend_height(legend.width, &shared) + 10.0;
         }
         let height = header_height + rows as f64 * (panel_height + MARGIN) + 4.0;
 
@@ -139,7 +139,7 @@ impl Figure {
             Look::Card => self.draw_header(&mut canvas, &notes),
             Look::Plain => canvas.rects(&[Rect::new(0.0, 0.0, width, height)], CARD),
         }
-        draw_legend(&mut canvas, legend, shared.clone());
+        draw_legend(&mut canvas, legend, &shared);
         for (index, panel) in self.panels.iter().enumerate() {
             let (row, column) = ((index / columns) as f64, (index % columns) as f64);
             let x = MARGIN + column * (panel_width + MARGIN);
