@@ -162,10 +162,8 @@ fn compare(pair: &Pair, sides: &Sides) -> Option<Row> {
     };
     let rounds = ours.iter().zip(theirs.unwrap_or_default());
     let ratios: Vec<_> = rounds.map(|(ours, theirs)| ours / theirs).collect();
-    let absent = || match &sides.absent {
-        Some(why) => why.clone(),
-        None => format!("{peer} was not measured"),
-    };
+    let unknown = || format!("{peer} was not measured");
+    let absent = || sides.absent.clone().unwrap_or_else(unknown);
     // A peer may fail in a later round; its earlier values are not the whole comparison.
     let failed = pair.own_figure.is_none() && sides.absent.is_some();
     Some(Row {
