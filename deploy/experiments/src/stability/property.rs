@@ -254,17 +254,6 @@ impl Cases<'_> {
         self.check_interrupt()
     }
 
-    /// Counts whether this case keeps a promise with the bound 0.
-    pub(super) fn record_kept(
-        &mut self,
-        promise: usize,
-        input: Arguments<'_>,
-        is_kept: bool,
-    ) -> anyhow::Result<()> {
-        self.tallies[promise].add(1, f64::from(!is_kept), || input.to_string());
-        self.check_interrupt()
-    }
-
     /// Returns an error if the user has interrupted. A long case calls this before it has an error to report.
     pub(super) fn check_interrupt(&mut self) -> anyhow::Result<()> {
         Ok(self.progress.advance(0)?)

@@ -114,7 +114,8 @@ fn projection_of_nan(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let shows_nan = bad[atoms..2 * atoms].iter().any(|p| p.is_nan());
     bad[atoms..2 * atoms].copy_from_slice(&good[atoms..2 * atoms]);
     let input = format_args!("{name}, {atoms} atoms on {support:?}");
-    cases.record_kept(2, input, shows_nan && bits(&good) == bits(&bad))
+    let is_kept = shows_nan && bits(&good) == bits(&bad);
+    cases.record_errors(input, [None, None, Some(f64::from(!is_kept))])
 }
 
 fn one_hot(atoms: usize, at: usize) -> Vec<f32> {
@@ -234,5 +235,6 @@ fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     };
     let (logit, target) = (batch.logits[at], batch.target[at]);
     let input = format_args!("logit {logit} under {target} at {at} of {}", batch.atoms);
-    cases.record_kept(2, input, !batch.kl().0.is_finite())
+    let hides_it = batch.kl().0.is_finite();
+    cases.record_errors(input, [None, None, Some(f64::from(hides_it))])
 }

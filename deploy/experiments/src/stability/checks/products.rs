@@ -271,7 +271,7 @@ fn infinite(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let y = linear(&line(large)?, &line(1e20)?, &bias, precision)?;
     let y = y.flatten_all()?.to_vec1::<f32>()?[0];
     let input = format_args!("{inputs} times {large:e} times 1e20: {y:e}");
-    cases.record_kept(1, input, !y.is_finite())
+    cases.record_errors(input, [None, Some(f64::from(y.is_finite()))])
 }
 
 /// Checks that an infinity or NaN in a row shows in the results of this row, and changes no other row and no later call.
@@ -301,7 +301,8 @@ fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
         let shows = may_hide || !spoilt[own_outputs.clone()].iter().any(|y| y.is_finite());
         spoilt[own_outputs.clone()].copy_from_slice(&before[own_outputs.clone()]);
         let kept = [spoilt, after].iter().all(|it| bits(it) == bits(&before));
-        cases.record_kept(1, format_args!("{bad} at {at} of {layer:?}"), shows && kept)?;
+        let input = format_args!("{bad} at {at} of {layer:?}");
+        cases.record_errors(input, [None, Some(f64::from(!(shows && kept)))])?;
     }
     Ok(())
 }
