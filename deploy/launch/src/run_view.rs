@@ -202,14 +202,12 @@ impl RunView {
         }
     }
 
-    /// The view of a run that begins now with these counts.
-    pub(crate) fn starting_at(plan: Plan, frames: u64, updates: u64) -> Self {
-        let mut this = Self::new(plan);
-        this.after_updates = Some(updates);
-        this.learner.updates = updates;
-        this.is_learner_known = true;
-        this.rates.add(Instant::now(), frames, updates);
-        this
+    /// Notes that the run begins now, with these counts.
+    pub(crate) fn begin_at(&mut self, frames: u64, updates: u64) {
+        self.after_updates = Some(updates);
+        self.learner.updates = updates;
+        self.is_learner_known = true;
+        self.rates.add(Instant::now(), frames, updates);
     }
 
     /// Stores the learner's status; none if it does not answer.
@@ -363,7 +361,8 @@ mod tests {
         }
         assert_eq!(view.speed.updates, 0.0);
 
-        let mut resumed = RunView::starting_at(Plan::default(), 0, 70);
+        let mut resumed = RunView::new(Plan::default());
+        resumed.begin_at(0, 70);
         resumed.set_learner(None);
         assert_eq!(resumed.learner.updates, 70, "before it has answered");
     }

@@ -85,6 +85,9 @@ pub fn run(
         let needed = shared_memory_bytes(&settings, config.replay.shards)?;
         shared_memory::granted(shared_memory::check_room(needed)).is_some()
     };
+    let point = resumed.unwrap_or_default();
+    let mut poller = Poller::new(config, Vec::new());
+    poller.view.begin_at(point.frames, point.updates);
     let mut launch = Launch {
         config,
         shared_memory,
@@ -99,7 +102,7 @@ pub fn run(
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
-        poller: Poller::starting_at(config, resumed.unwrap_or_default()),
+        poller,
         recorder,
     };
 

@@ -58,7 +58,8 @@ pub fn run(
     };
     let point = resumed.unwrap_or_default();
     let (frames, updates) = (point.frames, point.updates);
-    let mut view = RunView::starting_at(Plan::new(config), frames, updates);
+    let mut view = RunView::new(Plan::new(config));
+    view.begin_at(frames, updates);
     let mut evaluate = |updates, is_last| {
         let Some(episodes) = schedule.take_episodes(updates, is_last) else {
             return;

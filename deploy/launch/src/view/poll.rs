@@ -18,7 +18,6 @@ use zenoh::{Session, Wait};
 
 use crate::{
     endpoint::DEFAULT_NAMESPACE,
-    run_folder::ResumePoint,
     run_view::{PAUSE_MIN, Plan, RunView, ServerAnswer},
 };
 
@@ -51,21 +50,13 @@ pub struct Poller {
 }
 
 impl Poller {
-    /// A poller for the run with these settings, connected to its replay servers already, one per shard.
+    /// A poller for the run with these settings, connected to its replay servers already, one per shard, or to none yet.
     pub fn new(config: &RunConfig, servers: Vec<ServerConnection>) -> Self {
         Self {
             view: RunView::new(Plan::new(config)),
             config: config.clone(),
             servers,
             polled: Instant::now(),
-        }
-    }
-
-    /// A poller for a run that begins now, at `point`; it has no connection yet.
-    pub(crate) fn starting_at(config: &RunConfig, point: ResumePoint) -> Self {
-        Self {
-            view: RunView::starting_at(Plan::new(config), point.frames, point.updates),
-            ..Self::new(config, Vec::new())
         }
     }
 
