@@ -1,4 +1,4 @@
-//! Settings of runs, views and players, for tests.
+//! Settings of runs, run folders, views and players, for tests.
 
 use driml_learner::Compute;
 use driml_machine::resources::Machine;
@@ -10,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     evaluate::{EPSILON, Levels, Player, PolicyKind},
+    run_folder::RunFolder,
     run_view::{Plan, RunView},
 };
 
@@ -24,6 +25,13 @@ pub(crate) fn make<T: Default>(set: impl FnOnce(&mut T)) -> T {
     let mut it = T::default();
     set(&mut it);
     it
+}
+
+/// An empty run folder. Dropping the first value removes it.
+pub(crate) fn run_folder() -> (tempfile::TempDir, RunFolder) {
+    let root = tempfile::tempdir().unwrap();
+    let folder = RunFolder::new(root.path());
+    (root, folder)
 }
 
 /// The view of a run with one replay server, after these answers.

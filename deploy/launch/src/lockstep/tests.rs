@@ -61,8 +61,7 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 
 /// Begins a run, and saves it after `rounds` rounds.
 fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lockstep) {
-    let folder = tempfile::tempdir().unwrap();
-    let run_dir = RunFolder::new(folder.path());
+    let (folder, run_dir) = testing::run_folder();
     let mut lockstep = Lockstep::begin(config, &run_dir).unwrap();
     (0..rounds).for_each(|_| assert!(lockstep.run_round().unwrap()));
     lockstep.save(&run_dir.checkpoints()).unwrap();

@@ -5,7 +5,7 @@ use std::fs;
 use driml_protocol::Totals;
 
 use super::*;
-use crate::testing::make;
+use crate::testing::{make, run_folder};
 
 /// A shard with `frames` frames and `ended` episodes that have ended. The server keeps the episodes after the first `let_go`, thirty
 /// per answer. The return of an episode is `first` plus its number.
@@ -57,8 +57,7 @@ impl Shard {
 }
 
 fn begun() -> (tempfile::TempDir, RunFolder, TrainingEpisodes) {
-    let root = tempfile::tempdir().unwrap();
-    let folder = RunFolder::new(root.path());
+    let (root, folder) = run_folder();
     let episodes = TrainingEpisodes::open(&folder, None, None).unwrap();
     (root, folder, episodes)
 }

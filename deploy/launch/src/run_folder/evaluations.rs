@@ -174,6 +174,7 @@ impl Candidate {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::run_folder;
 
     /// Judges a checkpoint after `updates`, which the learner deletes while it is played.
     fn keep(folder: &RunFolder, updates: u64, mean: f64, episodes: u32) -> anyhow::Result<bool> {
@@ -188,8 +189,7 @@ mod tests {
 
     #[test]
     fn the_best_is_kept_and_all_are_in_the_table() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (_root, folder) = run_folder();
         let metrics = "seconds,frames,updates\n0.5,100,0\n1.5,300,9\n2.5,500,25\n";
         fs::write(folder.metrics(), metrics).unwrap();
         assert_eq!(EvaluationRow::all(&folder).unwrap(), []);
@@ -220,8 +220,7 @@ mod tests {
 
     #[test]
     fn of_evaluations_at_once_the_best_is_kept() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = &RunFolder::new(root.path());
+        let (_root, folder) = &run_folder();
         std::thread::scope(|scope| {
             for updates in 1..=8 {
                 scope.spawn(move || keep(folder, updates, updates as f64, 4).unwrap());
@@ -234,8 +233,7 @@ mod tests {
 
     #[test]
     fn the_best_stays_until_another_has_its_place() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (_root, folder) = run_folder();
         assert!(keep(&folder, 20, 3.0, 4).unwrap());
         let taken = folder.best().join("checkpoint-50.tmp");
         fs::write(&taken, "").unwrap();
@@ -248,8 +246,7 @@ mod tests {
 
     #[test]
     fn a_checkpoint_from_before_the_first_row_has_that_row_s_frames_if_there_is_one() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (_root, folder) = run_folder();
         let metrics = "seconds,frames,updates\n1.0,300,120\n2.0,500,240\n";
         fs::write(folder.metrics(), metrics).unwrap();
         let row = EvaluationRow::new(&folder, 100, 1, (2.0, None));

@@ -234,8 +234,7 @@ mod tests {
 
     #[test]
     fn settings_that_a_resume_changes_stay_beside_the_new_ones() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (root, folder) = testing::run_folder();
         let write = |set| {
             let config = testing::config("smoke", "chain", "c51", &[set]);
             folder.write_config(&config).unwrap();
@@ -259,8 +258,7 @@ mod tests {
 
     #[test]
     fn a_run_in_which_nothing_was_learned_gives_its_folder_back() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (root, folder) = testing::run_folder();
         let write = |path: PathBuf, text: &str| fs::write(path, text).unwrap();
         // As on a full disk, where settings cannot be written.
         write(folder.lock_file(), "");

@@ -128,11 +128,11 @@ mod tests {
     use std::fs;
 
     use super::*;
+    use crate::testing::run_folder;
 
     #[test]
     fn the_last_whole_row_counts() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (_root, folder) = run_folder();
         let write = |text: &str| fs::write(folder.metrics(), text).unwrap();
         assert_eq!(read_progress(&folder), None);
         write("seconds,frames,updates,a,b,c,episodes\n");

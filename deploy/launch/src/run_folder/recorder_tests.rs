@@ -9,7 +9,7 @@ use expect_test::expect;
 use super::*;
 use crate::{
     run_folder::{LastPlay, ReturnInterval},
-    testing::{self, make},
+    testing::{self, make, run_folder},
 };
 
 fn settings() -> RunConfig {
@@ -70,8 +70,7 @@ fn after(frames: u64, updates: u64, episodes: u64, k_histogram: [u64; 3]) -> Run
 
 #[test]
 fn a_run_leaves_settings_metrics_and_a_summary() {
-    let folder = tempfile::tempdir().unwrap();
-    let run = RunFolder::new(folder.path().join("run"));
+    let (_root, run) = run_folder();
     let mut recorder = open(&run, &["replay-server", "actor-0"], None).unwrap();
     let mut all = after(2_000, 31, 7, [2, 1, 1]);
     recorder.record(&mut after(0, 0, 0, [0; 3]), &[]);
@@ -106,8 +105,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 
 #[test]
 fn the_time_of_a_failed_start_is_not_that_of_the_next_run() {
-    let folder = tempfile::tempdir().unwrap();
-    let run = RunFolder::new(folder.path().join("run"));
+    let (_root, run) = run_folder();
     let failed = open(&run, &[], None).unwrap();
     let summary = Summary {
         wall_seconds: 120.0,
@@ -120,8 +118,7 @@ fn the_time_of_a_failed_start_is_not_that_of_the_next_run() {
 
 #[test]
 fn a_resumed_run_continues_in_its_metrics() {
-    let folder = tempfile::tempdir().unwrap();
-    let run = RunFolder::new(folder.path().join("run"));
+    let (_root, run) = run_folder();
     let processes = ["replay-server"];
     let mut recorder = open(&run, &processes, None).unwrap();
     // Mean k is 1.5 before the run is resumed, and 2 since.
@@ -199,8 +196,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         ("no metrics", None, 0.0, 0),
     ];
     for (what, metrics, seconds, kept) in cases {
-        let folder = tempfile::tempdir().unwrap();
-        let run = RunFolder::new(folder.path());
+        let (_root, run) = run_folder();
         fs::write(run.episodes(), episodes).unwrap();
         if let Some(text) = metrics {
             fs::write(run.metrics(), text).unwrap();
@@ -251,8 +247,7 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
         ("1.0,320,0,2\n1.5,800,0,3\n", with_log, 2, 0),
         ("1.0,1900,31,2\n1.5,2300,31,3\n", point(31), 1, 2),
     ] {
-        let folder = tempfile::tempdir().unwrap();
-        let run = RunFolder::new(folder.path());
+        let (_root, run) = run_folder();
         let text = format!("seconds,frames,updates,episodes\n{metrics}");
         fs::write(run.metrics(), text).unwrap();
         let recorder = open(&run, &[], Some(point)).unwrap();

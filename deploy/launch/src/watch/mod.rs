@@ -293,13 +293,12 @@ mod tests {
     use std::os::unix::net::UnixListener;
 
     use super::*;
-    use crate::testing::config;
+    use crate::testing::{config, run_folder};
 
     /// As on a file system without locks.
     #[test]
     fn a_server_that_listens_is_found_without_a_lock() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (root, folder) = run_folder();
         let settings = config("smoke", "chain", "c51", &[]).to_toml();
         std::fs::write(folder.config(), settings).unwrap();
         let socket = root.path().join("s");

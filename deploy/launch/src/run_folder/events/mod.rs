@@ -156,7 +156,7 @@ fn draw_affinity(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::make;
+    use crate::testing::{make, run_folder};
 
     #[test]
     fn counts_are_those_since_the_last_histogram() {
@@ -166,8 +166,7 @@ mod tests {
 
     #[test]
     fn a_file_is_whole_records() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        let (root, folder) = run_folder();
         let mut events = Events::create(&folder, 0).unwrap();
         let replay = make(|it: &mut ReplayStatus| {
             (it.transitions_inserted, it.k_histogram) = (70, vec![0, 4, 1]);
