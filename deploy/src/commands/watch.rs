@@ -64,11 +64,7 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
         let folder = selection.folder();
         watch::print_status(&mut poller, folder.as_ref(), args.watch, args.json)
     });
-    match shown.map_err(|e| e.downcast::<UnreachableRun>()) {
-        Err(Ok(unreachable)) => unreachable.print(args.json),
-        Err(Err(e)) => Err(e),
-        Ok(()) => Ok(()),
-    }
+    shown.or_else(|e| e.downcast::<UnreachableRun>()?.print(args.json))
 }
 
 impl RunSelection {
