@@ -42,6 +42,15 @@ pub struct RunFlags {
     pub flags: Flags,
 }
 
+impl RunFlags {
+    /// Preset, world and agent.
+    pub fn choice(&self) -> Result<Choice, Usage> {
+        let names = [&self.preset, &self.env, &self.agent];
+        let [preset, env, agent] = names.map(Option::as_deref);
+        Choice::new(preset, env, agent)
+    }
+}
+
 fn agent_help() -> String {
     let names: Vec<_> = agents().into_iter().map(|it| it.name).collect();
     format!("Agent: {} [default: driml-ada]", names.join(", "))
@@ -86,9 +95,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             (Source::of_another_run(&name, &text)?, name)
         }
         None => {
-            let names = [&args.preset, &args.env, &args.agent];
-            let [preset, env, agent] = names.map(Option::as_deref);
-            let choice = Choice::new(preset, env, agent)?;
+            let choice = args.choice()?;
             let from = format!("preset {}", choice.preset.name);
             (Source::Presets(choice), from)
         }

@@ -11,10 +11,7 @@ use driml_launch::{
     run_folder::RunFolder,
 };
 use driml_machine::resources::Machine;
-use driml_settings::{
-    flags::{RunFlags, resolve},
-    presets::Choice,
-};
+use driml_settings::flags::{RunFlags, resolve};
 
 #[derive(Debug, Args)]
 pub(crate) struct InspectArgs {
@@ -34,16 +31,11 @@ pub(crate) struct InspectArgs {
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
     let machine = Machine::detect();
     if args.worlds {
-        let RunFlags { preset, agent, .. } = &args.settings;
+        let mut flags = args.settings.clone();
         let mut inspections = Vec::new();
         for world in WorldName::all() {
-            let world = world.to_string();
-            if Choice::new(preset.as_deref(), Some(&world), agent.as_deref())?.fits_world() {
-                let env = Some(world);
-                let flags = RunFlags {
-                    env,
-                    ..args.settings.clone()
-                };
+            flags.env = Some(world.to_string());
+            if flags.choice()?.fits_world() {
                 inspections.push(Inspection::new(&resolve(&flags, &machine)?.0)?);
             }
         }
