@@ -287,8 +287,7 @@ impl Screen {
 
     /// Writes one line. A line about a full disk is left out if another one was written less than ten minutes ago.
     pub fn print_line(&self, text: &str) {
-        let is_full = |cause: &&str| text.contains(cause);
-        let is_full = FULL_DISK_CAUSES.iter().any(is_full);
+        let is_full = FULL_DISK_CAUSES.iter().any(|it| text.contains(it));
         if is_full
             && lock(&self.full_disk)
                 .admit_within(FULL_DISK_PERIOD)

@@ -212,9 +212,7 @@ pub(crate) fn curve_points(view: &RunView) -> Vec<(String, f64)> {
 /// The metrics as JSON by name. Whole numbers are integers, unknown values are null, and a metric with several members is an object.
 pub(crate) fn json(view: &RunView) -> BTreeMap<&'static str, serde_json::Value> {
     let value = |column: &Column| match column.value {
-        Value::Counter(value) | Value::Gauge(value) => {
-            value(view).map_or(serde_json::Value::Null, json_number)
-        }
+        Value::Counter(value) | Value::Gauge(value) => value(view).map(json_number).into(),
         Value::Words(words) => words(view).into(),
         Value::Members { members, .. } => {
             let members = members(view).into_iter();

@@ -110,11 +110,9 @@ fn as_whole(value: &Value) -> Option<Value> {
 }
 
 pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
-    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
-    let value = table.get(first)?;
-    match rest {
-        "" => Some(value),
-        rest => find(value.as_table()?, rest),
+    match path.split_once('.') {
+        None => table.get(path),
+        Some((first, rest)) => find(table.get(first)?.as_table()?, rest),
     }
 }
 
