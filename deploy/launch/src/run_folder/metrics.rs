@@ -95,7 +95,7 @@ pub(super) fn rows_up_to(
 }
 
 /// The progress of a run.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 pub struct Progress {
     /// Frames of the last row of metrics.
     pub frames: u64,
@@ -117,10 +117,7 @@ pub fn read_progress(folder: &RunFolder) -> Option<Progress> {
     // Text after the last line break is still being written.
     let row = end.get(..end.rfind('\n')?)?.lines().last()?;
     let last = Table::parse(format!("{header}{row}\n").as_bytes()).ok()?;
-    Some(Progress {
-        frames: last.last("frames")?,
-        episodes: last.last("episodes")?,
-    })
+    last.parse_rows(&folder.metrics()).ok()?.pop()
 }
 
 #[cfg(test)]
