@@ -223,5 +223,4 @@ fn describe_lost(lost: u64) -> String {
 }
 
 #[cfg(test)]
-#[path = "episodes_tests.rs"]
 mod tests;

@@ -205,5 +205,4 @@ fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
 }
 
 #[cfg(test)]
-#[path = "recorder_tests.rs"]
 mod tests;
