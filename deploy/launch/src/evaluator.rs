@@ -9,6 +9,7 @@ use std::{
 
 use driml_learner::checkpoint;
 use driml_machine::{error::Interrupted, units::count};
+use driml_protocol::Shutdown;
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
@@ -31,12 +32,12 @@ pub const SELECTION_SEED: u64 = 1 << 32;
 /// played for fewer episodes than the best does not replace it. Returns the evaluation and its rank, as the end of a sentence.
 ///
 /// # Errors
-/// A file system error; [`Interrupted`] once `is_stopped` returns true: then nothing is kept.
+/// A file system error; [`Interrupted`] once `shutdown` is raised: then nothing is kept.
 pub fn evaluate_and_keep(
     folder: &RunFolder,
     choice: CheckpointChoice,
     episodes: u32,
-    is_stopped: &dyn Fn() -> bool,
+    shutdown: &Shutdown,
 ) -> anyhow::Result<(EvaluationRow, String)> {
     let path = checkpoint_path(folder, choice)?;
     check_file("the table", &folder.evaluations())?;
@@ -44,7 +45,8 @@ pub fn evaluate_and_keep(
     let evaluate = |path: &Path| -> anyhow::Result<EvaluationRow> {
         let player = Player::load_checkpoint(read_config(folder)?, path, WeightsChoice::default())?;
         let (agent, count) = (PolicyKind::Agent, episodes as usize);
-        let returns = player.returns(agent, Levels::Train, count, SELECTION_SEED, is_stopped)?;
+        let is_over = || shutdown.is_set();
+        let returns = player.returns(agent, Levels::Train, count, SELECTION_SEED, is_over)?;
         if returns.len() < count {
             return Err(Interrupted.into());
         }
@@ -130,7 +132,7 @@ impl Evaluator {
     }
 
     /// Evaluates the last checkpoint. Waits for the result up to an hour, or until the run is told to stop.
-    pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
+    pub(crate) fn finish(&mut self, screen: &Screen, shutdown: &Shutdown) {
         let deadline = Instant::now() + LAST_EVALUATION_MAX;
         loop {
             self.report_result(screen);
@@ -140,11 +142,10 @@ impl Evaluator {
                 }
                 screen.print_line("playing the last checkpoint (skip it with Ctrl-C)");
             }
-            if abort() || Instant::now() > deadline {
+            if shutdown.wait_timeout(POLL) || Instant::now() > deadline {
                 screen.print_line("skipped the last evaluation");
                 return;
             }
-            std::thread::sleep(POLL);
         }
     }
 

@@ -36,7 +36,7 @@ pub(crate) fn play(
         "playing the weights beside a random policy, for at most about 30 s (skip it with Ctrl-C or --no-play)",
     );
     let (run, flag) = (folder.clone(), shutdown.clone());
-    let work = move || played(&run, &|| flag.is_set());
+    let work = move || played(&run, &flag);
     let played = shutdown.run_unless_set("last-play", work, || false);
     let played = played.map_err(anyhow::Error::from);
     let noted = played.and_then(|played| {
@@ -53,10 +53,10 @@ pub(crate) fn play(
 }
 
 /// What the weights in `folder` earn; none if stopped before the first batch was complete.
-fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<Option<LastPlay>> {
+fn played(folder: &RunFolder, stop: &Shutdown) -> anyhow::Result<Option<LastPlay>> {
     let started = Instant::now();
     let player = Player::load(folder, CheckpointChoice::Newest, WeightsChoice::Average)?;
-    let is_over = || is_stopped() || started.elapsed() > FIRST_BATCH_MAX;
+    let is_over = || stop.is_set() || started.elapsed() > FIRST_BATCH_MAX;
     let (mut agent, mut random) = (Vec::new(), Vec::new());
     for batch in 0..BATCHES_MAX {
         // The next batch takes about as long as the mean batch before it.
@@ -74,7 +74,7 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
     }
     if agent.is_empty() {
         let max = FIRST_BATCH_MAX.as_secs();
-        ensure!(is_stopped(), "{BATCH} episodes take longer than {max} s");
+        ensure!(stop.is_set(), "{BATCH} episodes take longer than {max} s");
         return Ok(None);
     }
     Ok(Some(LastPlay {
@@ -104,7 +104,7 @@ mod tests {
         let before = summary.clone();
         let folder = RunFolder::new("no-such-run");
         play(&mut summary, &config, &folder, &Shutdown::default());
-        assert!(played(&folder, &|| false).is_err());
+        assert!(played(&folder, &Shutdown::default()).is_err());
         assert_eq!(summary, before);
     }
 }

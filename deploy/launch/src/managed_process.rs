@@ -15,6 +15,7 @@ use driml_machine::{
     process_env::program_path,
     units::{duration, proc_kib},
 };
+use driml_protocol::Shutdown;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -187,13 +188,13 @@ pub(crate) fn is_orderly_exit(status: ExitStatus) -> bool {
     status.success() || status.code() == Some(EXIT_INTERRUPTED.into())
 }
 
-/// Waits for processes to end, after SIGTERM to each if `send_sigterm`. Kills those that do not end in time, and reports failures. A process
-/// that receives SIGTERM before it listens for signals dies of it, which is not a failure: it has nothing to save.
+/// Waits for processes to end, after SIGTERM to each if `send_sigterm`. Kills those that do not end in time, or when `now` is raised, and
+/// reports failures. A process that dies of a SIGTERM before it listens for signals is no failure: it has nothing to save.
 pub fn stop_processes<'a>(
     processes: impl IntoIterator<Item = &'a mut ManagedProcess>,
     send_sigterm: bool,
     drain_max: Duration,
-    abort: &impl Fn() -> bool,
+    now: &Shutdown,
 ) -> Vec<String> {
     let mut processes: Vec<_> = processes.into_iter().collect();
     if send_sigterm {
@@ -202,12 +203,12 @@ pub fn stop_processes<'a>(
     let deadline = Instant::now() + drain_max;
     let mut failures = Vec::new();
     for process in processes {
-        match process.wait_until(deadline, abort) {
+        match process.wait_until(deadline, || now.is_set()) {
             Some(status) if is_orderly_exit(status) => {}
             Some(status) if send_sigterm && status.signal() == Some(Signal::SIGTERM as i32) => {}
             Some(_) => failures.push(process.exit_report()),
             None => {
-                if !abort() {
+                if !now.is_set() {
                     failures.push(format!(
                         "{} did not exit within {} and was killed",
                         process.name,
@@ -235,7 +236,8 @@ mod tests {
             let screen = Screen::default();
             let started = ManagedProcess::start("script", command, logs.path(), &screen);
             let mut process = started.unwrap();
-            stop_processes([&mut process], ask, Duration::from_secs(60), &|| false)
+            let max = Duration::from_secs(60);
+            stop_processes([&mut process], ask, max, &Shutdown::default())
         };
         assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);
         let killed = stopped("kill -TERM $$", false);

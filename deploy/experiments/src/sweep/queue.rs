@@ -327,8 +327,7 @@ impl Queue {
         }
         progress.line("stopping the runs; the same command resumes those that are not finished");
         let processes = self.running.iter_mut().map(|it| &mut it.process);
-        let abort = || progress.shutdown.immediate.is_set();
-        stop_processes(processes, true, DRAIN_MAX, &abort);
+        stop_processes(processes, true, DRAIN_MAX, &progress.shutdown.immediate);
     }
 }
 

@@ -115,8 +115,8 @@ pub fn run(
     let (mut summary, written) = launch.write_summary(outcome, restarts_before);
     // An interrupted or failed run does not wait for the last evaluation.
     if outcome == Outcome::Finished {
-        let evaluator = &mut launch.evaluator;
-        evaluator.finish(&launch.display.screen, &|| launch.shutdown.drain.is_set());
+        let screen = &launch.display.screen;
+        launch.evaluator.finish(screen, &launch.shutdown.drain);
     }
     // All processes have exited, so these files are of no use. If they stay behind, the released locks show that.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
@@ -225,7 +225,6 @@ impl Launch<'_> {
             self.display.screen.print_line("stopping: actors deliver what they have, the learner saves (Ctrl-C again exits at once)");
         }
         let now = self.shutdown.immediate.clone();
-        let abort = move || now.is_set();
         let finished = matches!(watched, Ok(Outcome::Finished));
         // After a failure, the learner will hardly use what the actors still hold.
         let actors_max = match watched {
@@ -235,10 +234,10 @@ impl Launch<'_> {
         // In a finished run, the replay server tells the actors so, and they exit.
         let shards = self.endpoints.len();
         let actors = self.processes.iter_mut().skip(shards + 1);
-        let actors = stop_processes(actors, !finished, actors_max, &abort);
-        self.wait_for_final_checkpoint(&abort);
+        let actors = stop_processes(actors, !finished, actors_max, &now);
+        self.wait_for_final_checkpoint();
         let learner = self.processes.iter_mut().skip(shards).take(1);
-        let mut others = stop_processes(learner, true, LEARNER_DRAIN_MAX, &abort);
+        let mut others = stop_processes(learner, true, LEARNER_DRAIN_MAX, &now);
         let poller = &mut self.poller;
         if let Err(e) = poller.poll_replay() {
             tracing::debug!("the replay server's last answer: {e:#}");
@@ -248,14 +247,14 @@ impl Launch<'_> {
         // Closed before the replay server, which is the session's router: otherwise it would try to reconnect.
         poller.close();
         let servers = self.processes.iter_mut().take(shards);
-        others.extend(stop_processes(servers, true, REPLAY_DRAIN_MAX, &abort));
+        others.extend(stop_processes(servers, true, REPLAY_DRAIN_MAX, &now));
         // By the last answers, all transitions are stored and learned from, and the result is saved.
         let view = &self.poller.view;
         let served = updates_served(self.config, view.replay.rows_sampled);
         let is_complete = finished || view.is_all_learned() && view.learner.updates >= served;
         let result = match watched {
             _ if is_complete => self.run_dir.check_intact().map(|()| Outcome::Finished),
-            _ if abort() => Err(anyhow::anyhow!(
+            _ if now.is_set() => Err(anyhow::anyhow!(
                 "stopped at once by a second interrupt: what was not saved is lost"
             )),
             Ok(_) if !others.is_empty() => {
@@ -277,7 +276,7 @@ impl Launch<'_> {
     }
 
     /// Tells the learner to stop, then polls its status until it reports that it has saved or no longer answers.
-    fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
+    fn wait_for_final_checkpoint(&mut self) {
         let Some(learner) = self.processes.get_mut(self.endpoints.len()) else {
             return;
         };
@@ -291,7 +290,7 @@ impl Launch<'_> {
         }
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
-        while Instant::now() <= deadline && !abort() {
+        while Instant::now() <= deadline && !self.shutdown.immediate.is_set() {
             if let Err(e) = poller.poll_learner() {
                 tracing::debug!("a last question: {e:#}");
                 return;

@@ -44,7 +44,6 @@ pub fn run(
     let mut display = Display::new(config.frames(), Instant::now());
     let screen = display.screen.clone();
     watch_interrupts(drain.clone(), immediate, screen.clone())?;
-    let is_stopped = || drain.is_set();
     let mut schedule = EvaluationSchedule::new(config, run_dir)?;
     let events = config.local.tensorboard;
     // A state that does not fit the settings is an error before the folder changes.
@@ -65,9 +64,9 @@ pub fn run(
             return;
         };
         let choice = CheckpointChoice::After(updates);
-        match evaluate_and_keep(run_dir, choice, episodes, &is_stopped) {
+        match evaluate_and_keep(run_dir, choice, episodes, &drain) {
             Ok((evaluation, _)) => screen.print_line(&evaluation.describe()),
-            Err(_) if is_stopped() => screen.print_line("skipped an evaluation"),
+            Err(_) if drain.is_set() => screen.print_line("skipped an evaluation"),
             Err(e) => screen.print_line(&format!("the run continues without an evaluation: {e:#}")),
         }
     };
@@ -82,7 +81,7 @@ pub fn run(
     let period = config.learner.checkpoint_period_updates;
     let mut train = || {
         let outcome = loop {
-            if is_stopped() {
+            if drain.is_set() {
                 break Outcome::Interrupted;
             }
             if !lockstep.run_round()? {

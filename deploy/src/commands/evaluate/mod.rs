@@ -123,8 +123,7 @@ fn evaluate(args: &EvaluateArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         ));
     }
     if args.keep {
-        let is_stopped = || shutdown.is_set();
-        let (evaluation, rank) = evaluate_and_keep(&folder, choice, args.episodes, &is_stopped)?;
+        let (evaluation, rank) = evaluate_and_keep(&folder, choice, args.episodes, shutdown)?;
         return print(&format!("{}{rank}\n", evaluation.describe()));
     }
     let mut player = match pretrained {
