@@ -30,7 +30,7 @@ type Counts = Vec<(String, u64)>;
 
 pub(super) struct CostCounter<'a> {
     config: &'a RunConfig,
-    model: ModelConfig,
+    pub(super) model: ModelConfig,
     shape: UpdateShape,
     run: RunSpec,
     broadcast: usize,
@@ -85,10 +85,6 @@ impl<'a> CostCounter<'a> {
             shape,
             run,
         })
-    }
-
-    pub(super) fn units(&self) -> Vec<String> {
-        units(&self.model)
     }
 
     /// Scalars of all networks that the learner holds; `units` are those of the model that has the most.
@@ -156,7 +152,7 @@ fn sum(layers: &[LayerCost], part: &str, cost: fn(&LayerCost) -> u64) -> u64 {
 }
 
 /// The units in which layers are shown: a residual block is one unit, and so is C51's head, of one layer or two.
-fn units(model: &ModelConfig) -> Vec<String> {
+pub(super) fn units(model: &ModelConfig) -> Vec<String> {
     let mut units: Vec<String> = Vec::new();
     for layer in model.layer_costs() {
         let unit = match layer.name.split('.').collect::<Vec<_>>()[..] {

@@ -9,7 +9,7 @@ use indicatif::HumanCount;
 use serde::Serialize;
 
 use crate::console::align_columns;
-use count::{CostCounter, EVERYTHING, Line};
+use count::{CostCounter, EVERYTHING, Line, units};
 
 /// The size and the cost of a world and an agent.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -34,7 +34,7 @@ impl Inspection {
         let counters = CostCounter::new(config)
             .and_then(|is| Ok([is, CostCounter::with_everything_on(config)?]))
             .context("computing the size of the weights")?;
-        let units = counters[1].units();
+        let units = units(&counters[1].model);
         let lines = |count: &dyn Fn(&CostCounter<'_>) -> Vec<(String, u64)>| -> Vec<Line> {
             let [is, all] = counters.each_ref().map(count);
             let line = |((what, is), (_, everything))| Line {
