@@ -59,7 +59,7 @@ impl Override {
             (old, new) if old.same_type(new) => Ok(new.clone()),
             (old, new) => (old.as_integer().and_then(|_| as_whole(new))).ok_or_else(|| {
                 usage!(
-                    "--set {}={}: this setting takes {}, and {new} is {}",
+                    "--set {}={}: this setting takes {}, and \"{new}\" is {}",
                     self.path,
                     inline_text(new),
                     type_name(old),
