@@ -218,7 +218,7 @@ impl TrainingEpisodes {
 fn describe_lost(lost: u64) -> String {
     let lost = count(lost, "episode");
     format!(
-        "episodes.csv lacks {lost}: more ended between two requests than the replay server keeps"
+        "episodes.csv lacks {lost}: a replay server was restarted, or more ended between two requests than it keeps"
     )
 }
 
