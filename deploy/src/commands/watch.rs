@@ -55,7 +55,8 @@ pub(crate) struct StatusArgs {
 }
 
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    watch::run(args.selection.open(), &args.flags)
+    let selection = &args.selection;
+    watch::run(selection.open(), selection.folder().as_ref(), &args.flags)
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {

@@ -89,15 +89,20 @@ pub fn print_status(
 }
 
 /// Watches a run that was `found`: shows and records it until it is over, or, with `--once`, prints one page for scripts and monitors.
-/// The file for Prometheus tells whether the run answers.
+/// The file for Prometheus tells whether the run answers. If `driml train` stops, the run's `folder`, if it is known, tells how it ended.
 ///
 /// # Errors
 /// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
 /// that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
-pub fn run(found: anyhow::Result<Poller>, flags: &WatchFlags) -> anyhow::Result<()> {
+pub fn run(
+    found: anyhow::Result<Poller>,
+    folder: Option<&RunFolder>,
+    flags: &WatchFlags,
+) -> anyhow::Result<()> {
     match found {
         Ok(poller) if flags.once => check_once(poller, flags),
-        Ok(poller) => watch(poller, flags),
+        Ok(poller) => watch(poller, folder, flags)
+            .or_else(|e| e.downcast::<UnreachableRun>()?.print(flags.json)),
         Err(e) => {
             if let Some(path) = &flags.prometheus {
                 let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
@@ -156,7 +161,7 @@ fn wait_until_known(
 }
 
 /// Shows and records a run until it is over, or until Ctrl-C, after which the run continues.
-fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
+fn watch(mut poller: Poller, run: Option<&RunFolder>, flags: &WatchFlags) -> anyhow::Result<()> {
     let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
     poller.poll();
@@ -177,6 +182,12 @@ fn watch(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
             Ok(false) => {}
             Ok(true) => break Ok(Outcome::Finished),
             Err(e) => break Err(e),
+        }
+        let is_cut_short = poller.view.servers_ended() && !poller.view.is_over();
+        // A launcher that runs may restart its replay server.
+        let stopped = run.filter(|it| is_cut_short && !it.is_locked());
+        if let Some(Err(e)) = stopped.map(read_endpoints) {
+            break Err(e);
         }
         if interrupted.wait_timeout(poller.pause()) {
             break Ok(Outcome::Interrupted);
