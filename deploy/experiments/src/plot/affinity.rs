@@ -26,14 +26,13 @@ pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
 
 fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
     let checkpoints = checkpoint::list(&folder.checkpoints())?;
-    let (updates, path) = checkpoints.last().ok_or_else(|| {
-        usage!(
-            "{} has no checkpoint, from which A is read: choose a run that has one",
-            folder.display()
-        )
-    })?;
-    let affinity = checkpoint::read_affinity(path)?
-        .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
+    let name = folder.display();
+    let none =
+        || usage!("{name} has no checkpoint, from which A is read: choose a run that has one");
+    let (updates, path) = checkpoints.last().ok_or_else(none)?;
+    let affinity = checkpoint::read_affinity(path)?;
+    let none = || usage!("{name} has no affinity: only driml-ada learns one");
+    let affinity = affinity.ok_or_else(none)?;
     let side = affinity.num_actions();
     let matrix = affinity.matrix();
     // From 0, so that nearly equal probabilities have nearly the same colour.

@@ -164,11 +164,9 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(Usage(apart.pop().unwrap_or(none)).into());
         }
         apart.iter().for_each(|line| console::eprintln(line));
-        if !is_loss {
-            // Not every agent has a k, which only the overview draws without being asked.
-            let all = column == RETURN || !args.column.is_empty();
-            missing_messages(column, all, &groups).for_each(|line| console::eprintln(&line));
-        }
+        // Not every agent has a k or each loss, which only the overview draws without being asked.
+        let all = column == RETURN || !args.column.is_empty();
+        missing_messages(column, all, &groups).for_each(|line| console::eprintln(&line));
         if is_return(column) {
             series.extend(random_lines(&random, &series, groups.len()));
         }
