@@ -29,7 +29,9 @@ impl<'de> Deserialize<'de> for WorldConfig {
         let mut fields = table.clone();
         let kind = fields.remove("kind");
         let kind = kind.ok_or_else(|| D::Error::missing_field("kind"))?;
-        let invalid = |e: toml::de::Error| D::Error::custom(e.message());
+        // Two lines: what is wrong, and at which key.
+        let in_one_line = |e: toml::de::Error| e.to_string().trim_end().replace('\n', ", ");
+        let invalid = |e: toml::de::Error| D::Error::custom(in_one_line(e));
         let kind: String = kind.try_into().map_err(invalid)?;
         if let Some(built_in) = Self::parse_built_in(&kind, &fields) {
             return built_in.map_err(invalid);
