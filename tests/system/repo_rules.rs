@@ -16,7 +16,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("replay-server", 11_150),
     ("learner", 22_020),
     ("deploy", 31_210),
-    ("tests", 10_490),
+    ("tests", 10_515),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;

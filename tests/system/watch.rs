@@ -96,6 +96,25 @@ fn a_launched_run_is_watched_and_continues_without() {
     assert!(frames.is_sorted(), "{frames:?}");
 }
 
+/// A watch asks once a second, so that it often misses the last answers.
+#[test]
+fn a_run_that_ends_between_two_requests_leaves_its_summary() {
+    let system = system();
+    system.pause_learners_at(100);
+    let launcher = system.start(&system.local_args(&format!("--agent c51 {SHORT}")));
+    system.connect().wait_for_updates(0);
+    let watched = system.start("watch run --run-dir seen");
+    wait_until("the folder", || system.path("seen/metrics.csv").exists());
+    watched.signal(Signal::SIGSTOP);
+    system.release_learners();
+    launcher.wait_ok();
+    watched.signal(Signal::SIGCONT);
+    let ended = watched.wait_ok().expect_stdout("the run is over");
+    ended.expect_stderr("seen/metrics.csv lacks the run's last rows");
+    let [whole, seen] = ["run", "seen"].map(|it| system.read(&format!("{it}/summary.json")));
+    assert_eq!(seen, whole);
+}
+
 #[test]
 fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     let system = system();

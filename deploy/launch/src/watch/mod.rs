@@ -202,6 +202,15 @@ fn watch(mut poller: Poller, run: Option<&RunFolder>, flags: &WatchFlags) -> any
     poller.close();
     let outcome = *ended.as_ref().unwrap_or(&Outcome::Failed);
     let summary = watched.finish(&mut poller.view, outcome);
+    let error = ended.as_ref().err();
+    let unseen = error.and_then(|e| e.downcast_ref::<UnreachableRun>());
+    let whole = unseen.filter(|it| it.finished);
+    let whole = whole.and_then(|it| it.summary.as_ref());
+    if let Some((whole, folder)) = whole.zip(folder.as_ref()) {
+        whole.write(folder)?;
+        let metrics = folder.metrics();
+        console::eprintln(&format!("{} lacks the run's last rows", metrics.display()));
+    }
     if ended? == Outcome::Interrupted {
         console::eprintln("the run continues without being watched");
         return Err(Interrupted.into());
