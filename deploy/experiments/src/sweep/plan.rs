@@ -120,7 +120,9 @@ pub(crate) fn install_worlds<P>(plans: &[PointPlan<P>], report: bool) -> anyhow:
     for (_, plan) in first.filter(|_| !report) {
         let config = plan.call.config_within(Machine::detect().memory_bytes);
         let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
-        let is_as_planned = config.run.seed == 1 && config.frames() == plan.frames;
+        // Whatever its value: all seeds of the point would have it.
+        let sets_seed = |set: &String| set.trim_start().starts_with("run.seed");
+        let is_as_planned = !plan.call.sets.iter().any(sets_seed) && config.frames() == plan.frames;
         ensure!(
             is_as_planned,
             usage!("--set changes the run's seed or frames: use --seeds and --frames")
