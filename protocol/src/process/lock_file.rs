@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-/// How often a lock is tried again that a process which another thread starts may keep: until its `exec` it has all files open.
+/// How often a held lock is tried again: a process that another thread starts keeps all locks of this process until its `exec`.
 /// Tries are counted and not time, as time passes for a stopped process too.
 const RETRIES_MAX: u32 = 20;
 /// The pause after each try.

@@ -164,7 +164,7 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
             return Err(Usage(apart.pop().unwrap_or(none)).into());
         }
         apart.iter().for_each(|line| console::eprintln(line));
-        // Not every agent has a k or each loss, which only the overview draws without being asked.
+        // The overview also draws k and losses that some agents do not have.
         let all = column == RETURN || !args.column.is_empty();
         missing_messages(column, all, &groups).for_each(|line| console::eprintln(&line));
         if is_return(column) {
