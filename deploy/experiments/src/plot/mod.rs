@@ -27,7 +27,7 @@ use driml_machine::{
 pub(crate) use self::{
     flags::Band,
     groups::{Curve, combine_seeds, smooth},
-    runs::{Run, read_settings},
+    runs::{Run, Settings, read_settings},
 };
 use self::{
     flags::PlotArgs,

@@ -15,8 +15,11 @@ use driml_launch::{
 use driml_machine::error::usage;
 use driml_settings::config::RunConfig;
 
-use super::plan::{FinishedRun, PlannedRun, PointPlan};
-use crate::{cache::RUNS, plot::read_settings};
+use super::plan::{FinishedRun, PlannedRun, PointPlan, TrainCall};
+use crate::{
+    cache::RUNS,
+    plot::{Settings, read_settings},
+};
 
 /// The number of bytes at the end of a failed run's output that are shown.
 const LOG_TAIL_BYTES: usize = 1200;
@@ -70,24 +73,31 @@ impl Runs {
     /// Checks that the existing runs have the settings that the same calls mean now: presets may have changed since, and defaults depend on
     /// the machine.
     pub(super) fn check_settings<P>(&self, plans: &[PointPlan<P>]) -> anyhow::Result<()> {
+        let mut known: Vec<(TrainCall, Settings)> = Vec::new();
         let settings = |config: RunConfig| {
             let found = read_settings(&config.to_toml(), &[]);
             found.expect("a run's settings have a table [run]").0
         };
         for (_, plan) in plans {
-            let folder = self.folder(plan);
+            let (folder, call) = (self.folder(plan), plan.call.with_seed(1));
             // The queue begins other runs again.
             let is_used = self.get_finished(plan).is_some() || folder.newest_checkpoint().is_some();
             if !self.is_made_by(plan) || !is_used {
                 continue;
             }
             let next = "choose another --out, or remove that folder";
-            let now = settings(plan.call.config()?);
+            let at = known.iter().position(|it| it.0 == call);
+            let at = at.unwrap_or(known.len());
+            if at == known.len() {
+                let now = settings(call.config()?);
+                known.push((call, now));
+            }
+            let now = &known[at].1;
             let made = read_config(&folder).map_err(|e| usage!("{e:#}; {next}"))?;
             let made = settings(made);
             let mut keys = made.keys().chain(now.keys());
             if let Some(key) = keys.find(|key| made.get(*key) != now.get(*key)) {
-                let [made, now] = [&made, &now].map(|it| it.get(key).map_or("unset", |it| it));
+                let [made, now] = [&made, now].map(|it| it.get(key).map_or("unset", |it| it));
                 bail!(usage!(
                     "{} was made with {key} = {made}, and this call has {now}: {next}",
                     folder.display()
@@ -181,7 +191,6 @@ pub(super) mod tests {
     };
 
     use super::*;
-    use crate::sweep::plan::TrainCall;
 
     pub(in crate::sweep) fn write_finished_run(folder: &RunFolder) {
         let call = TrainCall {
