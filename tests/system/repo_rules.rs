@@ -12,10 +12,10 @@ use walkdir::{DirEntry, WalkDir};
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_550),
-    ("actor", 10_535),
+    ("actor", 10_520),
     ("replay-server", 11_150),
     ("learner", 22_020),
-    ("deploy", 31_210),
+    ("deploy", 31_180),
     ("tests", 10_515),
 ];
 /// The most lines of one file.
