@@ -70,14 +70,15 @@ pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     environment.add_filter("thousands", |number: u64| HumanCount(number).to_string());
     environment.add_filter("counted", |number: u64, noun: &str| count(number, noun));
     environment.add_filter("mean", |list: Value| reduce(&list, mean));
-    environment.add_filter("spread", |list: Value| {
-        reduce(&list, |all| mean_and_sd(all, 3, true))
+    environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
+        reduce(&list, |all| mean_and_sd(all, decimals.unwrap_or(3), true))
     });
     environment.add_filter("mean_and_sd", |list: Value, decimals: usize| {
         reduce(&list, |all| mean_and_sd(all, decimals, false))
     });
-    environment.add_filter("interval", |list: Value| {
-        reduce(&list, |all| Some(interval(all)?.to_string()))
+    environment.add_filter("interval", |list: Value, decimals: Option<usize>| {
+        let decimals = decimals.unwrap_or(2);
+        reduce(&list, |all| Some(format!("{:.decimals$}", interval(all)?)))
     });
     environment.add_filter("minus", |to: Value, from: Value| {
         let (to, from) = (numbers_of(&to)?, numbers_of(&from)?);
@@ -176,8 +177,8 @@ mod tests {
             ("{{ [1.0] | mean_and_sd(1) }}", "1.0"),
             ("{{ [1.0] | spread }}", "1.000 (one seed)"),
             (
-                "{{ [1.0, 3.0] | spread }}",
-                "2.000 (standard deviation 1.414 over 2 seeds)",
+                "{{ [1.0, 3.0] | spread(2) }}",
+                "2.00 (standard deviation 1.41 over 2 seeds)",
             ),
             ("{{ [1.0] | interval }}", "1.00 (one seed)"),
             ("{{ [1.0] | length | counted('run') }}", "1 run"),
