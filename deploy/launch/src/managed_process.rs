@@ -189,7 +189,7 @@ pub(crate) fn is_orderly_exit(status: ExitStatus) -> bool {
 }
 
 /// Waits for processes to end, after SIGTERM to each if `send_sigterm`. Kills those that do not end in time, or when `now` is raised, and
-/// reports failures. A process that dies of a SIGTERM before it listens for signals is no failure: it has nothing to save.
+/// reports failures. A process that dies of a SIGTERM before it listens for signals has not failed: it has nothing to save.
 pub fn stop_processes<'a>(
     processes: impl IntoIterator<Item = &'a mut ManagedProcess>,
     send_sigterm: bool,

@@ -121,7 +121,7 @@ pub struct ReplayStatus {
     /// How often each k was served; index 0 counts rows without a positive. A row of several positives counts once, under
     /// its furthest.
     pub k_histogram: Vec<u64>,
-    /// Mean age of the rows of the last batches, in transitions stored since; a shard counts those of its own.
+    /// Mean age of the rows of the last batches, in transitions stored since. One shard counts only those that it stored.
     pub mean_age: f64,
     /// How often each action was stored.
     pub action_histogram: Vec<u64>,
