@@ -76,6 +76,22 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
 }
 
 #[test]
+fn rows_that_the_learner_counts_after_its_first_request_count_here_too() {
+    let (folder, mut replay) = begin();
+    replay.join_learner(LearnerJoin::default()).unwrap();
+    drop(replay);
+    let mut replay = open(folder.path());
+    for (rows_received, rows_sampled) in [(8, 8), (12, 12), (8, 12)] {
+        let learned = LearnerProgress {
+            rows_received,
+            ..LearnerProgress::default()
+        };
+        replay.set_progress(learned).unwrap();
+        assert_eq!(replay.counts().rows_sampled, rows_sampled);
+    }
+}
+
+#[test]
 fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
     let (folder, mut replay) = begin();
     for actor in 0..ACTORS_MAX as u32 {

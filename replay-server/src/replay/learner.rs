@@ -110,8 +110,13 @@ impl Replay {
                 "a learner with {updates} updates and {rows} rows, counts that no run reaches"
             ));
         }
+        let rows_sampled = &mut self.limiter.counts.this_shard.rows_sampled;
         if std::mem::take(&mut self.awaits_row_count) {
-            self.limiter.counts.this_shard.rows_sampled = rows;
+            *rows_sampled = rows;
+        } else if self.state.actors.restored {
+            // The learner may count a batch from before the restart only after its first request. Too low a count would let it learn more
+            // than the replay ratio allows; this one is never too high, as the learner receives only what was served.
+            *rows_sampled = rows.max(*rows_sampled);
         }
         // A request may overtake another.
         if updates >= self.state.learned.updates {

@@ -37,7 +37,7 @@ pub struct Replay {
     pub(crate) origin: Origin,
     /// Set while the log is read back: differences counted then were logged when they happened.
     pub(crate) is_recovering: bool,
-    /// Set after the log was read back: the learner's next request tells how many rows it has received.
+    /// Set after the log was read back: the learner's next request replaces the count of rows, and later ones may raise it.
     pub(crate) awaits_row_count: bool,
     pub(crate) journal: Option<Journal>,
 }
