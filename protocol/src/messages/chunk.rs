@@ -56,7 +56,7 @@ pub struct ChunkHeader {
     pub first_transition: u64,
     /// Version of the weights that chose every action of this chunk; 0 before the first version.
     pub weights_version: u64,
-    /// Whether the actor is shutting down and sends its remaining transitions. The rate limiter lets them pass.
+    /// Whether the actor is shutting down and sends its remaining transitions. The rate limiter lets 128 such chunks pass.
     pub leaving: bool,
     /// Number of environments, each of which is a stream.
     pub streams: u32,

@@ -12,6 +12,9 @@ use crate::storage::ring::Link;
 pub const ACTORS_MAX: usize = 4096;
 /// Maximum streams of one actor. A chunk with more is rejected.
 pub const STREAMS_MAX: u32 = 4096;
+/// Maximum chunks of a leaving incarnation that pass the rate limiter: twice as many as an actor may have in flight. Later ones wait like
+/// those of an actor that stays, until the actor joins again.
+const LEAVING_CHUNKS_MAX: u64 = 128;
 /// Maximum past incarnations remembered per actor. Chunks of older ones are rejected as unknown.
 const PAST_INCARNATIONS_MAX: usize = 64;
 
@@ -33,6 +36,9 @@ struct IncarnationState {
     /// Whether it left although transitions were not stored. A restarted server does not need this, as it lists connected processes only.
     #[serde(skip)]
     has_failed: bool,
+    /// Sequence number of the first chunk that passed the rate limiter because the actor was leaving.
+    #[serde(skip)]
+    leaving_from: Option<u64>,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -205,6 +211,16 @@ impl Actors {
                 && actor.fits_streams(header)
                 && actor.gap_sequence.replace(header.sequence) == Some(header.sequence)
         })
+    }
+
+    /// Whether a chunk that [`Actors::chunk_order`] accepts passes the rate limiter because its actor is leaving. A retry gets the same reply.
+    pub(crate) fn passes_limiter(&mut self, header: &ChunkHeader) -> bool {
+        let actor = self.actors.get_mut(&header.actor);
+        header.leaving
+            && actor.is_some_and(|it| {
+                let from = *it.current.leaving_from.get_or_insert(header.sequence);
+                (from..from.saturating_add(LEAVING_CHUNKS_MAX)).contains(&header.sequence)
+            })
     }
 
     /// Unlinks each stream whose last transition is `first_lost` or later, as these transitions are gone.

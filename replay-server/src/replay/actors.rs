@@ -91,8 +91,8 @@ impl Replay {
     /// Stores a chunk for which [`Replay::early_reply`] returned `None`, on disk before in memory. Replies `Wait` while the disk rejects
     /// writes, and if the limiter has no room, unless the actor is leaving or the last draw found no anchor.
     pub(crate) fn store_if_allowed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
-        let is_leaving = packed.chunk.header.leaving;
-        if !(self.limiter.may_insert() || self.is_starving() || is_leaving) {
+        let may_insert = self.limiter.may_insert() || self.is_starving();
+        if !(may_insert || self.state.actors.passes_limiter(&packed.chunk.header)) {
             return self.wait_reply(false);
         }
         let journal = self.journal.as_mut();

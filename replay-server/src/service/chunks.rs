@@ -97,11 +97,13 @@ impl State {
         let (version, arrived) = (header.weights_version, query.arrived);
         let actor = Peer::actor(header.actor, header.incarnation);
         self.participants.mark_seen(actor, Some(version), arrived);
-        let must_wait = !self.chunks.queue.is_empty() && !header.leaving;
+        let is_first = self.chunks.queue.is_empty();
         let reply = match self.replay.early_reply(&packed) {
             Some(reply) => reply,
             // Parked chunks, which came before, go first.
-            None if must_wait => self.replay.wait_reply(false),
+            None if !(is_first || self.replay.state.actors.passes_limiter(&header)) => {
+                self.replay.wait_reply(false)
+            }
             None => {
                 let reply = self.replay.store_if_allowed(&packed);
                 if matches!(reply, InsertReply::Stored { .. }) {

@@ -164,6 +164,31 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     assert_eq!(replay.status().messages_refused, 2);
 }
 
+#[test]
+fn an_actor_that_leaves_and_does_not_stop_waits_like_the_others() {
+    let mut replay = small_replay(&Config {
+        replay_ratio: 4.0,
+        slack_transitions: 2,
+        ..Config::unlimited(1000)
+    });
+    assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
+    for incarnation in [1, 2] {
+        join(&mut replay, 1, incarnation);
+        let mut insert = |sequence: u64| {
+            let leaving = ChunkHeader {
+                leaving: true,
+                ..header(1, incarnation, sequence, 6 * sequence)
+            };
+            insert(&mut replay, leaving)
+        };
+        let passed = (0..300).take_while(|&it| is_stored(&insert(it)));
+        assert_eq!(passed.count(), 128, "incarnation {incarnation}");
+        assert!(is_stored(&insert(127)), "a retry");
+    }
+    let total = 6 * (1 + 2 * 128);
+    assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(total));
+}
+
 /// No episode ends and no stream is long enough for an anchor. Both sides would wait for each other if the limiter held the actors back.
 #[test]
 fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
