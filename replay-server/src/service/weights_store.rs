@@ -163,12 +163,13 @@ fn write_to_disk(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Resu
         weights: weights.header,
     };
     let new_path = path.with_extension("new");
-    fs::write(
-        &new_path,
-        codec::encode(spec_hash, &upload, &weights.safetensors)?,
-    )?;
-    fs::rename(&new_path, path)?;
-    Ok(())
+    let bytes = codec::encode(spec_hash, &upload, &weights.safetensors)?;
+    let written = fs::write(&new_path, bytes).and_then(|()| fs::rename(&new_path, path));
+    if written.is_err() {
+        // On a full disk it would take the room that the log needs.
+        try_remove(&new_path);
+    }
+    Ok(written?)
 }
 
 #[cfg(test)]
@@ -271,5 +272,9 @@ mod tests {
         for (was_kept, version) in [(true, 7), (false, 0), (true, 0)] {
             assert_eq!(open(was_kept).newest_version(), version, "{was_kept}");
         }
+        // A folder in their place: the temporary file cannot replace it.
+        fs::create_dir(folder.path().join(FILE_NAME)).unwrap();
+        store.disk_writer().unwrap()();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 }
