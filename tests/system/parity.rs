@@ -26,8 +26,10 @@ fn a_case_with_another_expectation_fails() {
         call += &format!(" {tensor}");
     }
     let ended = system.fails(&call, "error: files out of tolerance: 5 of 6");
+    fs::write(system.path("cut"), "cut").unwrap();
+    system.rejects("parity cut", "error: cut: not a whole safetensors file");
     let absent = "error: cannot read none: No such file or directory (os error 2)\n";
-    system.fails("parity none", absent);
+    system.rejects("parity none", absent);
     let stdout = &ended.stdout;
     let failed: Vec<_> = stdout.lines().filter(|it| it.ends_with("FAILED")).collect();
     assert_eq!(failed.len(), CHANGED.len(), "{stdout}");

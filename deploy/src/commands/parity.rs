@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use driml_launch::console::print;
+use driml_launch::console::{describe_error, print};
 use driml_learner::{Kernels, Precision};
 use driml_machine::{
     device::{DeviceFlag, check_device},
+    error::usage,
     units::count,
 };
 
@@ -25,7 +26,7 @@ pub(crate) struct ParityArgs {
     pub(crate) stock: bool,
 }
 
-/// Checks each file and prints what differs. A file out of tolerance is an error.
+/// Checks each file and prints what differs. A file that is not a case is a wrong call, and one out of tolerance an error.
 pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     check_device(args.on.device)?;
     let mut failed = 0;
@@ -34,7 +35,9 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
         compute.kernels = Kernels::Candle;
     }
     for file in &args.files {
-        let report = driml_learner::parity::check_file(file, &compute)?;
+        let checked = driml_learner::parity::check_file(file, &compute);
+        // A file that is not a whole case; values out of tolerance are in the report.
+        let report = checked.map_err(|e| usage!("{}", describe_error(&e)))?;
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }
