@@ -232,12 +232,10 @@ fn tradeoff() {
     call("--dials learner.precision");
     let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
     let first = summary("c51-seed1").unwrap();
-    let planned = call("--dials learner.precision,DIM --plan --budget 0");
-    let expected = [
-        "learner.precision = bf16: finished\n",
-        "DIM = driml-fix: does not fit",
-    ];
-    check_has(&planned, &expected);
+    let plan = |dial: &str| call(&format!("--plan --budget 1 --dials {dial}"));
+    let finished = "learner.precision = bf16: finished\n";
+    check_has(&plan("learner.precision"), &[finished]);
+    check_has(&plan("DIM --seeds 500"), &["DIM = driml-fix: does not fit"]);
     call("--dials DIM");
     assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
     let files = data_files(&folder);

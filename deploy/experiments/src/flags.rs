@@ -106,7 +106,7 @@ pub struct TradeoffArgs {
     #[arg(long, value_name = "WORLD", default_value = "mspacman")]
     pub(crate) env: String,
     /// Minutes for new runs; levels that do not fit with all their seeds are skipped
-    #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = whole_number::within_u32(0..=100_000))]
+    #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = whole_number::within_u32(1..=100_000))]
     pub(crate) budget: u32,
     /// Settings to change, such as learner.precision,DIM [default: all]; a wrong name lists them
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
