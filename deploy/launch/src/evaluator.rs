@@ -125,7 +125,7 @@ impl Evaluator {
 
     /// Reports an evaluation that has ended, and begins the next one if a checkpoint is due.
     pub(crate) fn poll(&mut self, screen: &Screen) {
-        self.report_result(screen);
+        screen.print_lines(self.take_report());
         if self.process.is_none() {
             self.start_if_due(false, screen);
         }
@@ -135,7 +135,7 @@ impl Evaluator {
     pub(crate) fn finish(&mut self, screen: &Screen, shutdown: &Shutdown) {
         let deadline = Instant::now() + LAST_EVALUATION_MAX;
         loop {
-            self.report_result(screen);
+            screen.print_lines(self.take_report());
             if self.process.is_none() {
                 if !self.start_if_due(true, screen) {
                     return;
@@ -174,23 +174,50 @@ impl Evaluator {
         self.process.is_some()
     }
 
-    /// Reports an evaluation that has ended. A failed evaluation costs the run nothing but a printed line.
-    fn report_result(&mut self, screen: &Screen) {
-        let Some(process) = &mut self.process else {
-            return;
-        };
-        let Some(status) = process.exit_status() else {
-            return;
-        };
-        let report = match (status.success(), EvaluationRow::all(&self.run_dir)) {
-            (false, _) => format!(
+    /// Describes an evaluation that has ended. A failed evaluation costs the run nothing but a printed line.
+    fn take_report(&mut self) -> Option<String> {
+        let process = self.process.as_mut()?;
+        let is_success = process.exit_status()?.success();
+        let report = match EvaluationRow::all(&self.run_dir) {
+            _ if !is_success => format!(
                 "the run continues without an evaluation: {}",
                 process.exit_report()
             ),
-            (true, Ok(all)) => all.last().map(EvaluationRow::describe).unwrap_or_default(),
-            (true, Err(e)) => format!("{e:#}"),
+            // Meanwhile `driml evaluate --keep` may have added rows of other checkpoints.
+            Ok(all) => {
+                let row = all.iter().rfind(|it| it.updates == self.schedule.newest);
+                row.map(EvaluationRow::describe).unwrap_or_default()
+            }
+            Err(e) => format!("{e:#}"),
         };
-        screen.print_line(&report);
         self.process = None;
+        Some(report)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+    use crate::testing::{config, run_folder};
+
+    #[test]
+    fn the_reported_evaluation_is_that_of_the_run_s_own_process() {
+        let (_root, folder) = run_folder();
+        let every = "local.evaluation={every_updates=100,episodes=4}";
+        let config = config("smoke", "chain", "c51", &[every]);
+        let mut evaluator = Evaluator::new(&config, &folder).unwrap();
+        assert_eq!(evaluator.schedule.take_episodes(200, false), Some(4));
+        for updates in [200, 100] {
+            let row = EvaluationRow::new(&folder, updates, 4, (1.5, None));
+            row.append_to(&folder).unwrap();
+        }
+        let mut process = ManagedProcess::spawn("evaluation", Command::new("true")).unwrap();
+        process.wait_until(Instant::now() + LAST_EVALUATION_MAX, || false);
+        evaluator.process = Some(process);
+        let report = evaluator.take_report().unwrap();
+        let is_own = report.starts_with("evaluated after 200 updates");
+        assert!(is_own, "{report}");
     }
 }
