@@ -152,8 +152,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_line_is_consistent() {
+    fn the_command_line_is_consistent_and_each_flag_has_one_name() {
         Cli::command().debug_assert();
+        // Only what a parent process sets is hidden.
+        fn check(command: &clap::Command) {
+            for arg in command.get_arguments() {
+                let is_hidden = arg.get_id() == "exit_with_parent";
+                let found = (arg.get_all_aliases(), arg.is_hide_set());
+                assert_eq!(found, (None, is_hidden), "{command} {arg}");
+            }
+            command.get_subcommands().for_each(check);
+        }
+        check(&Cli::command());
     }
 
     #[test]

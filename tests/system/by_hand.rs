@@ -35,7 +35,7 @@ fn check_whole_run(system: &TestSystem) {
 
     learner.stop(0).expect_stderr("finished after 540 updates");
     // The learner's run folder can be evaluated like that of a launched run.
-    system.run_ok("evaluate --run run --episodes 5");
+    system.run_ok("evaluate run --episodes 5");
     // The learner stayed alive after the end of the run, so its stop does not make the run unfinished.
     client.wait_for_replay("the end of the run", |it| it.learner_finished);
     drop(client);
@@ -82,7 +82,7 @@ fn processes_end_by_themselves_when_the_run_is_over() {
         process.wait_ok();
     }
     assert_eq!(system.running_processes(), []);
-    system.run_ok("evaluate --run run --episodes 2");
+    system.run_ok("evaluate run --episodes 2");
 }
 
 #[test]

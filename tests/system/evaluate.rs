@@ -58,7 +58,7 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
         assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-6);
     }
     // The chain world has no levels to hold out. A call that fails leaves existing files unchanged.
-    let call = "evaluate --run run --levels unseen --returns returns.csv";
+    let call = "evaluate run --levels unseen --returns returns.csv";
     system.rejects(call, "use --levels train");
     assert_eq!(system.read("returns.csv"), table);
 
@@ -289,7 +289,7 @@ fn damaged_checkpoints_and_those_of_another_run_are_named(system: &TestSystem) {
     let path = newest.join("online.safetensors");
     let whole = fs::read(&path).unwrap();
     fs::write(&path, &whole[..whole.len() / 2]).unwrap();
-    let call = "evaluate --run run --episodes 1";
+    let call = "evaluate run --episodes 1";
     let damaged = format!("error: run/checkpoints/{name}/online.safetensors is damaged: ");
     system
         .fails(call, &damaged)

@@ -165,7 +165,7 @@ fn cpc_and_curl_get_what_they_need_and_no_more() {
         let last: f64 = metrics.last(loss).unwrap();
         assert!(last > 0.0, "{agent}: {last}");
         system
-            .run_ok(&format!("evaluate --run {agent} --episodes 3"))
+            .run_ok(&format!("evaluate {agent} --episodes 3"))
             .expect_stdout(agent);
     }
 }

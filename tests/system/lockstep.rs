@@ -139,7 +139,7 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
     let while_training = summary.mean_return.unwrap();
     assert!(while_training >= return_min, "{while_training}");
 
-    let json = system.run_json("evaluate --run run --episodes 40 --json");
+    let json = system.run_json("evaluate run --episodes 40 --json");
     let mean = |policy: &str| json["policies"][policy]["mean_return"].as_f64().unwrap();
     let (learned, random) = (mean("c51"), mean("random"));
     assert!(learned >= return_min, "greedy: {learned} of {return_min}");

@@ -53,12 +53,12 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     };
     let first = lockstep(&flags, "first");
     assert_eq!(first, lockstep("--config first/config.toml", "again"));
-    let ended = system.run_ok("evaluate --run run --episodes 8");
+    let ended = system.run_ok("evaluate run --episodes 8");
     // Each episode ends with a reward of 1000; each step before gives at most 2.
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
     assert_eq!(system.running_processes(), []);
-    let mut hanging = system.start("env HANG_AT=2 DRIML evaluate --run run --record play.gif");
+    let mut hanging = system.start("env HANG_AT=2 DRIML evaluate run --record play.gif");
     hanging.wait_for_stderr("sleeping");
     hanging.stop(130);
     assert!(!system.path("play.gif.tmp").exists());

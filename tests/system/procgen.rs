@@ -18,7 +18,7 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
     assert_eq!((summary.frames, summary.updates), (608, 25));
     assert!(summary.mean_k.is_some());
     system
-        .run_ok("evaluate --run run --episodes 2 --levels unseen")
+        .run_ok("evaluate run --episodes 2 --levels unseen")
         .expect_stdout("procgen:bigfish on unseen levels, 2 episodes each");
 }
 
@@ -30,7 +30,7 @@ fn an_agent_chooses_among_the_actions_that_differ() {
     system.train(flags, "run");
     let config = system.run_folder("run").config();
     assert_eq!(config["model"]["num_actions"].as_integer(), Some(4));
-    system.run_ok("evaluate --run run --episodes 2 --levels unseen");
+    system.run_ok("evaluate run --episodes 2 --levels unseen");
 }
 
 #[test]

@@ -248,8 +248,7 @@ fn prometheus_reads_the_file_of_a_run_that_is_watched() {
     };
     let system = system();
     let launcher = start_run(&system, 1);
-    // The hidden form for scripts.
-    let watched = system.start("watch --run run --prometheus run.prom");
+    let watched = system.start("watch run --prometheus run.prom");
     let path = system.path("run.prom");
     let read = "
 import sys

@@ -26,7 +26,7 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
     system.run_ok("local --resume first --frames 1600");
     let resumed = system.run_folder("first").check(Outcome::Finished);
     assert!(resumed.frames >= 1600, "{resumed:#?}");
-    let played = system.run_ok("evaluate --run run --episodes 4").stdout;
+    let played = system.run_ok("evaluate run --episodes 4").stdout;
     assert!(played.starts_with("island as trained on"), "{played}");
     system
         .run_ok("presets")

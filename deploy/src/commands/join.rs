@@ -27,7 +27,7 @@ pub(crate) struct JoinFlags {
 #[derive(Debug, Args)]
 pub(crate) struct KeepAliveFlag {
     /// After the run, keep answering until Ctrl-C or a signal
-    #[arg(long, alias = "stay")]
+    #[arg(long)]
     pub(super) keep_alive: bool,
 }
 
@@ -45,7 +45,7 @@ pub(crate) struct TlsFlags {
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
     /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run
-    #[arg(long, alias = "insecure-network")]
+    #[arg(long)]
     pub(crate) allow_insecure: bool,
 }
 

@@ -48,10 +48,10 @@ pub(crate) struct TrainArgs {
     pub(crate) tensorboard: bool,
     /// Play a checkpoint every so many updates, in a separate process that takes a core, and keep the best; writes evaluations.csv.
     /// Unless it is a multiple of 1,000, checkpoints are saved at this period instead. `driml evaluate RUN --checkpoint best` plays the best
-    #[arg(long, alias = "evaluate-every", value_name = "UPDATES", value_parser = whole_number::within(1..=u64::MAX))]
+    #[arg(long, value_name = "UPDATES", value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) eval_interval: Option<u64>,
     /// Episodes per evaluation
-    #[arg(long, alias = "evaluate-episodes", value_name = "N", default_value_t = 20, requires = "eval_interval", value_parser = whole_number::within_u32(1..=1_000_000))]
+    #[arg(long, value_name = "N", default_value_t = 20, requires = "eval_interval", value_parser = whole_number::within_u32(1..=1_000_000))]
     pub(crate) eval_episodes: u32,
     /// Skip the greedy episodes after the run, which take about 30 s
     #[arg(long)]

@@ -25,8 +25,6 @@ pub(crate) struct RunSelection {
     /// Folder of a run that `driml train` started on this machine
     #[arg(value_name = "RUN", group = "whose")]
     folder: Option<PathBuf>,
-    #[arg(long, value_name = "DIR", group = "whose", hide = true)]
-    run: Option<PathBuf>,
     /// Prefix of the run's keys
     #[arg(long, value_name = "NS", default_value = DEFAULT_NAMESPACE)]
     namespace: String,
@@ -93,7 +91,6 @@ impl RunSelection {
     }
 
     fn folder(&self) -> Option<RunFolder> {
-        let folder = self.folder.as_ref().or(self.run.as_ref());
-        folder.map(RunFolder::new)
+        self.folder.as_ref().map(RunFolder::new)
     }
 }

@@ -37,10 +37,8 @@ use self::recording::{RecordArgs, Recording};
 #[derive(Debug, Args)]
 pub(crate) struct EvaluateArgs {
     /// Folder of a run, file written by --export, or pretrained:GAME for built-in weights
-    #[arg(value_name = "RUN", required_unless_present = "run")]
-    pub(crate) folder: Option<PathBuf>,
-    #[arg(long, value_name = "DIR", conflicts_with = "folder", hide = true)]
-    pub(crate) run: Option<PathBuf>,
+    #[arg(value_name = "RUN")]
+    pub(crate) folder: PathBuf,
     /// Episodes to play
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = whole_number::within_u32(1..=1_000_000))]
     pub(crate) episodes: u32,
@@ -111,10 +109,8 @@ fn evaluate(args: &EvaluateArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             path.display()
         ));
     }
-    let folder = args.folder.as_ref().or(args.run.as_ref());
-    let folder = folder.expect("clap asks for one of the two");
-    let pretrained = pretrained::load(folder)?;
-    let folder = RunFolder::new(folder);
+    let pretrained = pretrained::load(&args.folder)?;
+    let folder = RunFolder::new(&args.folder);
     let choice = args.checkpoint.unwrap_or_default();
     if pretrained.is_some() && (args.checkpoint.is_some() || args.weights.is_some() || args.keep) {
         bail!(usage!(

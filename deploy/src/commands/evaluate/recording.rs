@@ -33,7 +33,7 @@ pub(crate) struct RecordArgs {
     #[arg(long, requires = "record")]
     pub(crate) overlay: bool,
     /// Environments to film, side by side
-    #[arg(long, alias = "record-copies", value_name = "N", default_value_t = 1, requires = "record", value_parser = whole_number::within_u32(1..=8))]
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "record", value_parser = whole_number::within_u32(1..=8))]
     pub(crate) record_envs: u32,
     /// Episodes to film per environment; fewer if fewer are played
     #[arg(long, value_name = "N", default_value_t = 2, requires = "record", value_parser = whole_number::within_u32(1..=1000))]
