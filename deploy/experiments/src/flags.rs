@@ -112,7 +112,7 @@ pub struct TradeoffArgs {
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) dials: Vec<String>,
     /// Only measure speeds and print the plan
-    #[arg(long)]
+    #[arg(long, conflicts_with = "report")]
     pub(crate) plan: bool,
     /// Frames per run [default: by world, fewer if the budget is small]
     #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
