@@ -45,7 +45,7 @@ pub(crate) struct TlsFlags {
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
     /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run
-    #[arg(long)]
+    #[arg(long, requires = "listen", conflicts_with = "tls_dir")]
     pub(crate) allow_insecure: bool,
 }
 
