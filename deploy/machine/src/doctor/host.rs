@@ -135,7 +135,7 @@ fn locked_memory(limit: Option<u64>) -> Finding {
 
 fn disk(runs: &Path) -> Finding {
     let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
-    let existing = runs.ancestors().find(|it| it.is_dir()).unwrap_or(&runs);
+    let existing = runs.ancestors().find(|it| it.exists()).unwrap_or(&runs);
     let hint = "; --run-dir puts a run elsewhere";
     let folder = existing.display();
     match (free_disk_bytes(existing), tempfile::tempfile_in(existing)) {
@@ -230,5 +230,10 @@ mod tests {
         let (_, text) = disk(&folder.path().join("runs/one"));
         let existing = folder.path().display().to_string();
         assert!(text.contains(&existing) && !text.contains("runs"), "{text}");
+        let file = folder.path().join("file");
+        std::fs::write(&file, "").unwrap();
+        let (state, text) = disk(&file.join("runs"));
+        assert_eq!(state, State::Missing, "{text}");
+        assert!(text.contains("file cannot be written to: "), "{text}");
     }
 }
