@@ -25,12 +25,17 @@ pub struct Unreachable {
     text: String,
     /// Whether a retry may succeed, as the replay server may still be starting.
     is_retryable: bool,
+    /// Whether its machine reports that nothing listens there: a server that did has ended.
+    pub is_closed: bool,
 }
 
 impl Unreachable {
-    const fn retryable(text: String) -> Self {
-        let is_retryable = true;
-        Self { text, is_retryable }
+    const fn new(text: String, is_retryable: bool, is_closed: bool) -> Self {
+        Self {
+            text,
+            is_retryable,
+            is_closed,
+        }
     }
 }
 
@@ -46,8 +51,7 @@ pub fn check_listening(endpoint: &str) -> Result<(), Unreachable> {
                 let text = format!(
                     "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
                 );
-                let is_retryable = why.contains("emporary");
-                Unreachable { text, is_retryable }
+                Unreachable::new(text, why.contains("emporary"), false)
             })?;
             if protocol != "tcp" {
                 return Ok(());
@@ -68,27 +72,27 @@ pub fn check_listening(endpoint: &str) -> Result<(), Unreachable> {
 }
 
 fn connect_error(endpoint: &str, e: std::io::Error) -> Unreachable {
-    Unreachable::retryable(match e.kind() {
-        ErrorKind::ConnectionRefused => format!(
+    let is_closed = e.kind() == ErrorKind::ConnectionRefused;
+    let text = match is_closed {
+        true => format!(
             "nothing listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
              reached with quic/HOST:PORT, which is UDP, and --tls-dir"
         ),
-        _ => format!(
+        false => format!(
             "{endpoint} does not answer ({e}): is its machine up, is the address right, and does a firewall let this port through?"
         ),
-    })
+    };
+    Unreachable::new(text, true, is_closed)
 }
 
 fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
     let what = match UnixStream::connect(path) {
         Ok(_) => return Ok(()),
         Err(e) if e.kind() == ErrorKind::PermissionDenied => {
-            return Err(Unreachable {
-                text: format!(
-                    "{endpoint} belongs to another user: run as that user, or connect to a tcp/ endpoint"
-                ),
-                is_retryable: false,
-            });
+            let text = format!(
+                "{endpoint} belongs to another user: run as that user, or connect to a tcp/ endpoint"
+            );
+            return Err(Unreachable::new(text, false, false));
         }
         Err(e) if e.kind() == ErrorKind::NotFound => "there is no such socket",
         Err(e) if e.kind() == ErrorKind::ConnectionRefused => {
@@ -96,9 +100,10 @@ fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
         }
         Err(e) => return Err(connect_error(endpoint, e)),
     };
-    Err(Unreachable::retryable(format!(
+    let text = format!(
         "nothing listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
-    )))
+    );
+    Err(Unreachable::new(text, true, true))
 }
 
 /// Waits until something accepts connections at one of `endpoints`.

@@ -116,6 +116,17 @@ fn a_run_that_ends_between_two_requests_leaves_its_summary() {
 }
 
 #[test]
+fn a_run_ends_with_a_replay_server_that_kept_nothing_on_disk() {
+    let system = system();
+    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    drop(system.connect());
+    let mut watched = system.start(&system.connect_args("watch"));
+    watched.wait_for_stderr("no learner has joined yet");
+    server.kill();
+    watched.fails("has exited, and its replay was in memory: the run has ended");
+}
+
+#[test]
 fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     let system = system();
     let flags = format!("--replay-dir replay --agent c51 {LONG}");
@@ -149,7 +160,7 @@ const JSON_FIELDS: &str = "actors_planned agent finished frames_planned learner 
 #[test]
 fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let system = system();
-    let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
+    let _server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
     let watch_once = system.connect_args("watch --once");
     // A process is missing.
@@ -203,8 +214,6 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
         name == "driml_process_connected" && labels.contains("process=\"actor-0\"")
     });
     assert!(actor.is_none(), "it has left");
-    drop(client);
-    drop(server);
 }
 
 /// Returns name, labels and value of each sample. Panics if the text is not in Prometheus' text format.

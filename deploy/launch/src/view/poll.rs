@@ -206,7 +206,7 @@ impl ServerConnection {
                     &e,
                     SessionError::Unreadable { why, .. } if matches!(why, CodecError::RunSpec { .. })
                 );
-                answer.is_gone = reach::check_listening(&self.endpoint).is_err();
+                answer.is_gone = reach::check_listening(&self.endpoint).is_err_and(|e| e.is_closed);
                 answer.error = Some(e.to_string());
             }
         }

@@ -92,8 +92,8 @@ pub fn print_status(
 /// The file for Prometheus tells whether the run answers. If `driml train` stops, the run's `folder`, if it is known, tells how it ended.
 ///
 /// # Errors
-/// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, or
-/// that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
+/// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, that
+/// have exited with a replay in memory, or that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
 pub fn run(
     found: anyhow::Result<Poller>,
     folder: Option<&RunFolder>,
@@ -184,9 +184,13 @@ fn watch(mut poller: Poller, run: Option<&RunFolder>, flags: &WatchFlags) -> any
             Err(e) => break Err(e),
         }
         let is_cut_short = poller.view.servers_ended() && !poller.view.is_over();
-        // A launcher that runs may restart its replay server.
-        let stopped = run.filter(|it| is_cut_short && !it.is_locked());
-        if let Some(Err(e)) = stopped.map(read_endpoints) {
+        let continues = match run {
+            // A launcher that runs may restart its replay server.
+            Some(run) if is_cut_short && !run.is_locked() => read_endpoints(run).map(drop),
+            Some(_) => Ok(()),
+            None => watched.check_continues(&poller.view),
+        };
+        if let Err(e) = continues {
             break Err(e);
         }
         if interrupted.wait_timeout(poller.pause()) {

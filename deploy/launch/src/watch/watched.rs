@@ -17,7 +17,8 @@ use crate::{
     view::{Display, Poller},
 };
 
-/// How long replay servers may be silent before they count as ended, once they have reported that everything is sampled.
+/// How long replay servers may be silent before they count as ended, once they have reported that everything is sampled, or nothing listens
+/// in their place.
 const EXIT_SILENCE_MAX: Duration = Duration::from_secs(5);
 /// Longest time of a run that is shown, seconds: ten years.
 const UPTIME_MAX_S: f64 = 315_360_000.0;
@@ -26,8 +27,8 @@ pub(super) struct WatchedRun {
     /// Shows the run from its beginning, as far as that is known.
     pub(super) display: Display,
     recorder: Option<RunRecorder>,
-    /// The uptime of each server when it last answered, seconds.
-    uptimes_s: Vec<f64>,
+    /// The last answer of each server: its uptime in seconds, and whether its replay is kept on disk.
+    answers: Vec<Option<(f64, bool)>>,
 }
 
 impl WatchedRun {
@@ -52,7 +53,7 @@ impl WatchedRun {
         Ok(Self {
             display,
             recorder,
-            uptimes_s: vec![0.0; view.servers.len()],
+            answers: vec![None; view.servers.len()],
         })
     }
 
@@ -68,9 +69,10 @@ impl WatchedRun {
             let status = it.processes.as_ref()?;
             Some((status.up_s, status.log.is_some()))
         });
+        let begun_anew = find_begun_anew(&mut self.answers, answers);
         // Its rows would contradict those before.
         if self.recorder.is_some()
-            && let Some(number) = find_begun_anew(&mut self.uptimes_s, answers)
+            && let Some(number) = begun_anew
         {
             bail!(
                 "{} was started again with an empty replay: start `driml watch` again",
@@ -111,6 +113,21 @@ impl WatchedRun {
         Ok(false)
     }
 
+    /// Fails if a server has exited whose replay was in memory: the run cannot continue without it.
+    pub(super) fn check_continues(&self, view: &RunView) -> anyhow::Result<()> {
+        let mut servers = view.servers.iter().zip(&self.answers);
+        let lost = servers.find(|(it, last)| it.is_gone && matches!(last, Some((_, false))));
+        if let Some((server, _)) = lost
+            && view.replay_silence.length() > EXIT_SILENCE_MAX
+        {
+            bail!(
+                "the replay server on {} has exited, and its replay was in memory: the run has ended, and the output of its processes tells how",
+                server.endpoint
+            );
+        }
+        Ok(())
+    }
+
     fn count_served_updates(&mut self, poller: &mut Poller) {
         let updates = updates_served(&poller.config, poller.view.replay.rows_sampled);
         if poller.view.learner.updates >= updates {
@@ -139,15 +156,19 @@ impl WatchedRun {
     }
 }
 
-/// Returns the number of a server that was started again without its replay, so that its counts begin anew. Each answer has a server's
-/// uptime and whether its replay is kept on disk; `None` for a server that did not answer.
+/// Returns the number of a server that was started again without its replay, so that its counts begin anew. The answers, the last and
+/// the new ones, are those of [`WatchedRun`]; `None` for a server that did not answer.
 fn find_begun_anew(
-    uptimes_s: &mut [f64],
+    last: &mut [Option<(f64, bool)>],
     answers: impl Iterator<Item = Option<(f64, bool)>>,
 ) -> Option<usize> {
-    let mut servers = uptimes_s.iter_mut().zip(answers);
-    servers.position(|(last_s, answer)| {
-        answer.is_some_and(|(up_s, is_kept)| up_s < std::mem::replace(last_s, up_s) && !is_kept)
+    let mut servers = last.iter_mut().zip(answers);
+    servers.position(|(last, answer)| {
+        let Some((up_s, is_kept)) = answer else {
+            return false;
+        };
+        let before = last.replace((up_s, is_kept));
+        before.is_some_and(|(before_s, _)| up_s < before_s) && !is_kept
     })
 }
 
@@ -232,10 +253,10 @@ mod tests {
     #[test]
     fn a_server_that_was_started_again_without_its_replay_is_found() {
         for (is_kept, found) in [(false, Some(1)), (true, None)] {
-            let mut uptimes_s = [0.0; 2];
+            let mut last = [None; 2];
             let mut find = |up_s: [Option<f64>; 2]| {
                 let answers = up_s.into_iter().map(|it| Some((it?, is_kept)));
-                find_begun_anew(&mut uptimes_s, answers)
+                find_begun_anew(&mut last, answers)
             };
             // The second server does not answer for a while, and is then another process.
             for up_s in [[Some(2.0), Some(3.0)], [Some(4.0), None]] {
