@@ -105,15 +105,24 @@ fn an_actor_that_is_stopped_before_its_first_chunk_is_not_missing() {
 #[test]
 fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     let system = system();
-    let process = system.start(&format!(
-        "local --agent c51 {LONG} --actors 2 --run-dir run"
-    ));
+    let run = format!("local --agent c51 {LONG} --actors 2 --durable --run-dir run");
+    let process = system.start(&run);
     wait_until("a status of the living run", || {
         let ended = system.run("status run");
         ended.code == Some(0) && ended.stdout.contains("learns")
     });
     let watched = system.start("status run --watch --json");
     wait_until("its first answer", || !watched.stdout().is_empty());
+    // A launcher that is stopped does not restart its server.
+    process.signal(Signal::SIGSTOP);
+    system.find_process("replay-server").signal(Signal::SIGKILL);
+    let last_has = |words: &str| {
+        let stdout = watched.stdout();
+        stdout.lines().next_back().unwrap().contains(words)
+    };
+    wait_until("its end", || last_has("no replay server listens"));
+    process.signal(Signal::SIGCONT);
+    wait_until("the next server", || last_has("\"healthy\":true"));
     process.interrupt().expect_code(130);
     watched.wait_ok();
     let watch_once = "watch --once run --prometheus run.prom";

@@ -56,7 +56,7 @@ pub struct WatchFlags {
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
 /// Polls a run and prints a page or a JSON object: once, or with `repeat` until the run is over or Ctrl-C. If no process can be asked
-/// any more, the run's `folder`, if it is known, tells how the run ended.
+/// any more, the run's `folder`, if it is known, tells how the run ended, or that its launcher still runs.
 ///
 /// # Errors
 /// [`UnreachableRun`]; [`Interrupted`] if Ctrl-C came before the first page.
@@ -74,13 +74,18 @@ pub fn print_status(
     }
     loop {
         let view = poller.poll();
-        if let Some(folder) = folder.filter(|_| view.servers_ended()) {
-            read_endpoints(folder)?;
-        }
-        let is_read = match as_json {
-            true => console::print_unless_closed(&run_json(view)?)?,
-            false if repeat => console::print_page(&status_page(view))?,
-            false => console::print_unless_closed(&status_page(view))?,
+        let left = folder.filter(|_| view.servers_ended());
+        // A launcher that runs may restart its replay server.
+        let may_restart = repeat && !view.is_over() && left.is_some_and(RunFolder::is_locked);
+        let text = match left.and_then(|it| read_endpoints(it).err()) {
+            Some(e) if may_restart => e.downcast::<UnreachableRun>()?.text(as_json)?,
+            Some(e) => return Err(e),
+            None if as_json => run_json(view)?,
+            None => status_page(view),
+        };
+        let is_read = match repeat && !as_json {
+            true => console::print_page(&text)?,
+            false => console::print_unless_closed(&text)?,
         };
         if !repeat || !is_read || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
             return Ok(());
@@ -248,8 +253,12 @@ pub struct UnreachableRun {
 impl UnreachableRun {
     /// Prints the state, as one line of JSON or as text for a person.
     pub fn print(&self, as_json: bool) -> anyhow::Result<()> {
-        console::print(&match as_json {
-            true => format!("{}\n", serde_json::to_string(self)?),
+        console::print(&self.text(as_json)?)
+    }
+
+    fn text(&self, as_json: bool) -> serde_json::Result<String> {
+        Ok(match as_json {
+            true => serde_json::to_string(self)? + "\n",
             false => format!("{}\n{}", self.message, self.details),
         })
     }
