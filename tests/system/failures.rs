@@ -95,6 +95,23 @@ fn dead_processes_end_the_run_and_leave_no_shared_memory() {
     }
 }
 
+/// The launcher is stopped until the learner has saved and exited.
+#[test]
+fn updates_count_that_the_learner_saved_and_could_not_report() {
+    let system = system();
+    let process = start_run(&system, 100);
+    process.signal(Signal::SIGSTOP);
+    let client = system.connect();
+    client.wait_for_updates(client.learner_status().unwrap().updates + 100);
+    system.find_process("learner").signal(Signal::SIGTERM);
+    let has_ended = || system.find_process_now("learner").is_none();
+    wait_until("the learner's end", has_ended);
+    process.signal(Signal::SIGCONT);
+    process.fails("error: learner exited with code 130");
+    let run = system.run_folder("run");
+    assert_eq!(run.summary().updates, run.saved_updates());
+}
+
 /// A successor would count episodes from zero, and have other ghosts than the run's schedule.
 #[test]
 fn a_dead_actor_whose_ghosts_change_ends_the_run() {

@@ -42,6 +42,8 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to exit, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
+/// How long the learner may leave requests for its last status unanswered; a loaded machine answers late.
+const LAST_STATUS_MAX: Duration = Duration::from_secs(30);
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 
 /// Trains with a process for each replay server, the learner and each actor, and leaves the folder `run_dir`. A run that is
@@ -239,6 +241,10 @@ impl Launch<'_> {
         let learner = self.processes.iter_mut().skip(shards).take(1);
         let mut others = stop_processes(learner, true, LEARNER_DRAIN_MAX, &now);
         let poller = &mut self.poller;
+        // The learner's last status may be lost, but not what it has saved.
+        let saved = self.run_dir.newest_checkpoint().map_or(0, |it| it.0);
+        let learner = &mut poller.view.learner;
+        learner.updates = learner.updates.max(saved);
         if let Err(e) = poller.poll_replay() {
             tracing::debug!("the replay server's last answer: {e:#}");
         }
@@ -275,7 +281,7 @@ impl Launch<'_> {
         result
     }
 
-    /// Tells the learner to stop, then polls its status until it reports that it has saved or no longer answers.
+    /// Tells the learner to stop, then polls its status until it reports that it has saved, exits or does not answer for long.
     fn wait_for_final_checkpoint(&mut self) {
         let Some(learner) = self.processes.get_mut(self.endpoints.len()) else {
             return;
@@ -290,13 +296,19 @@ impl Launch<'_> {
         }
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
-        while Instant::now() <= deadline && !self.shutdown.immediate.is_set() {
-            if let Err(e) = poller.poll_learner() {
-                tracing::debug!("a last question: {e:#}");
-                return;
-            }
-            if poller.view.learner.finished {
-                return;
+        let mut silence = Silence::default();
+        while Instant::now() <= deadline
+            && silence.length() <= LAST_STATUS_MAX
+            && !self.shutdown.immediate.is_set()
+            && learner.exit_status().is_none()
+        {
+            match poller.poll_learner() {
+                Ok(()) if poller.view.learner.finished => return,
+                Ok(()) => silence.record_answer(),
+                Err(e) => {
+                    silence.record_failure();
+                    tracing::debug!("a last question: {e:#}");
+                }
             }
             std::thread::sleep(DRAIN_POLL);
         }
