@@ -78,10 +78,12 @@ fn what_cannot_be_resumed() {
     let system = system();
     let run = format!("local --agent c51 {SHORT} --run-dir run");
     system.run_ok(&run);
-    for less in ["", "--frames 700"] {
-        let ended = system.run_ok(&format!("local --resume run {less}"));
+    let set = "--set learner.batch_size=32";
+    let unused = ", so the changed settings have no effect";
+    for (flags, effect) in [("", ""), ("--frames 700", ""), (set, unused)] {
+        let ended = system.run_ok(&format!("local --resume run {flags}"));
         let nothing = "nothing is left to do: the run in run has done 540 updates and 1280 frames";
-        ended.expect_stdout(nothing);
+        ended.expect_stdout(&format!("{nothing}{effect}.\n"));
     }
     system.run_ok(&format!("local --lockstep {SHORT} --run-dir step"));
     let rainbow = "--env chain --preset smoke --agent rainbow --frames 640";

@@ -271,8 +271,12 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
     if is_complete && (is_shortened || Summary::is_finished(folder)) {
         let (run, updates) = (folder.quoted(), count(updates, "update"));
         let frames = count(frames, "frame");
+        let unused = match flags.sets.is_empty() {
+            true => "",
+            false => ", so the changed settings have no effect",
+        };
         return Ok(Resumption::Done(format!(
-            "nothing is left to do: the run in {run} has done {updates} and {frames}.\n\
+            "nothing is left to do: the run in {run} has done {updates} and {frames}{unused}.\n\
              `driml evaluate {run}` plays it; `driml train --resume {run} --frames N` trains it up to N frames"
         )));
     }
