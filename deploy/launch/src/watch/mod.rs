@@ -33,7 +33,7 @@ use crate::{
 };
 
 /// What `driml watch` does with a run.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub struct WatchFlags {
     /// Write settings, metrics and summary into this folder; a folder of the same run is continued
     #[arg(long, value_name = "DIR")]
@@ -104,30 +104,34 @@ pub fn run(
     folder: Option<&RunFolder>,
     flags: &WatchFlags,
 ) -> anyhow::Result<()> {
-    match found {
-        Ok(poller) if flags.once => check_once(poller, flags),
-        Ok(poller) => watch(poller, folder, flags)
-            .or_else(|e| e.downcast::<UnreachableRun>()?.print(flags.json)),
-        Err(e) => {
-            if let Some(path) = &flags.prometheus {
-                let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
-                write_file("--prometheus", path, down)?;
-            }
-            let unreachable = e.downcast::<UnreachableRun>()?;
-            unreachable.print(flags.json)?;
-            ensure!(
-                unreachable.is_well || !flags.once,
-                "the run needs attention: it is not finished and no process of it runs"
-            );
-            Ok(())
-        }
+    if let (Err(_), Some(path)) = (&found, &flags.prometheus) {
+        let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
+        write_file("--prometheus", path, down)?;
     }
+    let watched = found.and_then(|poller| match flags.once {
+        true => check_once(poller, folder, flags),
+        false => watch(poller, folder, flags),
+    });
+    watched.or_else(|e| {
+        let unreachable = e.downcast::<UnreachableRun>()?;
+        unreachable.print(flags.json)?;
+        ensure!(
+            unreachable.is_well || !flags.once,
+            "the run needs attention: it is not finished and no process of it runs"
+        );
+        Ok(())
+    })
 }
 
-fn check_once(mut poller: Poller, flags: &WatchFlags) -> anyhow::Result<()> {
-    print_status(&mut poller, None, false, flags.json)?;
+fn check_once(
+    mut poller: Poller,
+    folder: Option<&RunFolder>,
+    flags: &WatchFlags,
+) -> anyhow::Result<()> {
+    let printed = print_status(&mut poller, folder, false, flags.json);
     poller.close();
     write_prometheus(flags.prometheus.as_deref(), &poller.view)?;
+    printed?;
     let needed = actions_needed(&poller.view).join("; ");
     ensure!(needed.is_empty(), "the run needs attention: {needed}");
     Ok(())
@@ -326,14 +330,14 @@ mod tests {
     use std::os::unix::net::UnixListener;
 
     use super::*;
-    use crate::testing::{config, run_folder};
+    use crate::testing::{config, make, run_folder};
 
     /// As on a file system without locks.
     #[test]
     fn a_server_that_listens_is_found_without_a_lock() {
         let (root, folder) = run_folder();
-        let settings = config("smoke", "chain", "c51", &[]).to_toml();
-        std::fs::write(folder.config(), settings).unwrap();
+        let settings = config("smoke", "chain", "c51", &[]);
+        std::fs::write(folder.config(), settings.to_toml()).unwrap();
         let socket = root.path().join("s");
         let endpoint = format!("unixsock-stream/{}", socket.display());
         std::fs::write(folder.endpoints(), &endpoint).unwrap();
@@ -346,6 +350,11 @@ mod tests {
         drop(listener);
         let said = found();
         assert!(said.starts_with("no process runs in "), "{said}");
+        // As if the servers had exited after the poller was opened.
+        let once = make(|it: &mut WatchFlags| it.once = true);
+        let said = run(Ok(Poller::new(&settings, Vec::new())), Some(&folder), &once);
+        let said = said.unwrap_err().to_string();
+        assert!(said.ends_with("no process of it runs"), "{said}");
         // As in a run in lockstep.
         std::fs::remove_file(folder.endpoints()).unwrap();
         let _lock = folder.lock().unwrap();
