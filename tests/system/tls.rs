@@ -237,6 +237,10 @@ fn the_doctor_looks_at_certificates() {
     check_line(&exit, "missing", "tls observer", "is the certificate of");
     check_line(&exit, "missing", "tls actor-1", "actor-1.key is not there");
     check_line(&exit, "note", "tls replay-server", "chmod 600");
+    // The process itself says the same.
+    let server = format!("replay-server --agent c51 {LONG} --tls-dir bad --listen");
+    let mut server = system.start_process(&format!("{server} {}", quic_endpoint()));
+    server.wait_for_stderr("chmod 600 bad/replay-server.key");
     exit.expect_stderr("these certificates cannot be used: tls learner, tls observer, tls actor-1");
     check_line(
         &doctor("nowhere").expect_code(1),

@@ -31,7 +31,7 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
     let dir = args.replay_dir.as_deref();
     dir.map_or(Ok(()), |it| output::check_folder("--replay-dir", it))?;
     if let Some(dir) = &args.tls_dir {
-        Credentials::read_quietly(dir, Role::ReplayServer).map_err(|e| usage!("{e}"))?;
+        Credentials::read(dir, Role::ReplayServer).map_err(|e| usage!("{e}"))?;
     }
     let recording = Recording::record()?;
     let folder = output::temporary_folder()?;

@@ -22,16 +22,16 @@ use crate::{
 pub const ACTORS_MAX: u32 = 1024;
 
 /// The role of a process, and the common name of its certificate.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
-    /// The actor with this number.
-    Actor(u32),
-    /// The one learner of a run.
-    Learner,
     /// A replay server: the side that listens.
     ReplayServer,
+    /// The one learner of a run.
+    Learner,
     /// A process that only watches the run.
     Observer,
+    /// The actor with this number.
+    Actor(u32),
 }
 
 impl std::fmt::Display for Role {

@@ -27,8 +27,8 @@ use super::access::{ACTORS_MAX, Role};
 #[error("{0}")]
 pub struct TlsError(String);
 
-/// A certificate that expires sooner causes a warning at the start.
-const EXPIRES_SOON: Duration = Duration::from_secs(14 * 24 * 3600);
+/// The user is told of a certificate that expires sooner.
+const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
 
 /// The path of the authority's certificate in a folder.
 pub fn authority_path(folder: &Path) -> PathBuf {
@@ -42,8 +42,7 @@ pub struct Credentials {
     pub role: Role,
     authority: PathBuf,
     certificate: PathBuf,
-    /// The path of the private key.
-    pub key: PathBuf,
+    key: PathBuf,
     /// When the certificate expires, seconds since 1970.
     expires_unix_s: i64,
     /// When the certificate expires, as text for the user.
@@ -58,18 +57,6 @@ impl Credentials {
     /// # Errors
     /// A file is missing, unreadable, expired, not valid yet, or of another role, authority or key. The error says what to do.
     pub fn read(folder: &Path, role: Role) -> Result<Self, TlsError> {
-        let read = Self::read_quietly(folder, role)?;
-        if read.is_key_exposed() {
-            let key = read.key.display();
-            tracing::warn!(
-                "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
-            );
-        }
-        Ok(read)
-    }
-
-    /// Like [`Credentials::read`], but logs no warning.
-    pub fn read_quietly(folder: &Path, role: Role) -> Result<Self, TlsError> {
         if let Role::Actor(number) = role
             && number >= ACTORS_MAX
         {
@@ -134,12 +121,6 @@ impl Credentials {
         })
     }
 
-    /// Whether other users of this machine can read the key, and so act in this role.
-    pub fn is_key_exposed(&self) -> bool {
-        let mode = fs::metadata(&self.key).map(|it| it.permissions().mode());
-        mode.is_ok_and(|mode| mode & 0o077 != 0)
-    }
-
     /// How long the certificate is still valid.
     pub fn expires_in(&self) -> Duration {
         let now = UnixTime::now().as_secs() as i64;
@@ -147,16 +128,27 @@ impl Credentials {
         Duration::from_secs(u64::try_from(left).unwrap_or(0))
     }
 
-    /// Warns if the certificate expires soon: an expired one is rejected in the middle of a run.
-    pub(crate) fn warn_if_expiring(&self) {
-        let left = self.expires_in();
-        if left < EXPIRES_SOON {
-            tracing::warn!(
-                "{} expires in {} hours, and this process is cut off then: remove it and its key, let deploy/certs.sh make new ones, and \
-                 start this process again",
-                self.certificate.display(),
-                left.as_secs() / 3600
-            );
+    /// What the user should do about these files, although they can be used; `None` if nothing.
+    pub fn advice(&self) -> Option<String> {
+        let (certificate, key) = (self.certificate.display(), self.key.display());
+        let mode = fs::metadata(&self.key).map(|it| it.permissions().mode());
+        if mode.is_ok_and(|mode| mode & 0o077 != 0) {
+            Some(format!(
+                "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
+            ))
+        } else if self.expires_in() < EXPIRES_SOON {
+            Some(format!(
+                "{certificate} expires at {}, and its process is disconnected then: remove it and its key, let deploy/certs.sh make new \
+                 ones, and restart that process",
+                self.expires_on
+            ))
+        } else if self.role == Role::ReplayServer && self.hosts.is_empty() {
+            Some(format!(
+                "{certificate} names no host, so no client can connect: remove it and its key, and `deploy/certs.sh {}` makes new ones",
+                certs_args(&self.certificate, self.role)
+            ))
+        } else {
+            None
         }
     }
 

@@ -1,15 +1,13 @@
 //! The certificates in a folder for `--tls-dir`: which roles have one, which are valid, and what to do about the others.
 //! This module makes no certificates: `deploy/certs.sh` does.
 
-use std::{collections::BTreeSet, fs, path::Path, time::Duration};
+use std::{collections::BTreeSet, fs, path::Path};
 
 use driml_protocol::tls::{self, Credentials, Role};
 
 use super::fact::{Fact, State};
 use crate::units::count;
 
-/// A certificate that expires within this time gets the state `Note`.
-const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
 const DAY_S: u64 = 24 * 3600;
 
 /// The facts about `folder`: one for each process that has a file there, and a single one for all actors without a complaint.
@@ -33,12 +31,12 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         name.to_str().map(str::to_owned)
     };
     let names: BTreeSet<_> = entries.flatten().filter_map(name).collect();
-    let (mut facts, mut roles) = (Vec::new(), Vec::new());
+    let (mut facts, mut roles) = (Vec::new(), BTreeSet::new());
     let mut add =
         |what: &str, state: State, text: String| facts.push(Fact::new(what, state.with(text)));
     for name in &names {
         match name.parse::<Role>() {
-            Ok(role) => roles.push(role),
+            Ok(role) => _ = roles.insert(role),
             Err(e) => add("tls other", State::Note, format!("{dir}/{name}.*: {e}")),
         }
     }
@@ -46,18 +44,12 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         let text = format!("{dir} has no certificates: `deploy/certs.sh {dir}` makes them");
         add("tls folder", State::Missing, text);
     }
-    roles.sort_by_key(|role| match role {
-        Role::ReplayServer => (0, 0),
-        Role::Learner => (1, 0),
-        Role::Observer => (2, 0),
-        Role::Actor(number) => (3, *number),
-    });
     let mut actors = Vec::new();
     for role in roles {
         let what = format!("tls {role}");
-        match Credentials::read_quietly(folder, role) {
+        match Credentials::read(folder, role) {
             Err(e) => add(&what, State::Missing, e.to_string()),
-            Ok(it) => match (advice(&it), role) {
+            Ok(it) => match (it.advice(), role) {
                 (Some(text), _) => add(&what, State::Note, text),
                 (None, Role::Actor(number)) => actors.push((number, it)),
                 (None, Role::ReplayServer) => {
@@ -82,30 +74,6 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         add("tls authority", State::Note, text);
     }
     facts
-}
-
-/// What the user should do about a certificate that is valid; none if nothing.
-fn advice(credentials: &Credentials) -> Option<String> {
-    let (role, key) = (credentials.role, credentials.key.display());
-    let left = credentials.expires_in();
-    if credentials.is_key_exposed() {
-        Some(format!(
-            "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
-        ))
-    } else if left < EXPIRES_SOON {
-        Some(format!(
-            "valid for {} more, then its process is disconnected: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
-             restart that process",
-            count(left.as_secs() / DAY_S, "day")
-        ))
-    } else if role == Role::ReplayServer && credentials.hosts.is_empty() {
-        Some(format!(
-            "it names no host, so no client can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
-             NAME_OR_ADDRESS` makes one"
-        ))
-    } else {
-        None
-    }
 }
 
 fn validity(credentials: &Credentials) -> String {
