@@ -13,7 +13,7 @@ use crate::{
 
 /// Returns the page of `driml status` as one line, because words stand where its lines are broken.
 pub(crate) fn status_text(system: &TestSystem) -> String {
-    let page = system.run_ok(&system.connect_args("status")).stdout;
+    let page = system.run(&system.connect_args("status")).stdout;
     page.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
@@ -75,7 +75,7 @@ fn missing_processes_are_named_with_what_to_do() {
     let words = ["learner DOWN ", "from its newest checkpoint"];
     wait_for_status(&system, &words);
 
-    let answer = system.run_json(&system.connect_args("status --json"));
+    let answer = system.run(&system.connect_args("status --json")).json();
     let processes = &answer["servers"][0]["processes"]["processes"];
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);
@@ -125,14 +125,12 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     wait_until("the next server", || last_has("\"healthy\":true"));
     process.interrupt().expect_code(130);
     watched.wait_ok();
-    let watch_once = "watch --once run --prometheus run.prom";
-    system.fails(watch_once, "no process of it runs");
-    let file = system.read("run.prom");
-    assert!(file.ends_with("\ndriml_up 0\n"), "{file}");
     system
-        .run_ok("status run")
+        .fails("status run --prometheus run.prom", "the run is not healthy")
         .expect_stdout("no process runs in run, which holds")
         .expect_stdout("`driml train --resume run` resumes it");
+    let file = system.read("run.prom");
+    assert!(file.ends_with("\ndriml_up 0\n"), "{file}");
     system.rejects("status nowhere", "nowhere is not the folder of a run");
 }
 
@@ -153,10 +151,8 @@ fn a_run_that_is_ending_is_no_riddle() {
     assert_eq!(stopping["finished"], false, "{stopping}");
     process.interrupt().expect_code(0);
     system.run_ok("status run").expect_stdout("the run is over");
-    for command in ["status --json", "watch --once --json"] {
-        let over = system.run_json(&format!("{command} run"));
-        assert_eq!(over["finished"], true);
-        assert_eq!(over["message"], "the run is over");
-        assert_eq!(over["summary"]["outcome"], "finished", "{over}");
-    }
+    let over = system.run_json("status --json run");
+    assert_eq!(over["finished"], true);
+    assert_eq!(over["message"], "the run is over");
+    assert_eq!(over["summary"]["outcome"], "finished", "{over}");
 }

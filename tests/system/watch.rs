@@ -153,7 +153,7 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     watched.interrupt().expect_code(130);
 }
 
-/// The fields of `--once --json` beside the metrics, which deploy/docs/src/reference/run-folder.md describes.
+/// The fields of `status --json` beside the metrics, which deploy/docs/src/reference/run-folder.md describes.
 const JSON_FIELDS: &str = "actors_planned agent finished frames_planned learner replay replay_ratio_planned run_spec seed servers actions_needed \
     updates_planned waiting_for healthy world";
 
@@ -162,15 +162,16 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let system = system();
     let _server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
-    let watch_once = system.connect_args("watch --once");
+    let status = system.connect_args("status");
     // A process is missing.
-    let words = "error: the run needs attention: no learner has joined: start `driml learner";
-    system.fails(&watch_once, words);
+    system
+        .fails(&status, "error: the run is not healthy")
+        .expect_stdout("to do: no learner has joined: start");
     let _processes = [system.start_learner("run"), system.start_actor(0)];
     client.wait_for_the_last_update();
     client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
 
-    let ended = system.run_ok(&format!("{watch_once} --json --prometheus run.prom"));
+    let ended = system.run_ok(&format!("{status} --json --prometheus run.prom"));
     let json = ended.json();
     let names = json.as_object().unwrap().keys().map(String::as_str);
     let names: BTreeSet<_> = names.collect();
@@ -182,9 +183,8 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     assert_eq!(json["healthy"], true);
     assert_eq!(json["finished"], true);
     assert_eq!(json["losses"].as_object().unwrap().len(), 1);
-    // The text output is that of `driml status`.
     system
-        .run_ok(&watch_once)
+        .run_ok(&status)
         .expect_stdout("the run is over: all updates are made and saved");
     // A watcher that records nothing does not know how long a resumed run took.
     system

@@ -330,7 +330,7 @@ mod tests {
     #[test]
     fn the_page_has_every_metric() {
         let mut page = "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n\
-             `metrics.csv` in the run folder has a row per second with these columns. `driml watch --once --json` has the same \
+             `metrics.csv` in the run folder has a row per second with these columns. `driml status --json` has the same \
              names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n\
              | column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();
         for column in COLUMNS {

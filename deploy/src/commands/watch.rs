@@ -8,7 +8,7 @@ use driml_launch::{
     endpoint::{DEFAULT_NAMESPACE, check_connect_endpoints},
     run_folder::RunFolder,
     view::Poller,
-    watch::{self, UnreachableRun, WatchFlags, read_endpoints},
+    watch::{self, StatusFlags, WatchFlags, read_endpoints},
 };
 use driml_machine::error::usage;
 use driml_protocol::tls::Role;
@@ -44,12 +44,8 @@ pub(crate) struct WatchArgs {
 pub(crate) struct StatusArgs {
     #[command(flatten)]
     selection: RunSelection,
-    /// Repeat every two seconds until the run is over or Ctrl-C
-    #[arg(long)]
-    pub(crate) watch: bool,
-    /// Print one JSON object per answer
-    #[arg(long)]
-    pub(crate) json: bool,
+    #[command(flatten)]
+    flags: StatusFlags,
 }
 
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
@@ -59,11 +55,7 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
     let selection = &args.selection;
-    let shown = selection.open().and_then(|mut poller| {
-        let folder = selection.folder();
-        watch::print_status(&mut poller, folder.as_ref(), args.watch, args.json)
-    });
-    shown.or_else(|e| e.downcast::<UnreachableRun>()?.print(args.json))
+    watch::status(selection.open(), selection.folder().as_ref(), &args.flags)
 }
 
 impl RunSelection {

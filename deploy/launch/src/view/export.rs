@@ -3,14 +3,18 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    path::Path,
+    path::PathBuf,
 };
 
+use clap::Args;
 use driml_machine::error::Usage;
 use driml_protocol::{LearnerStatus, ProcessStatus, ReplayStatus};
 use serde::Serialize;
 
-use super::advice::{actions_needed, limiter_waits};
+use super::{
+    advice::{actions_needed, limiter_waits},
+    poll::Poller,
+};
 use crate::{
     metrics::{self, COLUMNS, Member, Value},
     output::write_file,
@@ -50,10 +54,33 @@ pub(crate) fn run_json(view: &RunView) -> serde_json::Result<String> {
     Ok(serde_json::to_string(&answer)? + "\n")
 }
 
-/// Writes the file for Prometheus, whole or not at all; nothing without a path.
-pub(crate) fn write_prometheus(path: Option<&Path>, view: &RunView) -> Result<(), Usage> {
-    let write = |path| write_file("--prometheus", path, prometheus_text(view).as_bytes());
-    path.map_or(Ok(()), write)
+/// The file for Prometheus. Each write replaces it, whole or not at all.
+#[derive(Debug, Default, Args)]
+pub(crate) struct PrometheusFlag {
+    /// Replace this file with the metrics in Prometheus' text format at each answer; for node_exporter's textfile collector, which
+    /// reads files named *.prom
+    #[arg(long, value_name = "FILE")]
+    prometheus: Option<PathBuf>,
+}
+
+impl PrometheusFlag {
+    /// If no run was `found`, writes that none answers.
+    pub(crate) fn check_found(&self, found: anyhow::Result<Poller>) -> anyhow::Result<Poller> {
+        if found.is_err() {
+            self.write_text("# TYPE driml_up gauge\ndriml_up 0\n")?;
+        }
+        found
+    }
+
+    /// Writes the metrics of `view`.
+    pub(crate) fn write(&self, view: &RunView) -> Result<(), Usage> {
+        self.write_text(&prometheus_text(view))
+    }
+
+    fn write_text(&self, text: &str) -> Result<(), Usage> {
+        let path = self.prometheus.as_deref();
+        path.map_or(Ok(()), |it| write_file("--prometheus", it, text.as_bytes()))
+    }
 }
 
 /// The text of the file. Labels on each line distinguish the runs of one machine.

@@ -8,7 +8,7 @@ mod poll;
 
 pub(crate) use self::{
     advice::{actions_needed, describe_recovery, missing_shards},
-    export::{run_json, write_prometheus},
+    export::{PrometheusFlag, run_json},
     live::Display,
     page::status_page,
 };

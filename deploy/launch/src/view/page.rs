@@ -1,4 +1,4 @@
-//! A run as a page of text, 80 columns wide: `driml status` and `driml watch --once`.
+//! A run as a page of text, 80 columns wide: `driml status`.
 
 use driml_machine::units::{count, rough_duration};
 use driml_protocol::{LogStatus, ProcessStatus, Waiting, Warning};

@@ -3,10 +3,7 @@
 
 mod watched;
 
-use std::{
-    path::{Path, PathBuf},
-    time::Duration,
-};
+use std::{path::PathBuf, time::Duration};
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
@@ -20,20 +17,18 @@ use serde::Serialize;
 use self::watched::WatchedRun;
 use crate::{
     checkpoint_choice::read_config,
-    console,
-    output::write_file,
-    resume,
+    console, resume,
     run_folder::{
         Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_progress,
     },
     view::{
-        Poller, actions_needed, describe_recovery, missing_shards, run_json, status_page,
-        write_prometheus,
+        Poller, PrometheusFlag, actions_needed, describe_recovery, missing_shards, run_json,
+        status_page,
     },
 };
 
 /// What `driml watch` does with a run.
-#[derive(Debug, Default, Args)]
+#[derive(Debug, Args)]
 pub struct WatchFlags {
     /// Write settings, metrics and summary into this folder; a folder of the same run is continued
     #[arg(long, value_name = "DIR")]
@@ -41,31 +36,56 @@ pub struct WatchFlags {
     /// Write TensorBoard events into that folder
     #[arg(long, requires = "run_dir")]
     tensorboard: bool,
-    /// Print the page of `driml status` and exit: with code 0 if no process is missing, else 1
-    #[arg(long, conflicts_with = "run_dir")]
-    once: bool,
-    /// With --once, print one JSON object
-    #[arg(long, requires = "once")]
+    #[command(flatten)]
+    exported: PrometheusFlag,
+}
+
+/// What `driml status` does with a run.
+#[derive(Debug, Default, Args)]
+pub struct StatusFlags {
+    /// Repeat every two seconds until the run is over or Ctrl-C, and exit with code 0
+    #[arg(long)]
+    watch: bool,
+    /// Print one JSON object per answer
+    #[arg(long)]
     json: bool,
-    /// Replace this file with the metrics in Prometheus' text format, once a second; for node_exporter's textfile collector, which
-    /// reads files named *.prom
-    #[arg(long, value_name = "FILE")]
-    prometheus: Option<PathBuf>,
+    #[command(flatten)]
+    exported: PrometheusFlag,
 }
 
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Polls a run and prints a page or a JSON object: once, or with `repeat` until the run is over or Ctrl-C. If no process can be asked
-/// any more, the run's `folder`, if it is known, tells how the run ended, or that its launcher still runs.
+/// Prints a page or a JSON object about a run that was `found`. If no process can be asked, the run's `folder`, if it is known, tells how
+/// the run ended, or that its launcher still runs.
 ///
 /// # Errors
-/// [`UnreachableRun`]; [`Interrupted`] if Ctrl-C came before the first page.
-pub fn print_status(
+/// A file that cannot be written; [`Interrupted`] if Ctrl-C came before the first page; without `--watch`, a run in which a process is
+/// missing, gone or unresponsive.
+pub fn status(
+    found: anyhow::Result<Poller>,
+    folder: Option<&RunFolder>,
+    flags: &StatusFlags,
+) -> anyhow::Result<()> {
+    let found = flags.exported.check_found(found);
+    let printed = found.and_then(|mut poller| {
+        let is_well = print_status(&mut poller, folder, flags);
+        poller.close();
+        is_well
+    });
+    let is_well = printed.or_else(|e| {
+        let unreachable = e.downcast::<UnreachableRun>()?;
+        unreachable.print(flags.json).map(|()| unreachable.is_well)
+    })?;
+    ensure!(is_well || flags.watch, "the run is not healthy");
+    Ok(())
+}
+
+/// Returns whether the last page says that nothing has to be done. The error may be an [`UnreachableRun`].
+fn print_status(
     poller: &mut Poller,
     folder: Option<&RunFolder>,
-    repeat: bool,
-    as_json: bool,
-) -> anyhow::Result<()> {
+    flags: &StatusFlags,
+) -> anyhow::Result<bool> {
     let interrupted = Shutdown::on_signals(None)?;
     // The first poll starts the speed, which counts what happens until the next.
     poller.poll();
@@ -74,80 +94,54 @@ pub fn print_status(
     }
     loop {
         let view = poller.poll();
+        flags.exported.write(view)?;
         let left = folder.filter(|_| view.servers_ended());
         // A launcher that runs may restart its replay server.
-        let may_restart = repeat && !view.is_over() && left.is_some_and(RunFolder::is_locked);
+        let may_restart = flags.watch && !view.is_over() && left.is_some_and(RunFolder::is_locked);
         let text = match left.and_then(|it| read_endpoints(it).err()) {
-            Some(e) if may_restart => e.downcast::<UnreachableRun>()?.text(as_json)?,
+            Some(e) if may_restart => e.downcast::<UnreachableRun>()?.text(flags.json)?,
             Some(e) => return Err(e),
-            None if as_json => run_json(view)?,
+            None if flags.json => run_json(view)?,
             None => status_page(view),
         };
-        let is_read = match repeat && !as_json {
+        let is_read = match flags.watch && !flags.json {
             true => console::print_page(&text)?,
             false => console::print_unless_closed(&text)?,
         };
-        if !repeat || !is_read || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
-            return Ok(());
+        let is_last = !flags.watch || !is_read || view.is_over();
+        if is_last || interrupted.wait_timeout(PAGE_PERIOD) {
+            return Ok(actions_needed(view).is_empty());
         }
     }
 }
 
-/// Watches a run that was `found`: shows and records it until it is over, or, with `--once`, prints one page for scripts and monitors.
-/// The file for Prometheus tells whether the run answers. If `driml train` stops, the run's `folder`, if it is known, tells how it ended.
+/// Watches a run that was `found`: shows and records it until it is over. The file for Prometheus tells whether the run answers. If
+/// `driml train` stops, the run's `folder`, if it is known, tells how it ended.
 ///
 /// # Errors
 /// A file that cannot be written; [`Interrupted`]; replay servers that do not answer for as long as the run's processes wait for them, that
-/// have exited with a replay in memory, or that serve another run; with `--once`, a run in which a process is missing, gone or unresponsive.
+/// have exited with a replay in memory, or that serve another run.
 pub fn run(
     found: anyhow::Result<Poller>,
     folder: Option<&RunFolder>,
     flags: &WatchFlags,
 ) -> anyhow::Result<()> {
-    if let (Err(_), Some(path)) = (&found, &flags.prometheus) {
-        let down = b"# TYPE driml_up gauge\ndriml_up 0\n";
-        write_file("--prometheus", path, down)?;
-    }
-    let watched = found.and_then(|poller| match flags.once {
-        true => check_once(poller, folder, flags),
-        false => watch(poller, folder, flags),
-    });
-    watched.or_else(|e| {
-        let unreachable = e.downcast::<UnreachableRun>()?;
-        unreachable.print(flags.json)?;
-        ensure!(
-            unreachable.is_well || !flags.once,
-            "the run needs attention: it is not finished and no process of it runs"
-        );
-        Ok(())
-    })
-}
-
-fn check_once(
-    mut poller: Poller,
-    folder: Option<&RunFolder>,
-    flags: &WatchFlags,
-) -> anyhow::Result<()> {
-    let printed = print_status(&mut poller, folder, false, flags.json);
-    poller.close();
-    write_prometheus(flags.prometheus.as_deref(), &poller.view)?;
-    printed?;
-    let needed = actions_needed(&poller.view).join("; ");
-    ensure!(needed.is_empty(), "the run needs attention: {needed}");
-    Ok(())
+    let found = flags.exported.check_found(found);
+    let watched = found.and_then(|poller| watch(poller, folder, flags));
+    watched.or_else(|e| e.downcast::<UnreachableRun>()?.print(false))
 }
 
 /// Waits until the replay servers have read their replay back and a learner has joined. Prints the progress; fails if they are silent.
 fn wait_until_known(
     poller: &mut Poller,
-    prometheus: Option<&Path>,
+    exported: &PrometheusFlag,
     interrupted: &Shutdown,
 ) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let mut limiter = LogLimiter::default();
     loop {
         let view = poller.poll();
-        write_prometheus(prometheus, view)?;
+        exported.write(view)?;
         if view.servers_answered() && view.after_updates.is_some() {
             return Ok(());
         }
@@ -174,12 +168,12 @@ fn watch(mut poller: Poller, run: Option<&RunFolder>, flags: &WatchFlags) -> any
     let folder = flags.run_dir.as_ref().map(RunFolder::new);
     let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
     poller.poll();
-    write_prometheus(flags.prometheus.as_deref(), &poller.view)?;
+    flags.exported.write(&poller.view)?;
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown = folder.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
     if is_unknown || poller.view.recovering().next().is_some() {
         // Before that, it is not known what the run has done so far.
-        wait_until_known(&mut poller, flags.prometheus.as_deref(), &interrupted)?;
+        wait_until_known(&mut poller, &flags.exported, &interrupted)?;
     }
     if let Some(missing) = missing_shards(&poller.view) {
         bail!(usage!("{missing}"));
@@ -206,7 +200,7 @@ fn watch(mut poller: Poller, run: Option<&RunFolder>, flags: &WatchFlags) -> any
             break Ok(Outcome::Interrupted);
         }
         poller.poll();
-        if let Err(failed) = write_prometheus(flags.prometheus.as_deref(), &poller.view)
+        if let Err(failed) = flags.exported.write(&poller.view)
             && !std::mem::replace(&mut has_warned, true)
         {
             watched.display.screen.print_line(&failed.0);
@@ -330,7 +324,7 @@ mod tests {
     use std::os::unix::net::UnixListener;
 
     use super::*;
-    use crate::testing::{config, make, run_folder};
+    use crate::testing::{config, run_folder};
 
     /// As on a file system without locks.
     #[test]
@@ -351,10 +345,10 @@ mod tests {
         let said = found();
         assert!(said.starts_with("no process runs in "), "{said}");
         // As if the servers had exited after the poller was opened.
-        let once = make(|it: &mut WatchFlags| it.once = true);
-        let said = run(Ok(Poller::new(&settings, Vec::new())), Some(&folder), &once);
+        let poller = Poller::new(&settings, Vec::new());
+        let said = status(Ok(poller), Some(&folder), &StatusFlags::default());
         let said = said.unwrap_err().to_string();
-        assert!(said.ends_with("no process of it runs"), "{said}");
+        assert_eq!(said, "the run is not healthy");
         // As in a run in lockstep.
         std::fs::remove_file(folder.endpoints()).unwrap();
         let _lock = folder.lock().unwrap();
