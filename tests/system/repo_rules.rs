@@ -13,10 +13,10 @@ use walkdir::{DirEntry, WalkDir};
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 7_550),
     ("actor", 10_520),
-    ("replay-server", 11_150),
+    ("replay-server", 11_180),
     ("learner", 22_020),
-    ("deploy", 31_180),
-    ("tests", 10_515),
+    ("deploy", 31_235),
+    ("tests", 10_545),
 ];
 /// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;
