@@ -78,8 +78,9 @@ impl Axis {
         let all = values.chain(self.covered.iter().copied());
         let kept = all.filter(|value| self.shows(*value));
         let (low, high) = ticks::bounds(kept.map(|value| self.transform(value)))?;
+        // Means of equal values may differ by a rounding error.
         let margin = match (high - low) * slack {
-            0.0 => low.abs().max(1.0) * SLACK,
+            margin if margin <= 1e-12 * high.abs() => low.abs().max(1.0) * SLACK,
             margin => margin,
         };
         Some(Scale {
@@ -142,7 +143,7 @@ pub struct Series {
     pub mark: Mark,
     /// The points (x, y), sorted by x.
     pub points: Vec<(f64, f64)>,
-    /// The band (x, low, high), sorted by x; empty if the series has none.
+    /// The band (x, low, high), sorted by x; empty if the series has none. At a single x it is a bar.
     pub band: Vec<(f64, f64, f64)>,
 }
 
@@ -347,7 +348,7 @@ impl Plot<'_> {
         let is_shown =
             |(x, low, high): &&(f64, f64, f64)| self.shows(*x, *low) && self.shows(*x, *high);
         let band: Vec<_> = series.band.iter().filter(is_shown).collect();
-        if series.mark == Mark::Bars {
+        if series.mark == Mark::Bars || band.len() == 1 {
             for (x, low, high) in band {
                 let bar = [self.point(*x, *low), self.point(*x, *high)];
                 canvas.line(&bar, series.colour, 1.4);

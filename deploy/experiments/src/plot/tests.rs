@@ -70,6 +70,12 @@ fn runs_that_differ_in_their_seed_are_one_line_with_a_band() {
     let svg = drawn(&root.args(&[&a, &b, &c], &[]));
     assert!(svg.contains("the band is their smallest and largest value"));
     assert!(svg.contains("Not smoothed."));
+
+    // Of runs of one row the band is a bar, beside a dot and a legend in each chart; equal values have ticks that differ.
+    let row = |seed: u32| format!("frames,mean_return,replay_ratio\n9,{seed},0.995595\n");
+    let runs = [7_u32, 8, 9].map(|seed| root.run(&seed.to_string(), "c51", seed, &row(seed)));
+    let svg = drawn(&root.args(&runs.each_ref(), &["mean_return", "replay_ratio"]));
+    assert!(svg.matches("#0072b2").count() > 6 && !svg.contains("0.995595"));
 }
 
 #[test]
