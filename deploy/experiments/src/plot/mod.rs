@@ -87,7 +87,7 @@ fn overview_columns(runs: &[Run]) -> Vec<String> {
     columns.into_iter().filter(has).map(String::from).collect()
 }
 
-/// Returns the named run folders, each once. Other folders and files are skipped with a message, because `runs/*` names them too.
+/// Returns the named run folders, each once. Other folders are skipped with a message, files without one: a sweep's `runs/*` names both.
 fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let mut seen = BTreeSet::new();
     // A folder given twice is one run, not two seeds.
@@ -95,19 +95,16 @@ fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let named = args.runs.iter().filter(|it| seen.insert(whole(it)));
     let folders = named.map(RunFolder::new);
     let (runs, others): (Vec<_>, Vec<_>) = folders.partition(|it| it.metrics().is_file());
+    let is_told = |it: &&RunFolder| runs.is_empty() || !it.path().is_file();
+    let others = others.iter().filter(is_told);
+    let others: Vec<String> = others.map(|it| it.display().to_string()).collect();
+    let others = others.join(", ");
     if runs.is_empty() {
-        let named: Vec<String> = others.iter().map(|it| it.display().to_string()).collect();
-        let (named, metrics) = (named.join(", "), others[0].metrics());
-        let file = metrics.file_name().unwrap_or_default().display();
-        return Err(usage!("{named} is not the folder of a run: there is no {file} in it").into());
+        let why = "it has no metrics.csv, which `driml train` and `driml watch --run-dir` write; a sweep's runs are in its folder runs";
+        return Err(usage!("{others} is not the folder of a run: {why}").into());
     }
-    if let Some((first, more)) = others.split_first() {
-        let more = match more.len() {
-            0 => String::new(),
-            others => format!(" and {}", count(others, "other path")),
-        };
-        let first = first.display();
-        console::eprintln(&format!("skipped {first}{more}: not the folder of a run"));
+    if !others.is_empty() {
+        console::eprintln(&format!("skipped {others}: not the folder of a run"));
     }
     Ok(runs)
 }

@@ -287,7 +287,7 @@ fn what_cannot_be_drawn_is_said() {
             "its seeds share no range of frames; --separate draws each",
         ),
         (root.args(&[&empty], &[]), "recorded a value yet"),
-        (root.args(&[&none], &[]), "is not the folder of a run"),
+        (root.args(&[&none], &[]), "of a run: it has no metrics.csv"),
         (root.args(&[&ragged], &[]), "correct or remove that line"),
         (eps, ".svg, .pdf or .png"),
         (affinity, "no checkpoint"),
