@@ -14,8 +14,7 @@ pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
     Ok(Figure {
         title: "Action affinity A of the newest checkpoint".into(),
         notes: vec![
-            "A[i, j]: how much likelier action j follows action i than it is at all, as a softmax over j. \
-             The sampler looks one step further ahead with probability A."
+            "A[i, j]: how much likelier action j is after action i than overall, as a softmax over j. k grows a step with probability A."
                 .into(),
         ],
         columns: panels.len().min(2),
