@@ -102,7 +102,7 @@ columns! {
         "Mean value of the actions that the last update's rows took.",
         Value::Gauge(|it| last_update(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
-        "Mean k of rows with a positive; of several the furthest.",
+        "Mean k since the start, over positives; of several the furthest.",
         Value::Gauge(|it| it.k.map(|it| it.mean));
     "sd_k", "environment steps", "k", "Standard deviation of k":
         "Standard deviation of k over the same rows.",
