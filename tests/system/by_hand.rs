@@ -8,7 +8,11 @@ use driml_tests::{Process, TestSystem, check_nothing_lost};
 use nix::sys::signal::Signal::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::{
-    LONG, SHORT, closed_terminal::skipped_under_nohup, failures::interrupt_until_it_ends, system,
+    LONG, SHORT,
+    closed_terminal::skipped_under_nohup,
+    failures::interrupt_until_it_ends,
+    leftovers::{check_removed, shared_memory},
+    system,
 };
 
 /// Starts a run by hand, and checks that its processes find each other and exit in order.
@@ -104,7 +108,7 @@ fn a_second_interrupt_ends_a_process_at_once() {
 
 /// Tests each signal that a shell, a service manager or a closed ssh session sends.
 #[test]
-fn processes_that_are_told_to_stop_lose_nothing() {
+fn processes_that_are_told_to_stop_lose_nothing_and_leave_no_shared_memory() {
     for signal in [SIGTERM, SIGINT, SIGHUP] {
         if signal == SIGHUP && skipped_under_nohup() {
             continue;
@@ -119,6 +123,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         let client = system.connect();
         client.wait_for_updates(100);
         client.wait_for_replay("both actors", |replay| replay.actors == 2);
+        let segments = shared_memory(&system);
         let ends = |process: Process, says: &str| {
             process.signal(signal);
             process.wait().expect_code(130).expect_stderr(says)
@@ -134,10 +139,12 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         client.wait_for_replay("a waiting learner", |replay| {
             replay.waiting == Waiting::LearnerWaitsForActors
         });
+        // A client may hold shared memory that it has received.
+        drop(client);
         ends(learner, "saved run/checkpoints/checkpoint-").expect_stderr("stopped after ");
         assert!(!system.run_folder("run").checkpoints().is_empty());
-        drop(client);
         ends(server, "replay server stops");
+        check_removed(&segments);
     }
 }
 

@@ -1,6 +1,6 @@
 //! A run leaves nothing outside its folder, neither in the temporary folder nor in shared memory, however it ended.
 //! If all its processes were killed, the next run removes what they left. After a killed launcher, the learner still saves a checkpoint.
-//! The shared memory of single processes that end is also checked in `failures`.
+//! The shared memory of single processes that end is also checked in `failures` and `by_hand`.
 
 use std::{fs, path::PathBuf};
 
@@ -36,23 +36,7 @@ fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     check_removed(&segments);
 }
 
-#[test]
-fn a_run_that_finishes_leaves_its_folder_alone() {
-    let system = system();
-    fs::create_dir(system.path("tmp")).unwrap();
-    system.pause_learners_at(100);
-    let process = system.start(&local_call(
-        &system,
-        &format!("--agent c51 {SHORT} --run-dir run"),
-    ));
-    system.run_folder("run").wait_for_updates(50);
-    let segments = shared_memory(&system);
-    system.release_learners();
-    process.wait_ok();
-    assert_eq!(system.file_names("tmp"), [] as [&str; 0]);
-    check_removed(&segments);
-}
-
+/// The next run finishes, and leaves nothing of its own either.
 #[test]
 fn the_next_run_sweeps_what_killed_processes_left() {
     let system = system();
@@ -62,26 +46,14 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     system.wait_until_all_have_ended();
     assert_eq!(system.file_names("tmp").len(), 1, "nothing could remove it");
     let next = format!("--agent c51 {SHORT} --run-dir next");
-    system.run_ok(&local_call(&system, &next));
+    system.pause_learners_at(100);
+    let process = system.start(&local_call(&system, &next));
+    system.run_folder("next").wait_for_updates(50);
+    let own = shared_memory(&system);
+    system.release_learners();
+    process.wait_ok();
     assert_eq!(system.file_names("tmp"), [] as [&str; 0]);
-    check_removed(&segments);
-}
-
-#[test]
-fn processes_started_by_hand_leave_no_shared_memory() {
-    let system = system();
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-    let learner = system.start_learner("run");
-    let actor = system.start_actor(0);
-    let client = system.connect();
-    client.wait_for_updates(100);
-    let segments = shared_memory(&system);
-    // A client may hold shared memory that it has received.
-    drop(client);
-    for process in [actor, learner, server] {
-        process.stop(130);
-    }
-    check_removed(&segments);
+    check_removed(&[segments, own].concat());
 }
 
 /// Returns the shared memory files that the processes of a run have open.
