@@ -15,7 +15,6 @@ mod process;
 pub mod python;
 mod run_folder;
 mod skipped;
-mod slow_machine;
 mod system;
 mod waiting;
 
@@ -25,6 +24,5 @@ pub use network::Network;
 pub use process::{Exit, Process, check_has};
 pub use run_folder::{Outcome, RunFolder, Summary, Table, checkpoint_updates};
 pub use skipped::{print_line, skip, skipped_offline, succeeds};
-pub use slow_machine::SlowMachine;
 pub use system::{RunningProcess, TestSystem};
 pub use waiting::{in_parallel, wait_for, wait_until};

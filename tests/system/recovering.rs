@@ -1,15 +1,17 @@
 //! A replay server that reads back a long log: all processes receive the progress, wait, and continue; nothing is lost or stored twice.
 //! The log is real, and its server gets little processor time, as on a slow machine. The program contains no delay for these tests.
 
-use std::{fs, path::Path};
+use std::{fs, path::Path, thread, time::Duration};
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, InsertReply, ReplayStatus, RunInfo, RunSpec, WeightsUpload,
-    config::Settings,
+    ActorJoin, Chunk, ChunkHeader, End, InsertReply, ReplayStatus, RunInfo, RunSpec, Shutdown,
+    WeightsUpload, config::Settings,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{
-    Client, Process, SlowMachine, TestSystem, check_has, new_learner, wait_for, wait_until,
+use driml_tests::{Client, Process, TestSystem, check_has, new_learner, wait_for, wait_until};
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
 };
 use serde_json::Value;
 
@@ -75,6 +77,37 @@ fn prepare_log(system: &TestSystem) -> (RunSpec, String) {
     drop(client);
     server.stop(130);
     (spec, format!("{flags} --replay-dir replay"))
+}
+
+/// Keeps a process slow until this value is dropped: it is stopped for 98 of 100 ms.
+struct SlowMachine(Shutdown);
+
+impl SlowMachine {
+    fn for_process(pid: i32) -> Self {
+        let done = Shutdown::default();
+        let until = done.clone();
+        let signal = move |signal| {
+            // The process may have ended.
+            let _ = kill(Pid::from_raw(pid), signal);
+        };
+        thread::spawn(move || {
+            loop {
+                signal(Signal::SIGSTOP);
+                let is_done = until.wait_timeout(Duration::from_millis(98));
+                signal(Signal::SIGCONT);
+                if is_done || until.wait_timeout(Duration::from_millis(2)) {
+                    return;
+                }
+            }
+        });
+        Self(done)
+    }
+}
+
+impl Drop for SlowMachine {
+    fn drop(&mut self) {
+        self.0.set();
+    }
 }
 
 /// Slows a server down, and waits until it has begun to read.
