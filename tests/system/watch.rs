@@ -5,7 +5,6 @@ use std::collections::BTreeSet;
 
 use driml_launch::metrics::COLUMNS;
 use driml_tests::{
-    check_has,
     python::{find_python, run_script},
     wait_for, wait_until,
 };
@@ -191,63 +190,47 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
         .run_ok(&system.connect_args("watch"))
         .expect_stdout("finished: 1280 frames and 540 updates, replay ratio");
 
-    let samples = parse_prometheus(&system.read("run.prom"));
-    let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();
-    let (_, labels, frames) = of("driml_frames_total");
-    assert_eq!(*frames, 1280.0);
-    let endpoint = format!("endpoint={:?}", system.endpoint());
-    let run = [
-        "world=\"chain\"",
-        "agent=\"driml-ada\"",
-        "seed=\"1\"",
-        &endpoint,
-    ];
-    check_has(labels, &run);
-    assert_eq!(of("driml_updates_total").2, 540.0);
+    // Each sample has the labels of the run first.
+    let endpoint = system.endpoint();
+    let run = format!("world=\"chain\",agent=\"driml-ada\",seed=\"1\",endpoint={endpoint:?}");
+    let text = system.read("run.prom").replace(&run, "");
+    check_prometheus(&text);
+    let value = |sample: &str| -> f64 {
+        let start = format!("driml_{sample} ");
+        let value = text.lines().find_map(|it| it.strip_prefix(&start));
+        value.unwrap().parse().unwrap()
+    };
+    let counts = ["frames_total{}", "updates_total{}", "finished{}"].map(value);
+    assert_eq!(counts, [1280.0, 540.0, 1.0]);
     // The JSON parser may be off by the last digit.
-    let (found, mean) = (of("driml_mean_return").2, &json["mean_return"]);
+    let (found, mean) = (value("mean_return{}"), &json["mean_return"]);
     assert!((found - mean.as_f64().unwrap()).abs() < 1e-12, "{found}");
-    assert_eq!(of("driml_finished").2, 1.0);
-    assert!(of("driml_c51_kl").2 > 0.0 && of("driml_total_loss").2 > 0.0);
-    check_has(&of("driml_losses").1, &["loss=\"dim_4t4\""]);
-    let actor = samples.iter().find(|(name, labels, _)| {
-        name == "driml_process_connected" && labels.contains("process=\"actor-0\"")
-    });
-    assert!(actor.is_none(), "it has left");
+    let losses = ["c51_kl{}", "total_loss{}", "losses{,loss=\"dim_4t4\"}"].map(value);
+    assert!(losses.iter().all(|&it| it > 0.0), "{losses:?}");
+    assert!(!text.contains("process_connected{,process=\"actor-0\"}"));
 }
 
-/// Returns name, labels and value of each sample. Panics if the text is not in Prometheus' text format.
-fn parse_prometheus(text: &str) -> Vec<(String, String, f64)> {
-    assert!(text.ends_with('\n'));
-    let (mut families, mut samples) = (BTreeSet::new(), Vec::new());
-    let (mut helped, mut family) = ("", "");
-    for line in text.lines() {
-        if let Some(help) = line.strip_prefix("# HELP ") {
-            helped = help.split_once(' ').unwrap().0;
-        } else if let Some(of) = line.strip_prefix("# TYPE ") {
-            let (name, kind) = of.split_once(' ').unwrap();
-            assert_eq!(name, helped, "HELP comes before TYPE");
-            assert!(["counter", "gauge"].contains(&kind), "{line}");
-            assert_eq!(kind == "counter", name.ends_with("_total"), "{line}");
-            let is_plain = |it: u8| matches!(it, b'a'..=b'z' | b'0'..=b'9' | b'_');
-            assert!(name.bytes().all(is_plain), "{line}");
-            assert!(families.insert(name), "{name} comes twice");
-            family = name;
-        } else {
-            let (name, rest) = line.split_once('{').unwrap();
-            assert_eq!(name, family, "samples follow their family");
-            let (labels, value) = rest.rsplit_once("} ").unwrap();
-            let mut pairs = labels.split("\",");
-            let is_quoted = labels.ends_with('"') && pairs.all(|it| it.contains("=\""));
-            assert!(is_quoted, "{line}");
-            let twice = samples
-                .iter()
-                .any(|(other, their, _)| other == name && their == labels);
-            assert!(!twice, "{line} comes twice");
-            samples.push((name.to_owned(), labels.to_owned(), value.parse().unwrap()));
+/// Checks Prometheus' text format: each family once, its help and type before its samples, and each sample once. The labels of the run are
+/// cut out, and a sample has at most one other.
+fn check_prometheus(text: &str) {
+    let families = text.strip_prefix("# HELP ").unwrap().strip_suffix('\n');
+    let mut seen = BTreeSet::new();
+    for family in families.unwrap().split("\n# HELP ") {
+        let mut lines = family.lines();
+        let (name, _) = lines.next().unwrap().split_once(' ').unwrap();
+        let kind = ["gauge", "counter"][usize::from(name.ends_with("_total"))];
+        assert_eq!(lines.next(), Some(&*format!("# TYPE {name} {kind}")));
+        let is_plain = |it: u8| matches!(it, b'a'..=b'z' | b'0'..=b'9' | b'_');
+        assert!(name.bytes().all(is_plain) && seen.insert(name), "{name}");
+        for line in lines {
+            let (sample, value) = line.rsplit_once(' ').unwrap();
+            let labels = sample.strip_prefix(name).unwrap();
+            let is_one = |it: &str| it.ends_with("\"}") && it.matches("=\"").count() == 1;
+            let is_sound = labels == "{}" || labels.strip_prefix("{,").is_some_and(is_one);
+            assert!(is_sound && value.parse::<f64>().is_ok(), "{line}");
+            assert!(seen.insert(sample), "{line} comes twice");
         }
     }
-    samples
 }
 
 #[test]
