@@ -77,25 +77,25 @@ fn with_full_disk(
     }
 }
 
-const NOT_WRITTEN: &str = "cannot be written: No space left";
-
+/// Rows of metrics wait until there is room, and a checkpoint that finds none is tried again.
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
-    with_full_disk(PERIOD_NEVER, NOT_WRITTEN, |system, process, filler| {
+    with_full_disk(200, "No space left", |system, process, filler| {
         let client = system.connect();
         let then = client.learner_status().unwrap().updates;
-        client.wait_for_updates(then + 200);
+        client.wait_for_updates(then + 600);
         fs::remove_file(filler).unwrap();
         let run = system.run_folder("disk/run");
         let now = client.learner_status().unwrap().updates;
         run.wait_for_updates(now);
+        wait_until("a checkpoint after that", || {
+            let newest = run.checkpoints().pop();
+            newest.is_some_and(|it| checkpoint_updates(&it) > now)
+        });
         let ended = process.interrupt().expect_code(130);
-        assert_eq!(
-            ended.stderr.matches("No space left").count(),
-            1,
-            "{ended:#?}"
-        );
-        assert_eq!(ended.stderr.matches("\nlost ").count(), 0, "{ended:#?}");
+        let count = |words: &str| ended.stderr.matches(words).count();
+        let counts = ["No space left", "\nlost "].map(count);
+        assert_eq!(counts, [1, 0], "{ended:#?}");
         run.check(Outcome::Interrupted);
         // Times increase strictly, and frames never decrease.
         let [seconds, frames] = ["seconds", "frames"].map(|name| run.numeric_column(name));
@@ -106,7 +106,8 @@ fn a_run_continues_while_the_disk_is_full() {
 
 #[test]
 fn the_first_error_is_the_one_shown() {
-    with_full_disk(PERIOD_NEVER, NOT_WRITTEN, |_, process, filler| {
+    let words = "cannot be written: No space left";
+    with_full_disk(PERIOD_NEVER, words, |_, process, filler| {
         let ended = process.interrupt().expect_code(1);
         // The run fails because the checkpoint could not be saved. The error about the summary is only logged before.
         let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
@@ -121,24 +122,6 @@ fn the_first_error_is_the_one_shown() {
             assert!(causes <= 1, "a cause is logged once: {line}");
         }
         fs::remove_file(filler).unwrap();
-    });
-}
-
-#[test]
-fn a_checkpoint_that_finds_no_room_is_tried_again() {
-    with_full_disk(200, "No space left", |system, process, filler| {
-        let client = system.connect();
-        let then = client.learner_status().unwrap().updates;
-        client.wait_for_updates(then + 600);
-        fs::remove_file(filler).unwrap();
-        let now = client.learner_status().unwrap().updates;
-        let run = system.run_folder("disk/run");
-        wait_until("a checkpoint after that", || {
-            let newest = run.checkpoints().pop();
-            newest.is_some_and(|it| checkpoint_updates(&it) > now)
-        });
-        process.interrupt().expect_code(130);
-        run.check(Outcome::Interrupted);
     });
 }
 
