@@ -71,20 +71,27 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
         .expect_stdout(&format!("weights after {oldest} updates"));
 }
 
+/// By default an evaluation plays the weights that the run's actors receive, rounded to the actors' precision.
 #[test]
 fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
-    let system = with_run("--set learner.update.average_tau=0.01");
+    let bf16 = "--set learner.publish_dtype=bf16 --set actor.precision=bf16";
+    let system = with_run(&format!("--set learner.update.average_tau=0.01 {bf16}"));
     system.run_ok("evaluate run --keep --episodes 2");
-    for (flags, weights) in [
-        ("", "averaged"),
-        ("--checkpoint newest", "averaged"),
-        ("--checkpoint best", "averaged"),
-        ("--weights average", "averaged"),
-        ("--weights online", "online"),
+    for (flags, weights, precision) in [
+        ("", "averaged", "bf16"),
+        ("--exact", "averaged", "f32"),
+        ("--checkpoint newest", "averaged", "bf16"),
+        ("--checkpoint best", "averaged", "bf16"),
+        ("--weights average", "averaged", "bf16"),
+        ("--weights online", "online", "bf16"),
     ] {
         let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
         assert_eq!(json["averaged"], weights == "averaged", "{flags}");
+        assert_eq!([&json["weights"], &json["arithmetic"]], [precision; 2]);
     }
+    let words = "averaged bf16 weights after 540 updates played in bf16";
+    let played = system.run_ok("evaluate run --episodes 2");
+    played.expect_stdout(words);
     system
         .run_ok("evaluate run --export net.safetensors")
         .expect_stdout("averaged weights after 540 updates as f16");
@@ -267,19 +274,6 @@ fn a_film_changes_nothing_that_is_played() {
     assert!(!system.path("returns.csv").exists());
     assert!(!unfinished.exists());
     assert!(fs::read(system.path("play.gif")).unwrap() == bytes);
-}
-
-/// By default an evaluation plays the weights that the run's actors receive, rounded to the actors' precision.
-#[test]
-fn it_plays_in_the_precision_of_the_run() {
-    let system = with_run("--set learner.publish_dtype=bf16 --set actor.precision=bf16");
-    for (flags, precision) in [("", "bf16"), ("--exact", "f32")] {
-        let json = system.run_json(&format!("evaluate run --episodes 2 --json {flags}"));
-        assert_eq!([&json["weights"], &json["arithmetic"]], [precision; 2]);
-    }
-    let words = "bf16 weights after 540 updates played in bf16";
-    let played = system.run_ok("evaluate run --episodes 2");
-    played.expect_stdout(words);
 }
 
 /// The learner's own tests check that damage to any file is found. Without a checkpoint no film is begun.
