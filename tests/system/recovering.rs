@@ -225,6 +225,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back(
     assert_eq!(replay.transitions_inserted, PLANNED_FRAMES);
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait_ok();
+    check_has(&system.read("run.prom"), &["\ndriml_updates_total{"]);
     let seen = system.run_folder("seen").summary();
     assert_eq!(seen.updates, PLANNED_UPDATES);
     learner.stop(0);
