@@ -13,7 +13,8 @@ use crate::{
 
 /// Returns the page of `driml status` as one line, because words stand where its lines are broken.
 pub(crate) fn status_text(system: &TestSystem) -> String {
-    let page = system.run(&system.connect_args("status")).stdout;
+    let ended = system.run(&system.connect_args("status"));
+    let page = ended.expect_stdout("\nprocess ").stdout;
     page.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
