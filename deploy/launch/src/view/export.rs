@@ -107,7 +107,7 @@ fn prometheus_text(view: &RunView) -> String {
         page.add_gauge("updates_planned", "Updates of the whole run.", planned[1]);
         let help = "Whether all updates are made and saved.";
         page.add_gauge("finished", help, view.is_finished().into());
-        let help = "Whether no process of the run is missing.";
+        let help = "Whether `driml status` exits with code 0.";
         page.add_gauge("healthy", help, actions_needed(view).is_empty().into());
     }
     page.text

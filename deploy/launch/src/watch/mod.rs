@@ -43,7 +43,8 @@ pub struct WatchFlags {
 /// What `driml status` does with a run.
 #[derive(Debug, Default, Args)]
 pub struct StatusFlags {
-    /// Repeat every two seconds until the run is over or Ctrl-C, and exit with code 0
+    /// Repeat every two seconds until the run is over or Ctrl-C, and exit with code 0; without it, exit with code 1 unless the run is
+    /// healthy
     #[arg(long)]
     watch: bool,
     /// Print one JSON object per answer
