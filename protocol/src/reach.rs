@@ -25,7 +25,7 @@ pub struct Unreachable {
     text: String,
     /// Whether a retry may succeed, as the replay server may still be starting.
     is_retryable: bool,
-    /// Whether its machine reports that nothing listens there: a server that did has ended.
+    /// Whether its machine reports that nothing listens there: a server that did has exited.
     pub is_closed: bool,
 }
 

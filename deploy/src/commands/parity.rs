@@ -36,7 +36,6 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     }
     for file in &args.files {
         let checked = driml_learner::parity::check_file(file, &compute);
-        // A file that is not a whole case; values out of tolerance are in the report.
         let report = checked.map_err(|e| usage!("{}", describe_error(&e)))?;
         print(&report.to_string())?;
         failed += usize::from(!report.passed());

@@ -59,7 +59,7 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
 }
 
 impl RunSelection {
-    /// Opens a connection to the run. The error may be an [`UnreachableRun`].
+    /// Opens a connection to the run. The error may be a [`watch::UnreachableRun`].
     fn open(&self) -> anyhow::Result<Poller> {
         check_connect_endpoints(&self.connect, self.tls.is_set())?;
         let (role, connect) = (Role::Observer, self.endpoints()?);

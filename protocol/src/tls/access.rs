@@ -21,7 +21,7 @@ use crate::{
 /// Number of actors that certificates can name, from 0. A replay server makes the rules of all at its start, which takes memory.
 pub const ACTORS_MAX: u32 = 1024;
 
-/// The role of a process, and the common name of its certificate.
+/// The role of a process, and the common name of its certificate. `driml doctor` lists the roles in this order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
     /// A replay server: the side that listens.

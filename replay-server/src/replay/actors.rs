@@ -89,7 +89,7 @@ impl Replay {
     }
 
     /// Stores a chunk for which [`Replay::early_reply`] returned `None`, on disk before in memory. Replies `Wait` while the disk rejects
-    /// writes, and if the limiter has no room, unless the actor is leaving or the last draw found no anchor.
+    /// writes, and if the limiter has no room, unless the actor is leaving (`Actors::passes_limiter`) or the last draw found no anchor.
     pub(crate) fn store_if_allowed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         let may_insert = self.limiter.may_insert() || self.is_starving();
         if !(may_insert || self.state.actors.passes_limiter(&packed.chunk.header)) {

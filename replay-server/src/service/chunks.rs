@@ -133,7 +133,7 @@ impl State {
         replies
     }
 
-    /// Replies what became of a chunk, or keeps the query with the parked chunk. If the actor is leaving, stores its parked chunk.
+    /// Replies what became of a chunk, or keeps the query with the parked chunk. If the actor is leaving, stores its parked chunk if it may.
     fn handle_poll(&mut self, poll: &ChunkPoll, query: PendingQuery) -> Replies {
         if let Some(reply) = self.replay.answer_poll(poll) {
             if let InsertReply::Refused { why } = &reply {

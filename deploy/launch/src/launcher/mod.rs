@@ -243,8 +243,8 @@ impl Launch<'_> {
         let poller = &mut self.poller;
         // The learner's last status may be lost, but not what it has saved.
         let saved = self.run_dir.newest_checkpoint().map_or(0, |it| it.0);
-        let learner = &mut poller.view.learner;
-        learner.updates = learner.updates.max(saved);
+        let updates = &mut poller.view.learner.updates;
+        *updates = saved.max(*updates);
         if let Err(e) = poller.poll_replay() {
             tracing::debug!("the replay server's last answer: {e:#}");
         }
