@@ -15,7 +15,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 10_520),
     ("replay-server", 11_180),
     ("learner", 22_020),
-    ("deploy", 31_235),
+    ("deploy", 31_240),
     ("tests", 10_410),
 ];
 /// The most lines of one file.

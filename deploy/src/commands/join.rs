@@ -57,7 +57,11 @@ impl TlsFlags {
     pub(super) fn credentials(&self, role: Role) -> Result<Option<Arc<Credentials>>, Usage> {
         let read = |folder: &PathBuf| Credentials::read(folder, role).map(Arc::new);
         let read = self.tls_dir.as_ref().map(read).transpose();
-        read.map_err(|e| Usage(e.to_string()))
+        let read = read.map_err(|e| Usage(e.to_string()))?;
+        if let Some(advice) = read.as_ref().and_then(|it| it.advice()) {
+            tracing::warn!("{advice}");
+        }
+        Ok(read)
     }
 
     /// Returns how a process in this role reaches the run at these endpoints.

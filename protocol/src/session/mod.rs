@@ -71,9 +71,6 @@ impl Connection {
         let Some(credentials) = &self.credentials else {
             return open_with_settings(&self.endpoints, message_bytes_max, &[]);
         };
-        if let Some(advice) = credentials.advice() {
-            tracing::warn!("{advice}");
-        }
         let mut settings = vec![
             ("transport/link/tls", credentials.zenoh_settings()),
             (

@@ -57,7 +57,7 @@ pub(crate) fn run_json(view: &RunView) -> serde_json::Result<String> {
 /// The file for Prometheus. Each write replaces it, whole or not at all.
 #[derive(Debug, Default, Args)]
 pub(crate) struct PrometheusFlag {
-    /// Replace this file with the metrics in Prometheus' text format at each answer; for node_exporter's textfile collector, which
+    /// Replace this file with the metrics in Prometheus' text format at each request; for node_exporter's textfile collector, which
     /// reads files named *.prom
     #[arg(long, value_name = "FILE")]
     prometheus: Option<PathBuf>,
