@@ -36,7 +36,7 @@ fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     check_removed(&segments);
 }
 
-/// The next run finishes, and leaves nothing of its own either.
+/// The next run finishes, and leaves nothing outside its folder either.
 #[test]
 fn the_next_run_sweeps_what_killed_processes_left() {
     let system = system();

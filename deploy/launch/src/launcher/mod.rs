@@ -42,7 +42,7 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to exit, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
-/// How long the learner may leave requests for its last status unanswered; a loaded machine answers late.
+/// How long the learner may leave requests for its last status unanswered.
 const LAST_STATUS_MAX: Duration = Duration::from_secs(30);
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 
