@@ -14,6 +14,7 @@ use std::mem::transmute;
 use half::bf16;
 
 use super::{
+    avx512_half::{self, HALF},
     avx512_rounding::{self, first_lanes},
     element::Rounding,
     simd::{LANES, Loop, RawTile, Simd},
@@ -76,7 +77,7 @@ const fn rows_max(vecs: usize) -> usize {
 }
 
 macro_rules! simd {
-    ($simd:ident, $element:ty, $features:literal) => {
+    ($simd:ident, $half:ty, $element:ty, $features:literal) => {
         impl Simd for $simd {
             type Element = $element;
             const VECS_MAX: usize = 4;
@@ -111,6 +112,11 @@ macro_rules! simd {
 
             #[target_feature(enable = $features)]
             unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                if vecs == 1 && tile.cols <= HALF {
+                    return compute_sizes!($half, tile, rows, vecs;
+                        1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
+                    );
+                }
                 compute_sizes!(Self, tile, rows, vecs;
                     1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
                     2: 1 2 3 4 5 6 7 8 9 10 11 12;
@@ -121,9 +127,15 @@ macro_rules! simd {
     };
 }
 
-simd!(F32, f32, "avx512f,avx512bw,avx512dq,avx512vl,fma");
+simd!(
+    F32,
+    avx512_half::F32,
+    f32,
+    "avx512f,avx512bw,avx512dq,avx512vl,fma"
+);
 simd!(
     Bf16,
+    avx512_half::Bf16,
     bf16,
     "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma"
 );
