@@ -31,15 +31,12 @@ fn derived_settings() -> impl Iterator<Item = (&'static str, &'static str)> {
 
 /// The settings that follow from others unless they are set by hand: the number of actors on the epsilon ladder, the visible action to
 /// which each action amounts, and the updates over which beta rises.
-const FOLLOWING: [&str; 3] = [
-    "actor.epsilon_ladder.actors",
-    "learner.affinity.visible",
-    "replay.sampling.beta_updates",
-];
+const FOLLOWING: &str =
+    "actor.epsilon_ladder.actors learner.affinity.visible replay.sampling.beta_updates";
 
 /// Removes the settings that only follow from others, so that they follow from changed ones too.
 pub(crate) fn remove_following(table: &mut Table) -> Result<(), Usage> {
-    for path in FOLLOWING {
+    for path in FOLLOWING.split(' ') {
         let mut filled = table.clone();
         let is = remove(&mut filled, path);
         fill_in_derived(&mut filled)?;
@@ -163,7 +160,7 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
     fill_in_loss_layers(table, &update);
     let (ladder_actors, visible) = (ladder_actors(table), visible_actions(table, &config, set));
     let values = [ladder_actors, visible, beta_updates(table)];
-    for (path, value) in FOLLOWING.into_iter().zip(values) {
+    for (path, value) in FOLLOWING.split(' ').zip(values) {
         if let Some(value) = value {
             insert_missing(table, path, value);
         }

@@ -20,15 +20,8 @@ const TOTAL_LOSS: &str = "total_loss";
 const TEXTS: [&str; 1] = ["waiting"];
 
 /// The beginnings of the names of settings that do not influence what is learned. Time-outs, which end in `_ms`, do not either.
-const OF_MACHINE: [&str; 7] = [
-    "local.",
-    "transport.",
-    "learner.checkpoint_period_updates",
-    "learner.checkpoints_kept",
-    "actor.world_threads",
-    "replay.capacity_transitions",
-    "replay.compressed_bytes_max",
-];
+const OF_MACHINE: &str = "local. transport. learner.checkpoint_period_updates learner.checkpoints_kept actor.world_threads \
+                          replay.capacity_transitions replay.compressed_bytes_max";
 
 /// Settings as text, by their full dotted names.
 pub(crate) type Settings = BTreeMap<String, String>;
@@ -177,7 +170,7 @@ pub(crate) fn read_settings(config: &str, compared: &[String]) -> Option<(Settin
     }
     all.retain(|name, _| {
         let is_in = |prefix: &str| name.starts_with(prefix);
-        let is_of_machine = name.ends_with("_ms") || OF_MACHINE.into_iter().any(is_in);
+        let is_of_machine = name.ends_with("_ms") || OF_MACHINE.split(' ').any(is_in);
         compared.iter().any(|it| is_in(it)) || !is_of_machine
     });
     Some((all, seed))

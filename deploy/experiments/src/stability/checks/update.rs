@@ -30,15 +30,8 @@ pub(super) fn properties() -> Vec<Property> {
 const ACTIONS: usize = 4;
 
 /// Settings of a small network in which all four pairs of DIM have a weight.
-const SETS: [&str; 7] = [
-    "learner.update.lambda.3t3=0.5",
-    "learner.update.lambda.3t4=0.5",
-    "learner.update.lambda.4t3=0.5",
-    "model.conv=[{out=8,kernel=4,stride=2},{out=8,kernel=3,stride=1}]",
-    "model.hidden=32",
-    "model.embedding_dim=16",
-    "model.action_embed=4",
-];
+const SETS: &str = "learner.update.lambda.3t3=0.5 learner.update.lambda.3t4=0.5 learner.update.lambda.4t3=0.5 model.hidden=32 \
+                    model.embedding_dim=16 model.action_embed=4 model.conv=[{out=8,kernel=4,stride=2},{out=8,kernel=3,stride=1}]";
 
 /// The settings of an update besides its weights and rows.
 #[derive(Debug)]
@@ -73,7 +66,8 @@ impl Setting {
 
     /// Creates two agents with the same scaled initial weights: one with our kernels, one with candle's.
     fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
-        let run = resolve_names("paper", "chain", "driml-fix", &SETS, &Machine::detect())?;
+        let sets: Vec<_> = SETS.split(' ').collect();
+        let run = resolve_names("paper", "chain", "driml-fix", &sets, &Machine::detect())?;
         let model = ModelConfig {
             height: 20,
             width: 20,
