@@ -32,20 +32,13 @@ pub(crate) use self::{
 use self::{
     flags::PlotArgs,
     groups::Group,
-    runs::{C51_LOSS, SD_OF_K},
+    runs::{C51_LOSS, SD_OF_K, SHORT_NAMES},
 };
 
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column of training returns; the chart can show a random policy as a line.
 const RETURN: &str = "mean_return";
 const EVALUATED: &str = "evaluated_return";
-/// Short names of columns, which `--column` accepts.
-const SHORT_NAMES: [(&str, &str); 4] = [
-    ("return", RETURN),
-    ("loss", C51_LOSS),
-    ("k", "mean_k"),
-    ("speed", "frames_per_second"),
-];
 /// The columns drawn by default, if the runs have values of them. Auxiliary losses follow after [`C51_LOSS`].
 const OVERVIEW: [&str; 7] = [
     RETURN,

@@ -16,6 +16,13 @@ pub(super) const SD_OF_K: &str = "sd_k";
 /// The columns right before and right after those of the auxiliary losses.
 pub(super) const C51_LOSS: &str = "c51_kl";
 const TOTAL_LOSS: &str = "total_loss";
+/// Short names of columns, which `--column` accepts.
+pub(super) const SHORT_NAMES: [(&str, &str); 4] = [
+    ("return", "mean_return"),
+    ("loss", C51_LOSS),
+    ("k", "mean_k"),
+    ("speed", "frames_per_second"),
+];
 /// The columns of `metrics.csv` that hold words instead of numbers.
 const TEXTS: [&str; 1] = ["waiting"];
 
@@ -122,7 +129,7 @@ impl Run {
             usage!(
                 "{} has no column of numbers {column:?}{}; it has {}",
                 self.folder.metrics().display(),
-                did_you_mean(column, numbers()),
+                did_you_mean(column, numbers().chain(SHORT_NAMES.map(|it| it.0))),
                 numbers().collect::<Vec<_>>().join(", ")
             )
         })

@@ -277,6 +277,7 @@ fn what_cannot_be_drawn_is_said() {
             root.args(&[&a], &["mean_retrun"]),
             "has no column of numbers \"mean_retrun\" (did you mean \"mean_return\"?); it has seconds, frames, mean_return, mean_k",
         ),
+        (root.args(&[&a], &["retrun"]), "did you mean \"return\"?"),
         (root.args(&[&a], &["waiting"]), "has no column of numbers"),
         (
             root.args(&[&empty], &["mean_return"]),
