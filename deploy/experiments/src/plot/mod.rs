@@ -39,6 +39,8 @@ const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column of training returns; the chart can show a random policy as a line.
 const RETURN: &str = "mean_return";
 const EVALUATED: &str = "evaluated_return";
+/// The most skipped folders that are named. Of further folders the message has only the number.
+const SKIPPED_MAX: usize = 4;
 /// The columns drawn by default, if the runs have values of them. Auxiliary losses follow after [`C51_LOSS`].
 const OVERVIEW: [&str; 7] = [
     RETURN,
@@ -90,14 +92,18 @@ fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let (runs, others): (Vec<_>, Vec<_>) = folders.partition(|it| it.metrics().is_file());
     let is_told = |it: &&RunFolder| runs.is_empty() || !it.path().is_file();
     let others = others.iter().filter(is_told);
-    let others: Vec<String> = others.map(|it| it.display().to_string()).collect();
-    let others = others.join(", ");
+    let mut others: Vec<String> = others.map(|it| it.display().to_string()).collect();
+    if let more @ 1.. = others.len().saturating_sub(SKIPPED_MAX) {
+        others.truncate(SKIPPED_MAX);
+        others.push(format!("{more} more"));
+    }
     if runs.is_empty() {
         let why = "it has no metrics.csv, which `driml train` and `driml watch --run-dir` write; a sweep's runs are in its folder runs";
+        let others = others.join(", ");
         return Err(usage!("{others} is not the folder of a run: {why}").into());
     }
-    if !others.is_empty() {
-        console::eprintln(&format!("skipped {others}: not the folder of a run"));
+    for other in others {
+        console::eprintln(&format!("skipped {other}: not the folder of a run"));
     }
     Ok(runs)
 }

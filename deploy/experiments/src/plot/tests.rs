@@ -266,7 +266,7 @@ fn what_cannot_be_drawn_is_said() {
     let a = root.run("a", "c51", 1, METRICS);
     let empty = root.run("e", "c51", 1, "frames,mean_return\n0,\n");
     let late = root.run("l", "c51", 2, "frames,mean_return\n90,1.5\n95,2.5\n");
-    let none = root.0.path().join("none");
+    let none = ["a1", "a2", "a3", "a4", "a5", "a6"].map(|it| root.0.path().join(it));
     let ragged = root.run("r", "c51", 1, "frames,mean_return\n0\n");
     let mut eps = root.args(&[&a], &[]);
     eps.out = root.0.path().join("p.eps");
@@ -288,7 +288,10 @@ fn what_cannot_be_drawn_is_said() {
             "its seeds share no range of frames; --separate draws each",
         ),
         (root.args(&[&empty], &[]), "recorded a value yet"),
-        (root.args(&[&none], &[]), "of a run: it has no metrics.csv"),
+        (
+            root.args(&none.each_ref(), &[]),
+            "/a4, 2 more is not the folder of a run: it has no metrics.csv",
+        ),
         (root.args(&[&ragged], &[]), "correct or remove that line"),
         (eps, ".svg, .pdf or .png"),
         (affinity, "no checkpoint"),
