@@ -70,13 +70,15 @@ fn format_number(value: f64) -> String {
 }
 
 fn case_count(rows: &[Row]) -> String {
-    HumanCount(rows.iter().map(|row| row.tally.cases).sum()).to_string()
+    let cases: u64 = rows.iter().map(|row| row.tally.cases).sum();
+    let noun = if cases == 1 { "case" } else { "cases" };
+    format!("{} {noun}", HumanCount(cases))
 }
 
 fn verdict(rows: &[Row]) -> String {
     let kept = rows.iter().filter(|row| row.is_kept()).count();
     let (all, cases) = (rows.len(), case_count(rows));
-    format!("{kept} of {all} promises are kept, in {cases} cases.")
+    format!("{kept} of {all} promises are kept, in {cases}.")
 }
 
 fn page_values(rows: &[Row], settings: &Settings) -> Value {
@@ -150,7 +152,7 @@ fn figure(rows: &[Row]) -> Figure {
         title: "The worst error of each routine, beside what it promises".into(),
         notes: vec![
             format!(
-                "{} cases. A ring a row; above the dashed line a promise is broken.",
+                "{}. A ring a row; above the dashed line a promise is broken.",
                 case_count(rows)
             ),
             "At the bottom: no error at all, as where a promise allows none.".into(),
@@ -191,7 +193,7 @@ mod tests {
             (verdict(&rows), page)
         };
         let (verdict, page) = reported(0.25, "");
-        assert_eq!(verdict, "1 of 1 promises are kept, in 1 cases.");
+        assert_eq!(verdict, "1 of 1 promises are kept, in 1 case.");
         assert!(!page.contains("Not kept"), "{page}");
         let nearest = "Nearest to their promises: halving (50%).";
         assert!(page.contains(nearest), "{page}");
