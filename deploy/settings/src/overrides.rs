@@ -58,8 +58,13 @@ impl Override {
             (Value::Float(_), Value::Integer(whole)) => Ok(Value::Float(*whole as f64)),
             (old, new) if old.same_type(new) => Ok(new.clone()),
             (old, new) => (old.as_integer().and_then(|_| as_whole(new))).ok_or_else(|| {
+                let is_list = new.as_str().map_or(new.is_array(), |it| it.contains(','));
+                let hint = match is_list && !old.is_array() && !old.is_table() {
+                    true => "; `driml sweep` makes a run for each of several values, separated by commas without brackets",
+                    false => "",
+                };
                 usage!(
-                    "--set {}={}: this setting takes {}, and \"{new}\" is {}",
+                    "--set {}={}: this setting takes {}, and \"{new}\" is {}{hint}",
                     self.path,
                     inline_text(new),
                     type_name(old),
