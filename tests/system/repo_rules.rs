@@ -239,15 +239,13 @@ fn dangerous_words_stay_where_they_are_needed() {
     let ffi = &["actor/procgen-sys/", "learner/model/src/kernels/isa/"];
     // The messages, and the saved state of worlds.
     let encoded = &["protocol/src/wire/", "actor/envs/src/saved.rs"];
+    let caught = &["replay-server/tests/", "tests/decoders/tests/"];
     let rules: [(&str, &[&str]); 4] = [
         ("unsafe", ffi),
         ("unsafe_code", ffi),
         ("bincode", encoded),
         // A panic ends the process: no code of the program may rely on catching one.
-        (
-            "catch_unwind",
-            &["replay-server/tests/", "tests/decoders/tests/"],
-        ),
+        ("catch_unwind", caught),
     ];
     for (word, places) in rules {
         let mut uses = 0;

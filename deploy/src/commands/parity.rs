@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use driml_launch::console::{describe_error, print};
-use driml_learner::{Kernels, Precision};
+use driml_learner::{Kernels, Precision, UpdateError};
 use driml_machine::{
     device::{DeviceFlag, check_device},
     error::usage,
@@ -26,7 +26,7 @@ pub(crate) struct ParityArgs {
     pub(crate) stock: bool,
 }
 
-/// Checks each file and prints what differs. A file that is not a case is a wrong call, and one out of tolerance an error.
+/// Checks each file and prints what differs. A file that is not a case is a wrong call; a failed or wrong update is an error.
 pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     check_device(args.on.device)?;
     let mut failed = 0;
@@ -36,7 +36,12 @@ pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     }
     for file in &args.files {
         let checked = driml_learner::parity::check_file(file, &compute);
-        let report = checked.map_err(|e| usage!("{}", describe_error(&e)))?;
+        let report = checked.map_err(|e| match e.downcast_ref() {
+            Some(
+                UpdateError::NonFinite(_) | UpdateError::Diverged { .. } | UpdateError::Tensor(_),
+            ) => e,
+            _ => usage!("{}", describe_error(&e)).into(),
+        })?;
         print(&report.to_string())?;
         failed += usize::from(!report.passed());
     }

@@ -80,7 +80,8 @@ impl fmt::Display for ParityReport {
 /// Runs one update on a case file, computed as `compute` says, and compares every tensor that the case expects.
 ///
 /// # Errors
-/// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are lines of the report.
+/// A file that cannot be read, is not a case, or lacks a tensor; [`UpdateError`](crate::UpdateError) if the arithmetic of a sound case
+/// fails. Values out of tolerance are lines of the report.
 pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityReport> {
     let file = path.as_ref().to_owned();
     let bytes = std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
