@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use driml_launch::metrics::COLUMNS;
+use driml_launch::{metrics::COLUMNS, run_folder::RunFolder};
 use driml_tests::{
     python::{find_python, run_script},
     wait_until,
@@ -100,14 +100,19 @@ fn a_launched_run_is_watched_and_continues_without() {
 fn a_run_that_ends_between_two_requests_leaves_its_summary() {
     let system = system();
     system.pause_learners_at(100);
-    let launcher = system.start(&system.local_args(&format!("--agent c51 {SHORT}")));
+    let flags = "--agent c51 --set learner.unreachable_max_ms=9000";
+    let launcher = system.start(&system.local_args(&format!("{flags} {SHORT}")));
     system.connect().wait_for_updates(0);
-    let watched = system.start("watch run --run-dir seen");
+    let mut watched = system.start("watch run --run-dir seen");
     wait_until("the folder", || system.path("seen/metrics.csv").exists());
     watched.signal(Signal::SIGSTOP);
     system.release_learners();
     launcher.wait_ok();
+    // As if the launcher still played the last checkpoint.
+    let lock = RunFolder::new(system.path("run")).lock().unwrap();
     watched.signal(Signal::SIGCONT);
+    watched.wait_for_stderr("replay server: no answer for ");
+    drop(lock);
     let ended = watched.wait_ok().expect_stdout("the run is over");
     ended.expect_stderr("seen/metrics.csv lacks the run's last rows");
     let [whole, seen] = ["run", "seen"].map(|it| system.read(&format!("{it}/summary.json")));

@@ -189,10 +189,10 @@ fn watch(mut poller: Poller, run: Option<&RunFolder>, flags: &WatchFlags) -> any
         }
         let is_cut_short = poller.view.servers_ended() && !poller.view.is_over();
         let continues = match run {
-            // A launcher that runs may restart its replay server.
-            Some(run) if is_cut_short && !run.is_locked() => read_endpoints(run).map(drop),
-            Some(_) => Ok(()),
-            None => watched.check_continues(&poller.view),
+            // A launcher that runs may restart its replay server, or play the last checkpoint after its servers have exited.
+            Some(run) if run.is_locked() => Ok(()),
+            Some(run) if is_cut_short => read_endpoints(run).map(drop),
+            _ => watched.check_continues(&poller),
         };
         if let Err(e) = continues {
             break Err(e);

@@ -87,42 +87,43 @@ impl WatchedRun {
             self.display.screen.print_lines(warnings);
         }
         self.display.show(&poller.view);
-        self.is_over(poller)
+        Ok(self.is_over(poller))
     }
 
-    fn is_over(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
+    fn is_over(&mut self, poller: &mut Poller) -> bool {
         let view = &poller.view;
         if view.is_all_learned() {
-            return Ok(true);
+            return true;
         }
-        let silent = view.replay_silence.length();
         // The servers exit once the learner has saved. Another client may have received the learner's last answer, or the launcher may
         // have stopped the learner before it was polled again.
         let is_reported = view.replay.learner_finished && !view.is_learner_answering;
-        let has_exited = is_reported || silent > EXIT_SILENCE_MAX;
-        if has_exited && view.replay.waiting == Waiting::Finished {
+        let has_exited = is_reported || view.replay_silence.length() > EXIT_SILENCE_MAX;
+        let is_over = has_exited && view.replay.waiting == Waiting::Finished;
+        if is_over {
             self.count_served_updates(poller);
-            return Ok(true);
+        }
+        is_over
+    }
+
+    /// Fails if a server has exited whose replay was in memory, as the run cannot continue without it, or if the servers have been silent
+    /// for as long as the run's processes wait for them.
+    pub(super) fn check_continues(&self, poller: &Poller) -> anyhow::Result<()> {
+        let (view, silent) = (&poller.view, poller.view.replay_silence.length());
+        let mut servers = view.servers.iter().zip(&self.answers);
+        let lost = servers.find(|(it, last)| it.is_gone && matches!(last, Some((_, false))));
+        if let Some((server, _)) = lost
+            && silent > EXIT_SILENCE_MAX
+        {
+            bail!(
+                "the replay server on {} has exited, and its replay was in memory: the run has ended, and the output of its processes tells how",
+                server.endpoint
+            );
         }
         if silent > Duration::from_millis(poller.config.learner.unreachable_max_ms) {
             bail!(
                 "the replay server has not answered for {}: the run has ended, or the network is interrupted",
                 duration(silent)
-            );
-        }
-        Ok(false)
-    }
-
-    /// Fails if a server has exited whose replay was in memory: the run cannot continue without it.
-    pub(super) fn check_continues(&self, view: &RunView) -> anyhow::Result<()> {
-        let mut servers = view.servers.iter().zip(&self.answers);
-        let lost = servers.find(|(it, last)| it.is_gone && matches!(last, Some((_, false))));
-        if let Some((server, _)) = lost
-            && view.replay_silence.length() > EXIT_SILENCE_MAX
-        {
-            bail!(
-                "the replay server on {} has exited, and its replay was in memory: the run has ended, and the output of its processes tells how",
-                server.endpoint
             );
         }
         Ok(())
