@@ -70,7 +70,7 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     system.run_folder("run").wait_for_updates(10);
     fs::remove_file(system.path("run/metrics.csv")).unwrap();
     system.release_learners();
-    let ended = process.fails("missing: run/metrics.csv");
+    let ended = process.fails("start the run again; missing: run/metrics.csv");
     assert!(!ended.stderr.contains("episodes.csv"), "{}", ended.stderr);
 }
 
@@ -123,7 +123,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     system.find_process("actor").signal(Signal::SIGKILL);
     process
         .fails("error: actor-0 was killed by signal 9 SIGKILL (log: ")
-        .expect_stderr("actor-0 cannot be restarted: the ghosts of this run change");
+        .expect_stderr("actor-0 cannot be restarted, so start the run again: the ghosts");
     system.check_outcome(Outcome::Failed);
 }
 

@@ -55,7 +55,7 @@ pub fn read_config(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     let path = folder.config();
     let text = std::fs::read_to_string(&path).map_err(|e| {
         usage!(
-            "{} is not the folder of a run: reading {}: {e}",
+            "{} is not the folder of a run: reading {}: {e}; give a folder that `driml train` or `driml watch --run-dir` made",
             folder.display(),
             path.display()
         )

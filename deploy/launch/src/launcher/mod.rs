@@ -178,7 +178,9 @@ impl Launch<'_> {
                 if silent > SILENCE_MAX {
                     let why = view.servers.iter().find_map(|it| it.error.as_deref());
                     let (silent, why) = (duration(silent), why.unwrap_or("no answer"));
-                    bail!("the {name} has not answered for {silent}: {why}");
+                    let logs = self.run_dir.logs();
+                    let logs = logs.display();
+                    bail!("the {name} has not answered for {silent} ({why}): see {logs}");
                 }
             }
             let processes = self.processes.iter_mut();

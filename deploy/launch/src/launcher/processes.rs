@@ -195,8 +195,8 @@ impl Launch<'_> {
             }
             if is_actor && !self.config.world.is_resumable() {
                 bail!(
-                    "{report}\n{name} cannot be restarted: the ghosts of this run change as episodes pass, and a new process would \
-                     count these from 0"
+                    "{report}\n{name} cannot be restarted, so start the run again: the ghosts of this run change as episodes pass, and a \
+                     new process would count these from 0"
                 );
             }
             *restarts += 1;

@@ -174,7 +174,7 @@ impl RunFolder {
         let missing: Vec<_> = missing.map(|it| it.display().to_string()).collect();
         anyhow::ensure!(
             missing.is_empty(),
-            "the run folder was removed or moved during the run; missing: {}",
+            "the run folder was removed or moved during the run: resume it at its new place, or start the run again; missing: {}",
             missing.join(", ")
         );
         Ok(())

@@ -122,7 +122,7 @@ impl WatchedRun {
         }
         if silent > Duration::from_millis(poller.config.learner.unreachable_max_ms) {
             bail!(
-                "the replay server has not answered for {}: the run has ended, or the network is interrupted",
+                "the replay server has not answered for {}: the run has ended, or the network is interrupted; once it answers, start `driml watch` again",
                 duration(silent)
             );
         }
