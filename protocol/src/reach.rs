@@ -29,16 +29,6 @@ pub struct Unreachable {
     pub is_closed: bool,
 }
 
-impl Unreachable {
-    const fn new(text: String, is_retryable: bool, is_closed: bool) -> Self {
-        Self {
-            text,
-            is_retryable,
-            is_closed,
-        }
-    }
-}
-
 /// Checks once whether something accepts connections at `endpoint`. For `quic/` only the host is resolved, because UDP does not
 /// report a closed port.
 pub fn check_listening(endpoint: &str) -> Result<(), Unreachable> {
@@ -51,24 +41,40 @@ pub fn check_listening(endpoint: &str) -> Result<(), Unreachable> {
                 let text = format!(
                     "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
                 );
-                Unreachable::new(text, why.contains("emporary"), false)
+                Unreachable {
+                    text,
+                    is_retryable: why.contains("emporary"),
+                    is_closed: false,
+                }
             })?;
             if protocol != "tcp" {
                 return Ok(());
             }
-            let mut failed = None;
+            let mut failed = Vec::new();
             for address in addresses {
                 match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
                     Ok(_) => return Ok(()),
-                    Err(e) => failed = Some(e),
+                    Err(e) => failed.push(e),
                 }
             }
+            let failed = most_telling(failed);
             let failed = failed.unwrap_or_else(|| ErrorKind::AddrNotAvailable.into());
             Err(connect_error(endpoint, failed))
         }
         // zenoh reports what is wrong with such an endpoint.
         None => Ok(()),
     }
+}
+
+/// Returns the error that tells most of those of a host's addresses. A server may still run at an address that does not answer; other
+/// errors than these two kinds say only that this machine has no route to the address, as where it lacks IPv6.
+fn most_telling(errors: Vec<std::io::Error>) -> Option<std::io::Error> {
+    let rank = |e: &std::io::Error| match e.kind() {
+        ErrorKind::TimedOut | ErrorKind::HostUnreachable => 2,
+        ErrorKind::ConnectionRefused => 1,
+        _ => 0,
+    };
+    errors.into_iter().max_by_key(rank)
 }
 
 fn connect_error(endpoint: &str, e: std::io::Error) -> Unreachable {
@@ -82,7 +88,11 @@ fn connect_error(endpoint: &str, e: std::io::Error) -> Unreachable {
             "{endpoint} does not answer ({e}): is its machine up, is the address right, and does a firewall let this port through?"
         ),
     };
-    Unreachable::new(text, true, is_closed)
+    Unreachable {
+        text,
+        is_retryable: true,
+        is_closed,
+    }
 }
 
 fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
@@ -92,7 +102,11 @@ fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
             let text = format!(
                 "{endpoint} belongs to another user: run as that user, or connect to a tcp/ endpoint"
             );
-            return Err(Unreachable::new(text, false, false));
+            return Err(Unreachable {
+                text,
+                is_retryable: false,
+                is_closed: false,
+            });
         }
         Err(e) if e.kind() == ErrorKind::NotFound => "there is no such socket",
         Err(e) if e.kind() == ErrorKind::ConnectionRefused => {
@@ -103,7 +117,11 @@ fn check_unix_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
     let text = format!(
         "nothing listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
     );
-    Err(Unreachable::new(text, true, true))
+    Err(Unreachable {
+        text,
+        is_retryable: true,
+        is_closed: true,
+    })
 }
 
 /// Waits until something accepts connections at one of `endpoints`.
@@ -159,4 +177,25 @@ pub(crate) fn read_greeting(endpoint: &str) -> Option<String> {
     let line = std::str::from_utf8(line.into_iter().next()?).ok()?;
     let is_text = line.len() >= 4 && line.chars().all(|it| !it.is_control());
     is_text.then(|| line.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_has_exited_only_if_no_address_of_its_host_may_be_silent() {
+        use ErrorKind::{ConnectionRefused, HostUnreachable, NetworkUnreachable, TimedOut};
+        for (errors, is_closed) in [
+            ([ConnectionRefused, ConnectionRefused], true),
+            ([ConnectionRefused, NetworkUnreachable], true),
+            ([HostUnreachable, ConnectionRefused], false),
+            ([TimedOut, ConnectionRefused], false),
+            ([ConnectionRefused, TimedOut], false),
+        ] {
+            let failed = most_telling(errors.map(std::io::Error::from).into());
+            let error = connect_error("tcp/host:1", failed.unwrap());
+            assert_eq!(error.is_closed, is_closed, "{errors:?}");
+        }
+    }
 }
