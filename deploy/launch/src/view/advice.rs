@@ -39,7 +39,7 @@ pub(super) fn limiter_waits(view: &RunView) -> Vec<String> {
     waits
 }
 
-/// What is missing and what to do about it, the most important first.
+/// What is missing and what to do about it, the most important first. A server that reads its replay back needs nothing.
 pub(crate) fn actions_needed(view: &RunView) -> Vec<String> {
     let servers = view.servers.iter().filter(|_| !view.is_over());
     let mut needed: Vec<_> = servers.filter_map(server_action).collect();
@@ -66,10 +66,6 @@ fn server_action(server: &ServerAnswer) -> Option<String> {
     let endpoint = &server.endpoint;
     Some(if server.is_another_run {
         format!("{endpoint} now serves a run with other settings: connect again")
-    } else if let Some(progress) = server.recovering {
-        format!(
-            "the replay server on {endpoint} reads its replay back from disk ({progress}): no action needed, the run then continues"
-        )
     } else if server.is_gone {
         format!("the replay server on {endpoint} has exited: restart it unless the run is complete")
     } else {
@@ -103,7 +99,8 @@ fn learner_action(view: &RunView) -> Option<String> {
             "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: {command}",
             format_s(learner.since_s)
         )),
-        Some(_) if view.learner_status().is_none() => Some(
+        // The learner is asked through the first server.
+        Some(_) if view.learner_status().is_none() && view.servers[0].replay.is_some() => Some(
             "the learner is connected but does not respond: its process may be suspended, or the machine overloaded".into(),
         ),
         Some(_) => None,

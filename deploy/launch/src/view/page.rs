@@ -81,6 +81,9 @@ pub(crate) fn status_page(view: &RunView) -> String {
     page += match needed.is_empty() {
         _ if view.is_finished() => "the run is over: all updates are made and saved\n",
         _ if view.is_over() => "the run is over: all frames were stored and sampled\n",
+        _ if view.recovering().next().is_some() => {
+            "recovering: the run continues once its replay is read back from disk\n"
+        }
         true => "nothing is missing\n",
         false => "",
     };
