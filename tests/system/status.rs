@@ -2,7 +2,7 @@
 //! The messages that processes log while they wait are tested here, too.
 
 use driml_protocol::Leave;
-use driml_tests::{TestSystem, check_has, wait_for, wait_until};
+use driml_tests::{Process, TestSystem, check_has, wait_for, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{
@@ -112,20 +112,28 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         let ended = system.run("status run");
         ended.code == Some(0) && ended.stdout.contains("learns")
     });
-    let watched = system.start("status run --watch --json");
-    wait_until("its first answer", || !watched.stdout().is_empty());
+    let early = system.start("status run --watch --json");
+    wait_until("its first answer", || !early.stdout().is_empty());
     // A launcher that is stopped does not restart its server.
     process.signal(Signal::SIGSTOP);
     system.find_process("replay-server").signal(Signal::SIGKILL);
-    let last_has = |words: &str| {
+    let last_has = |watched: &Process, words: &str| {
         let stdout = watched.stdout();
-        stdout.lines().next_back().unwrap().contains(words)
+        let last = stdout.lines().next_back();
+        last.is_some_and(|it| it.contains(words))
     };
-    wait_until("its end", || last_has("no replay server listens"));
+    let late = system.start("status run --watch --json");
+    for watched in [&early, &late] {
+        wait_until("its end", || last_has(watched, "no replay server listens"));
+    }
     process.signal(Signal::SIGCONT);
-    wait_until("the next server", || last_has("\"healthy\":true"));
+    for watched in [&early, &late] {
+        wait_until("the next server", || last_has(watched, "\"healthy\":true"));
+    }
     process.interrupt().expect_code(130);
-    watched.wait_ok();
+    for watched in [early, late] {
+        watched.wait_ok();
+    }
     system
         .fails("status run --prometheus run.prom", "the run is not healthy")
         .expect_stdout("no process runs in run, which holds")

@@ -54,8 +54,8 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    let selection = &args.selection;
-    watch::status(selection.open(), selection.folder().as_ref(), &args.flags)
+    let StatusArgs { selection, flags } = args;
+    watch::status(|| selection.open(), selection.folder().as_ref(), flags)
 }
 
 impl RunSelection {

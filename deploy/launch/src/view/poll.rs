@@ -220,7 +220,13 @@ fn fetch_settings(
     keys: &Keys,
     endpoint: &str,
 ) -> anyhow::Result<(RunConfig, Option<u32>)> {
-    let (config_toml, shard) = match join::fetch_run_info_once(session, keys, ANSWER_MAX) {
+    let mut fetched = join::fetch_run_info_once(session, keys, ANSWER_MAX);
+    if matches!(fetched, Err(SessionError::NoResponder { .. })) {
+        // A replay server listens shortly before it answers.
+        std::thread::sleep(POLL);
+        fetched = join::fetch_run_info_once(session, keys, ANSWER_MAX);
+    }
+    let (config_toml, shard) = match fetched {
         Ok(run_info) => (run_info.config_toml, Some(run_info.shard.0)),
         Err(SessionError::Recovering(recovering)) => (recovering.config_toml, None),
         Err(SessionError::Unreadable { why, .. }) => {

@@ -56,64 +56,63 @@ pub struct StatusFlags {
 
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Prints a page or a JSON object about a run that was `found`. If no process can be asked, the run's `folder`, if it is known, tells how
-/// the run ended, or that its launcher still runs.
+/// Prints a page or a JSON object about a run, which `open` finds. If no process can be asked, the run's `folder`, if it is known, tells
+/// how the run ended, or that its launcher still runs.
 ///
 /// # Errors
 /// A file that cannot be written; [`Interrupted`] if Ctrl-C came before the first page; without `--watch`, a run in which a process is
 /// missing, gone or unresponsive.
 pub fn status(
-    found: anyhow::Result<Poller>,
+    open: impl Fn() -> anyhow::Result<Poller>,
     folder: Option<&RunFolder>,
     flags: &StatusFlags,
 ) -> anyhow::Result<()> {
-    let found = flags.exported.check_found(found);
-    let printed = found.and_then(|mut poller| {
-        let is_well = print_status(&mut poller, folder, flags);
-        poller.close();
-        is_well
-    });
-    let is_well = printed.or_else(|e| {
-        let unreachable = e.downcast::<UnreachableRun>()?;
-        unreachable.print(flags.json).map(|()| unreachable.is_well)
-    })?;
-    ensure!(is_well || flags.watch, "the run is not healthy");
-    Ok(())
-}
-
-/// Returns whether the last page says that nothing has to be done. The error may be an [`UnreachableRun`].
-fn print_status(
-    poller: &mut Poller,
-    folder: Option<&RunFolder>,
-    flags: &StatusFlags,
-) -> anyhow::Result<bool> {
+    let mut found = Some(open());
     let interrupted = Shutdown::on_signals(None)?;
-    // The first poll starts the speed, which counts what happens until the next.
-    poller.poll();
-    if interrupted.wait_timeout(poller.pause()) {
-        return Err(Interrupted.into());
-    }
-    loop {
+    let mut poller: Option<Poller> = None;
+    let mut look = || -> anyhow::Result<(String, bool, bool)> {
+        let poller = match &mut poller {
+            Some(poller) => poller,
+            none => {
+                let found = found.take().unwrap_or_else(&open);
+                let poller = none.insert(flags.exported.check_found(found)?);
+                // The first poll starts the speed, which counts what happens until the next.
+                poller.poll();
+                if interrupted.wait_timeout(poller.pause()) {
+                    return Err(Interrupted.into());
+                }
+                poller
+            }
+        };
         let view = poller.poll();
         flags.exported.write(view)?;
-        let left = folder.filter(|_| view.servers_ended());
-        // A launcher that runs may restart its replay server.
-        let may_restart = flags.watch && !view.is_over() && left.is_some_and(RunFolder::is_locked);
-        let text = match left.and_then(|it| read_endpoints(it).err()) {
-            Some(e) if may_restart => e.downcast::<UnreachableRun>()?.text(flags.json)?,
-            Some(e) => return Err(e),
-            None if flags.json => run_json(view)?,
-            None => status_page(view),
+        if let Some(folder) = folder.filter(|_| view.servers_ended()) {
+            read_endpoints(folder)?;
+        }
+        let text = match flags.json {
+            true => run_json(view)?,
+            false => status_page(view),
         };
+        Ok((text, actions_needed(view).is_empty(), view.is_over()))
+    };
+    let is_well = loop {
+        let seen = look().or_else(|e| {
+            let unreachable = e.downcast::<UnreachableRun>()?;
+            // A launcher that runs may start its replay server, for the first time or again.
+            let is_over = !folder.is_some_and(RunFolder::is_locked);
+            anyhow::Ok((unreachable.text(flags.json)?, unreachable.is_well, is_over))
+        });
+        let (text, is_well, is_over) = seen?;
         let is_read = match flags.watch && !flags.json {
             true => console::print_page(&text)?,
             false => console::print_unless_closed(&text)?,
         };
-        let is_last = !flags.watch || !is_read || view.is_over();
-        if is_last || interrupted.wait_timeout(PAGE_PERIOD) {
-            return Ok(actions_needed(view).is_empty());
+        if !(flags.watch && is_read) || is_over || interrupted.wait_timeout(PAGE_PERIOD) {
+            break is_well;
         }
-    }
+    };
+    ensure!(is_well || flags.watch, "the run is not healthy");
+    Ok(())
 }
 
 /// Watches a run that was `found`: shows and records it until it is over. The file for Prometheus tells whether the run answers. If
@@ -129,7 +128,7 @@ pub fn run(
 ) -> anyhow::Result<()> {
     let found = flags.exported.check_found(found);
     let watched = found.and_then(|poller| watch(poller, folder, flags));
-    watched.or_else(|e| e.downcast::<UnreachableRun>()?.print(false))
+    watched.or_else(|e| console::print(&e.downcast::<UnreachableRun>()?.text(false)?))
 }
 
 /// Waits until the replay servers have read their replay back and a learner has joined. Prints the progress; fails if they are silent.
@@ -250,11 +249,7 @@ pub struct UnreachableRun {
 }
 
 impl UnreachableRun {
-    /// Prints the state, as one line of JSON or as text for a person.
-    pub fn print(&self, as_json: bool) -> anyhow::Result<()> {
-        console::print(&self.text(as_json)?)
-    }
-
+    /// Returns the state, as one line of JSON or as text for a person.
     fn text(&self, as_json: bool) -> serde_json::Result<String> {
         Ok(match as_json {
             true => serde_json::to_string(self)? + "\n",
@@ -346,8 +341,8 @@ mod tests {
         let said = found();
         assert!(said.starts_with("no process runs in "), "{said}");
         // As if the servers had exited after the poller was opened.
-        let poller = Poller::new(&settings, Vec::new());
-        let said = status(Ok(poller), Some(&folder), &StatusFlags::default());
+        let open = || Ok(Poller::new(&settings, Vec::new()));
+        let said = status(open, Some(&folder), &StatusFlags::default());
         let said = said.unwrap_err().to_string();
         assert_eq!(said, "the run is not healthy");
         // As in a run in lockstep.
