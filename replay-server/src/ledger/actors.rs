@@ -261,8 +261,7 @@ impl Actors {
 
     /// Counts a chunk to be stored. Returns the actor's streams, and how the chunk's count of earlier transitions differs from ours.
     ///
-    /// A new incarnation starts with fresh streams. If the counts differ, the streams are unlinked, so that the chunk does not continue
-    /// the transitions stored before.
+    /// A new incarnation starts with fresh streams. If the counts differ, the streams are unlinked: the chunk continues no transition.
     pub(crate) fn accept(&mut self, header: &ChunkHeader) -> (&mut [Stream], Difference) {
         let actor = self.actors.get_mut(&header.actor);
         let actor = actor.expect("a chunk of an actor that has not joined is never judged Next");
@@ -303,8 +302,12 @@ impl Actors {
         Ok(Some(difference))
     }
 
-    pub(crate) fn forgettable(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
-        if self.actors.len() < ACTORS_MAX {
+    pub(crate) fn forgettable(
+        &self,
+        joining: u32,
+        is_connected: impl Fn(u32, u64) -> bool,
+    ) -> Vec<u32> {
+        if self.actors.len() < ACTORS_MAX || self.actors.contains_key(&joining) {
             return Vec::new();
         }
         let forgettable = self.actors.iter().filter(|&(&number, actor)| {
@@ -315,9 +318,7 @@ impl Actors {
     }
 
     pub(crate) fn forget(&mut self, actors: &[u32]) {
-        for actor in actors {
-            self.actors.remove(actor);
-        }
+        self.actors.retain(|it, _| !actors.contains(it));
     }
 }
 

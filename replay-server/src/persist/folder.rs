@@ -40,8 +40,7 @@ pub enum PersistError {
     },
     #[error("another replay server keeps its replay in {}: end it first, or choose another --replay-dir", .0.display())]
     InUse(PathBuf),
-    /// The content of this file or folder belongs to another run or version, or is invalid although its checksum is right. The text says
-    /// why, and what to do.
+    /// This file or folder belongs to another run or version, or is invalid although its checksum is right; why, and what to do.
     #[error("{path} {1}", path = .0.display())]
     Unusable(PathBuf, String),
     /// The log cannot be rolled back to a mark: this file, its segment, is missing or damaged.

@@ -24,8 +24,7 @@ const UNUSABLE_EXTENSION: &str = "unusable";
 /// Period between log lines about the progress.
 const LOG_PERIOD: Duration = Duration::from_secs(5);
 
-/// The progress of reading a log, for clients that ask meanwhile, and a flag that stops the reading early. Threads share it by
-/// reference.
+/// The progress of reading a log, for clients that ask meanwhile, and a flag that stops the reading early.
 #[derive(Debug)]
 pub struct RecoveryControl {
     started: Instant,

@@ -97,7 +97,8 @@ fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
     for actor in 0..ACTORS_MAX as u32 {
         replay.join_actor(ActorJoin::new(actor, 1)).unwrap();
     }
-    replay.forget_absent(|actor, _| actor > 0);
+    let forgotten = [5, 9_999].map(|joins| replay.forget_absent(joins, |actor, _| actor > 0));
+    assert_eq!(forgotten, [vec![], vec![0]], "a known actor needs no room");
     replay.join_actor(ActorJoin::new(9_999, 1)).unwrap();
     check_comes_back(replay, folder.path());
 }

@@ -77,8 +77,7 @@ impl Replay {
         marked.transpose()
     }
 
-    /// Discards `mark`, as the checkpoint that should refer to it could not be saved. So it does not displace a mark to which a saved
-    /// checkpoint refers.
+    /// Discards `mark`, as its checkpoint could not be saved. So it does not displace a mark to which a saved checkpoint refers.
     pub fn discard_mark(&mut self, mark: Mark) {
         if let Some(journal) = &mut self.journal {
             journal.discard_mark(mark);

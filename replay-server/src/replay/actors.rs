@@ -19,8 +19,7 @@ use crate::{
 const PRODUCED_MAX: u64 = 1 << 48;
 
 impl Replay {
-    /// Admits an incarnation of an actor: from now on its chunks are stored, and those of earlier incarnations are not. Returns the number
-    /// of earlier incarnations.
+    /// Admits an incarnation of an actor: only its chunks are stored from now on. Returns the number of earlier incarnations.
     ///
     /// # Errors
     /// Too many actors, or an incarnation that another one has replaced; the reason, for a person.
@@ -33,9 +32,13 @@ impl Replay {
         Ok(earlier_incarnations)
     }
 
-    /// If the run has its maximum number of actors, forgets those that never sent a chunk and are not connected. Returns their numbers.
-    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
-        let absent = self.state.actors.forgettable(is_connected);
+    /// If the run has no room for the actor `joining`, forgets those that never sent a chunk and are not connected. Returns their numbers.
+    pub(crate) fn forget_absent(
+        &mut self,
+        joining: u32,
+        is_connected: impl Fn(u32, u64) -> bool,
+    ) -> Vec<u32> {
+        let absent = self.state.actors.forgettable(joining, is_connected);
         if !absent.is_empty() {
             self.state.actors.forget(&absent);
             self.append_to_log(ProcessEvent::Forgotten(absent.clone()));

@@ -59,8 +59,7 @@ impl Service {
         self.send_replies(replies);
     }
 
-    /// Stores parked chunks as the limiter allows, and replies `Wait` to queries that have been held for long, until the shutdown. Its
-    /// thread does nothing else.
+    /// Stores parked chunks as the limiter allows, and replies `Wait` to queries that have been held for long, until the shutdown.
     pub(super) fn store_parked_chunks(&self) {
         while !self.shutdown.is_set() {
             fail_point::reach("admit");

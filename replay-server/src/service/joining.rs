@@ -106,7 +106,7 @@ impl State {
             return Err(JoinReply::Taken { why });
         }
         // Otherwise a process that joins under one number after another would use up all numbers.
-        let absent = self.replay.forget_absent(is_connected);
+        let absent = self.replay.forget_absent(actor, is_connected);
         participants.forget(&absent);
         let earlier_incarnations = self.replay.join_actor(join).map_err(refused_reply)?;
         participants.add_joined(Peer::actor(actor, incarnation), Instant::now());

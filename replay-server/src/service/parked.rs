@@ -58,8 +58,7 @@ impl<Q> ParkedChunks<Q> {
         self.position_of(actor).map(|at| self.queue[at].arrived)
     }
 
-    /// Parks a chunk in the place of an older one of its actor, or at the end of the queue. Returns the query as an error if the
-    /// chunk has no room.
+    /// Parks a chunk in the place of an older one of its actor, or at the end of the queue. Without room for it, returns the query.
     pub(super) fn park(
         &mut self,
         packed: PackedChunk<'static>,

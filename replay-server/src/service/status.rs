@@ -113,8 +113,7 @@ impl Service {
         incoming.into_responder().reply(&status);
     }
 
-    /// Logs which missing process the run waits for: after `MISSING_MAX`, then at doubling intervals. Its thread does nothing else until
-    /// the shutdown.
+    /// Logs which missing process the run waits for, after `MISSING_MAX` and then at doubling intervals, until the shutdown.
     pub(super) fn log_missing_processes(&self) {
         // The missing process, since when, and after how long it is logged next.
         let mut missing: Option<(&str, Instant, Duration)> = None;

@@ -85,8 +85,7 @@ impl WeightsStore {
         self.newest.as_ref().map_or(0, |it| it.header.version)
     }
 
-    /// Takes newer weights; an upload may be repeated. Returns whether the weights are new. An error says why they cannot follow the
-    /// newest.
+    /// Takes newer weights; an upload may be repeated. Returns whether they are new, or why they cannot follow the newest.
     pub(super) fn update(
         &mut self,
         header: WeightsHeader,
