@@ -118,8 +118,7 @@ impl Network {
         ip(&format!("-n {router} link set {device} {state}")).unwrap();
     }
 
-    /// Limits what a machine sends and receives, in kbit/s. Packets beyond that wait at the link. Returns false if the kernel does not
-    /// support it.
+    /// Limits what a machine sends and receives, in kbit/s; packets beyond that wait at the link. Returns whether the kernel can do this.
     pub fn limit_rate(&self, machine: &str, sent: u32, received: u32) -> bool {
         let router = (self.namespace("router"), self.router_end(machine));
         let ends = [

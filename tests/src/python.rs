@@ -11,8 +11,7 @@ missing = ', '.join(name for name in sys.argv[1:] if importlib.util.find_spec(na
 sys.exit(f'{sys.executable} has no {missing}: name one that has with DRIML_TEST_PYTHON' if missing else 0)
 ";
 
-/// Returns the Python that `DRIML_TEST_PYTHON` names, or `python3`, if it has all these modules. Otherwise returns `None` and reports the
-/// test as skipped.
+/// Returns the Python that `DRIML_TEST_PYTHON` names, or `python3`. Without these modules, reports the test as skipped.
 pub fn find_python(modules: &[&str]) -> Option<String> {
     let python = std::env::var("DRIML_TEST_PYTHON").unwrap_or_else(|_| "python3".into());
     succeeds(Command::new(&python).args(["-c", FIND]).args(modules)).then_some(python)

@@ -83,8 +83,7 @@ impl TestSystem {
         self
     }
 
-    /// Returns this system with TLS, and certificates for three actors in its folder `tls`. Returns `None` if openssl is missing, and
-    /// reports the test as skipped.
+    /// Returns this system with TLS, and certificates for three actors in its folder `tls`. Without openssl, reports the test as skipped.
     pub fn over_tls(mut self) -> Option<Self> {
         if !succeeds(Command::new("openssl").arg("version")) {
             return None;

@@ -8,11 +8,17 @@ use std::{
     process::Command,
 };
 
+use driml_protocol::ActorJoin;
 use driml_tests::{
     Outcome, Process, TestSystem, check_has, checkpoint_updates, succeeds, wait_for, wait_until,
 };
 
-use crate::{LONG, SHORT, status::status_text, system};
+use crate::{
+    LONG, SHORT,
+    refusals::{Row, check_replies},
+    status::status_text,
+    system,
+};
 
 /// A small disk. Dropping the value unmounts it.
 struct Disk {
@@ -155,6 +161,12 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         let text = status_text(&system);
         words.iter().all(|it| text.contains(it))
     });
+    // The last page of the log has room for some joins; each further one has to wait, and none of them is kept to be written later.
+    let joins = (1_000..1_200).map(|it| Row::of(&client, &ActorJoin::new(it, 1), "W"));
+    check_replies(&client, joins);
+    let json = system.run(&system.connect_args("status --json")).json();
+    let bytes = &json["servers"][0]["processes"]["log"]["unwritten_bytes"];
+    assert!(bytes.as_u64().is_some_and(|it| it < 1_000), "{bytes}");
     fs::remove_file(filler).unwrap();
     client.wait_for_transitions(stopped.transitions_inserted + 1_000);
     server.wait_for_stderr("can be written again; nothing was lost");

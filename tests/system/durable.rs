@@ -179,8 +179,7 @@ fn a_replay_server_that_rejects_its_log_is_not_started_again() {
     assert!(!ended.stderr.contains("(restart 2 of"), "{}", ended.stderr);
 }
 
-/// Processes started by hand continue when the server restarts with the same flags. New actors then get weights, although the learner waits
-/// for transitions and publishes none.
+/// Processes started by hand continue when the server restarts with the same flags. New actors get weights before the learner's next ones.
 #[test]
 fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let system = system();

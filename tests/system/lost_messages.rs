@@ -372,8 +372,7 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     }
 }
 
-/// A shard that is empty at first, because its actors started late, is drawn from once it holds transitions, although the others never make
-/// the learner wait.
+/// A shard whose actors started late is drawn from once it holds transitions, although the others never make the learner wait.
 #[test]
 fn a_shard_that_fills_late_is_asked() {
     let mut shards = empty_shards(2, 1_000, None);

@@ -46,8 +46,7 @@ fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     assert_eq!(system.running_processes(), []);
 }
 
-/// The limiter never opens, as without a learner, and the test lasts longer than the time-out for an unreachable server. Actors that wait
-/// at the limiter do not time out.
+/// The limiter never opens, as without a learner, for longer than the time-out for an unreachable server. Waiting actors do not time out.
 #[test]
 fn an_actor_waits_for_as_long_as_it_must() {
     let system = system();

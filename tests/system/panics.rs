@@ -9,8 +9,7 @@ use crate::{LONG, PRIORITISED, system};
 /// The launcher itself; the other processes exit after its death.
 const LAUNCHER: &str = "launcher";
 
-/// The process's name in the launcher, the fail points in its threads, and the flags of a run that has these threads. If several processes
-/// have them, any of them may panic first.
+/// The process's name in the launcher, the fail points in its threads, and the flags of a run with these threads, perhaps in several processes.
 static FAIL_POINTS: [(&str, &str, &str); 8] = [
     (
         "replay-server",

@@ -6,8 +6,7 @@ use driml_tests::{Outcome, Summary, TestSystem, check_has};
 
 use crate::{SHORT, start_run, system};
 
-/// The number of updates that a resumed run makes: more than the 256 transitions of slack, a chunk in flight and a chunk that fills the
-/// replay again can allow.
+/// The updates of a resumed run: more than the 256 transitions of slack, a chunk in flight and one that refills the replay can allow.
 const MORE_UPDATES: u64 = 200;
 
 /// Resumes `run` for [`MORE_UPDATES`] updates, and checks what the run leaves behind.

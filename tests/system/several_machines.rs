@@ -106,8 +106,7 @@ impl Run {
     }
 }
 
-/// An actor is disconnected for longer than a session's lease; meanwhile the learner and the server are, too. The others continue while
-/// they can.
+/// An actor is disconnected for longer than a session's lease, and then the learner and the server too. The others continue while they can.
 #[test]
 fn cut_cables_heal_by_themselves() {
     let system = system();

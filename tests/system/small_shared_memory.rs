@@ -8,8 +8,7 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, chain, disk_full::fill_disk, system};
 
-/// Returns a call of the program that gives it and its children a `/dev/shm` of this size. If that is not permitted, returns `None` and
-/// reports the test as skipped.
+/// Returns a call of the program that gives it a `/dev/shm` of this size. If that is not permitted, reports the test as skipped.
 fn with_shared_memory(size: &str, call: &str) -> Option<String> {
     let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm");
     let mut tried = Command::new("unshare");

@@ -83,8 +83,7 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     assert!(system.run_folder("run").saved_updates() > 75);
 }
 
-/// A new replay server at the same endpoint knows nothing of the run: the old actors and learner exit, and a learner with the run's
-/// checkpoint resumes the run's counts.
+/// A new replay server at the same endpoint knows nothing of the run: all processes exit, and a learner with a checkpoint resumes its counts.
 #[test]
 fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let system = system();
@@ -118,8 +117,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     }
 }
 
-/// If the run has made updates, a learner without its checkpoint is rejected with a clear message, unless it is told to restart. A finished
-/// run admits no learner.
+/// If the run has made updates, a learner without its checkpoint is rejected unless it is told to restart. A finished run admits none.
 #[test]
 fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let system = system();

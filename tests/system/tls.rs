@@ -13,8 +13,7 @@ fn tls_copy(system: &TestSystem, name: &str) -> Certificates {
     system.certificates().copy_to(system.path(name))
 }
 
-/// Opens a session with zenoh alone, without driml's checks, that uses the certificate of a role on one side, `connect` or `listen`. A
-/// session that connects gives up soon.
+/// Opens a session without driml's checks, with the certificate of a role on one side, `connect` or `listen`. It gives up connecting soon.
 fn open_raw(
     side: &str,
     endpoint: &str,

@@ -52,7 +52,13 @@ impl Service {
     ) {
         let weights_version = self.weights().newest_version();
         self.answer(incoming, |state, request| {
-            let reply = match join(state, request) {
+            // Each join that the disk rejects would make the pending records longer, so at most one is among them.
+            let joined = state.replay.write_pending().then(|| join(state, request));
+            let (Some(joined), true) = (joined, state.replay.write_pending()) else {
+                let why = "the replay server cannot write its log; its output says why".into();
+                return Some(JoinReply::Wait { why });
+            };
+            let reply = match joined {
                 Ok(earlier_incarnations) => JoinReply::Welcome(Welcome {
                     inserted_total: state.replay.inserted_total(),
                     weights_version,
@@ -60,10 +66,6 @@ impl Service {
                 }),
                 Err(rejected) => rejected,
             };
-            if !state.replay.write_pending() {
-                let why = "the replay server cannot write its log; its output says why".into();
-                return Some(JoinReply::Wait { why });
-            }
             if let JoinReply::Refused { why } = &reply {
                 state.reject(J::NAME, why);
             }

@@ -35,8 +35,7 @@ fn foreign(client: &Client, message: &impl Message, payload: &[u8]) -> Vec<u8> {
     codec::encode(client.spec.hash() ^ 1, message, payload).unwrap()
 }
 
-/// Returns messages that are rejected at the key for chunks, each with words of the reason. All kinds of invalid messages and chunks are
-/// tested beside the codec and the replay.
+/// Returns messages that are rejected at the key for chunks, each with words of the reason. The crates test all kinds of them.
 fn invalid_chunks(client: &Client) -> [(Vec<u8>, &'static str); 4] {
     let chunk = chunk(client, 0);
     let foreign = foreign(client, &chunk.header, chunk.payload());
