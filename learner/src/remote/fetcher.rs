@@ -368,14 +368,15 @@ impl Fetcher {
         is_due: impl Fn(&ShardState, Instant) -> bool,
     ) -> anyhow::Result<()> {
         let (now, mut all_stored) = (Instant::now(), false);
-        for (client, state) in self.shared.clients.iter().zip(&mut partial.shards) {
+        let shards = self.shared.clients.iter().zip(&mut partial.shards);
+        for (shard, (client, state)) in shards.enumerate() {
             if !is_due(state, now) {
                 continue;
             }
             let status = client.fetch::<ReplayStatus>(REQUEST_TIMEOUT);
             let status = status.context("a shard's status")?;
-            let counts = ShardCounts::new(status.transitions_inserted, status.rows_sampled);
-            state.record_counts(counts, status.transitions_held);
+            let received = self.shared.counters.learned(shard).rows_received;
+            state.record_status(&status, received);
             all_stored |= status.finished;
         }
         partial.set_stored(all_stored);

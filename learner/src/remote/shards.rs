@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
-    Batch, Keys, LearnerJoin, Peer, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting,
-    join,
+    Batch, Keys, LearnerJoin, Peer, ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown,
+    Silence, Waiting, join,
     session::{Connection, MESSAGE_BYTES_MAX},
 };
 use rand::Rng;
@@ -146,6 +146,14 @@ impl ShardState {
     pub(super) fn record_counts(&mut self, counts: ShardCounts, held: u64) {
         (self.counts, self.held) = (counts, held);
         self.last_seen = Some(Instant::now());
+    }
+
+    /// The same from a shard's status. A shard that has read its replay back counts too few rows until its next request; by that count,
+    /// the other shards would serve more rows than the replay ratio allows.
+    pub(super) fn record_status(&mut self, status: &ReplayStatus, rows_received: u64) {
+        let rows_sampled = status.rows_sampled.max(rows_received);
+        let counts = ShardCounts::new(status.transitions_inserted, rows_sampled);
+        self.record_counts(counts, status.transitions_held);
     }
 
     /// Whether to fetch the counts again: other shards must not decide by old counts, and an empty shard may have received transitions.
@@ -352,6 +360,19 @@ mod tests {
         assert!(shard_state(9, 0, 0, 0).is_stale(now), "it was never asked");
         assert!(!is_stale(9, 400) && is_stale(9, 600));
         assert!(!is_stale(0, 40) && is_stale(0, 60));
+    }
+
+    #[test]
+    fn a_shard_that_restarted_has_sampled_what_came_from_it() {
+        for (rows_sampled, expected) in [(64, 96), (128, 128)] {
+            let mut state = shard_state(0, 0, 0, 0);
+            let status = ReplayStatus {
+                rows_sampled,
+                ..ReplayStatus::default()
+            };
+            state.record_status(&status, 96);
+            assert_eq!(state.counts.rows_sampled, expected);
+        }
     }
 
     #[test]
