@@ -66,8 +66,8 @@ pub fn check_listening(endpoint: &str) -> Result<(), Unreachable> {
     }
 }
 
-/// Returns the error that tells most of those of a host's addresses. A server may still run at an address that does not answer; other
-/// errors than these two kinds say only that this machine has no route to the address, as where it lacks IPv6.
+/// Returns the error that tells most about a host with several addresses. A server may still run at an address that does not answer.
+/// Errors of rank 0 say only that this machine has no route to the address, as where it lacks IPv6.
 fn most_telling(errors: Vec<std::io::Error>) -> Option<std::io::Error> {
     let rank = |e: &std::io::Error| match e.kind() {
         ErrorKind::TimedOut | ErrorKind::HostUnreachable => 2,

@@ -148,7 +148,7 @@ impl ShardState {
         self.last_seen = Some(Instant::now());
     }
 
-    /// The same from a shard's status. A shard that has read its replay back counts too few rows until its next request; by that count,
+    /// The same from a shard's status. A shard that has read its replay back counts too few rows until its next request. By that count,
     /// the other shards would serve more rows than the replay ratio allows.
     pub(super) fn record_status(&mut self, status: &ReplayStatus, rows_received: u64) {
         let rows_sampled = status.rows_sampled.max(rows_received);
