@@ -4,7 +4,6 @@
 use driml_envs::StepEnd;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 
-/// Converts the end of a step to its wire format.
 const fn wire_end(end: StepEnd) -> End {
     match end {
         StepEnd::Running => End::Running,

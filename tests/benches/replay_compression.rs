@@ -83,7 +83,6 @@ fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: usize) {
     assert!(matches!(replay.insert(chunk), InsertReply::Stored { .. }));
 }
 
-/// Returns the mean time of `work`, in microseconds.
 fn mean_us(mut work: impl FnMut(usize)) -> f64 {
     let started = Instant::now();
     (0..CHUNKS).for_each(&mut work);

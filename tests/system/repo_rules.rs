@@ -18,7 +18,6 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("deploy", 31_240),
     ("tests", 10_410),
 ];
-/// The most lines of one file.
 const FILE_LINES_MAX: usize = 450;
 
 /// Each of our packages, its folder, and those of our packages that it may depend on; * for all. Dependencies of tests and benches count.
@@ -65,7 +64,6 @@ pub(crate) fn root() -> PathBuf {
         .into()
 }
 
-/// Returns the folders of our packages.
 pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
     allowed_dependencies().map(|(_, folder, _)| folder)
 }

@@ -25,7 +25,6 @@ enum Stop {
     Interrupt,
     /// The launcher is killed; its processes end by themselves.
     KillLauncher,
-    /// All processes are killed.
     KillAll,
     /// A process is killed, and the run fails. A replay server with its replay on disk is restarted instead.
     Kill(&'static str),

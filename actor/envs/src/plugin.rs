@@ -54,7 +54,6 @@ fn registered() -> &'static [CustomKind] {
     REGISTERED.get().map_or(&[], Vec::as_slice)
 }
 
-/// The names of all registered worlds.
 pub(crate) fn registered_names() -> impl Iterator<Item = &'static str> {
     registered().iter().map(|kind| kind.name)
 }

@@ -184,7 +184,6 @@ impl WorldName {
         self.variant.filter(|_| self.variants().is_free_text)
     }
 
-    /// The variants of the world's kind.
     fn variants(self) -> Variants {
         let known = KINDS.iter().find(|(kind, _)| *kind == self.kind);
         known.map(|(_, variants)| variants()).unwrap_or_default()

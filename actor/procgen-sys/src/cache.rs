@@ -10,7 +10,6 @@ use nix::unistd::geteuid;
 
 use crate::error::ProcgenError;
 
-/// The cache folder and whether fetching is allowed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Cache {
     /// The folder under which each version of the engine has its own.

@@ -125,7 +125,6 @@ impl LibenvTensortype {
     }
 }
 
-/// Returns the name, dtype and shape of a tensor in one line.
 pub(crate) fn describe_tensor(name: &str, dtype: u32, shape: &[i32]) -> String {
     format!("{name} (dtype {dtype}) {shape:?}")
 }

@@ -54,7 +54,6 @@ impl Delivery {
         })
     }
 
-    /// Returns the progress as of the last reply.
     pub(crate) fn progress(&self) -> Progress {
         *lock(&self.state.progress)
     }

@@ -139,7 +139,6 @@ impl Batch {
         }
     }
 
-    /// The header of [`Batch::merge`].
     fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
         // The fields that all parts must share.
         let shape = |it: &BatchHeader| {

@@ -53,7 +53,6 @@ impl StackedFrames {
         frame_numbers(stacks).find(|number| *number >= self.frames)
     }
 
-    /// Writes the frame numbers `frames` of all states into `stacks`.
     pub(super) fn write_numbers(stacks: &mut [u8], frames: &[u32]) {
         let (places, _) = stacks.as_chunks_mut::<{ size_of::<FrameNumber>() }>();
         assert_eq!(places.len(), frames.len(), "a number for each place");
@@ -62,7 +61,6 @@ impl StackedFrames {
         }
     }
 
-    /// Adds `frames` to every number in `stacks`.
     pub(super) fn shift_numbers(stacks: &mut [u8], frames: u32) {
         for place in stacks.as_chunks_mut().0 {
             *place = (u32::from_le_bytes(*place) + frames).to_le_bytes();

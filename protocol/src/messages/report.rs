@@ -13,7 +13,6 @@ use crate::wire::{
 
 /// Most bytes of the description of what a process does.
 const DOING_BYTES_MAX: usize = 80;
-/// Most bytes of a warning in a report.
 const WARNING_BYTES_MAX: usize = 400;
 /// Most processes whose last warning is in a status: those with the newest warnings.
 pub const WARNINGS_MAX: usize = 64;

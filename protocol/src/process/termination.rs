@@ -18,7 +18,6 @@ use super::{fail_point, spawn};
 /// How often a process checks whether its parent and the reader of stderr still exist.
 const CHECK_PERIOD: Duration = Duration::from_millis(500);
 
-/// A reason for a process to exit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ExitReason {
     /// A request: SIGINT (Ctrl-C) or SIGTERM.

@@ -96,7 +96,6 @@ pub(crate) fn batch() -> Batch {
     batch_from(None)
 }
 
-/// The sample batch with rows drawn by priority.
 pub(crate) fn prioritised_batch() -> Batch {
     let mut batch = batch_from(Some(ORIGIN));
     batch.set_draws(&[(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)]);

@@ -99,7 +99,6 @@ pub struct PersistArgs {
     pub mark: Option<Mark>,
 }
 
-/// The size limits of a log, and how often it is flushed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LogLimits {
     /// Size from which a segment is followed by another.

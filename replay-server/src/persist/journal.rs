@@ -51,7 +51,6 @@ pub(super) struct LogPosition {
 
 struct WriteFailure {
     since: Instant,
-    /// The text of the last error.
     why: String,
 }
 

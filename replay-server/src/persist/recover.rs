@@ -19,7 +19,6 @@ use super::{
 };
 use crate::{replay::Replay, storage::pack::Packer};
 
-/// The file extension of a segment that cannot be used.
 const UNUSABLE_EXTENSION: &str = "unusable";
 /// Period between log lines about the progress.
 const LOG_PERIOD: Duration = Duration::from_secs(5);

@@ -130,7 +130,6 @@ impl Replay {
 
 /// Snapshots of the state.
 impl Replay {
-    /// Returns the replay's state without the transitions.
     pub(crate) fn snapshot(&self) -> Snapshot {
         Snapshot {
             inserted: self.ring.inserted(),

@@ -125,7 +125,6 @@ pub(super) struct ParkedRequest<Q> {
 }
 
 impl<Q> ParkedRequest<Q> {
-    /// Returns how much longer the request may stay parked.
     pub(super) fn time_left(&self, now: Instant) -> Duration {
         let is_part = self.request.other_shards.is_some();
         let hold_max = if is_part { PART_HOLD_MAX } else { HOLD_MAX };

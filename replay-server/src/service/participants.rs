@@ -139,7 +139,6 @@ impl Participants {
         (self.waiting.0, elapsed_s(now, self.waiting.1))
     }
 
-    /// Returns the seconds since the server started.
     pub(super) fn up_s(&self, now: Instant) -> f64 {
         elapsed_s(now, self.started)
     }

@@ -88,13 +88,11 @@ impl Timings {
         self.versions.iter_mut().for_each(|(.., at)| *at += stop);
     }
 
-    /// Returns the seconds since the newest weights arrived.
     pub(super) fn weights_age_s(&self, now: Instant) -> Option<f64> {
         let (_, _, arrived) = self.versions.back()?;
         Some(now.saturating_duration_since(*arrived).as_secs_f64())
     }
 
-    /// Sets the timing fields of a status.
     pub(super) fn fill_status(&self, status: &mut ReplayStatus) {
         status.answer_ms = self.replies.quantiles(1e3);
         status.insert_ms = self.inserts.quantiles(1e3);

@@ -82,7 +82,6 @@ impl PackedChunk<'_> {
         self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + bytes.sum::<usize>()
     }
 
-    /// Returns the frames of one of the chunk's streams.
     pub(crate) fn stream_frames(&self, stream: usize) -> StreamFrames<'_> {
         match self.blocks.get(stream) {
             Some(blocks) => StreamFrames::Packed(blocks),
@@ -124,7 +123,6 @@ impl BlockLayout {
         }
     }
 
-    /// Returns the maximum frames of a block.
     const fn block_frames_max(&self) -> usize {
         1 + PARTS_MAX * self.part_frames
     }

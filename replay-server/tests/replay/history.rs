@@ -196,7 +196,6 @@ impl History {
         ends || t + reach < records.len()
     }
 
-    /// Returns every valid anchor.
     pub(crate) fn valid_anchors(&self) -> Vec<(StreamKey, usize)> {
         let all = self
             .streams

@@ -51,7 +51,6 @@ impl NumberReader<'_> {
     }
 }
 
-/// Returns the spec of a run with frames of `frame_bytes` bytes.
 pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     RunSpec {
         agent: "driml-ada".into(),

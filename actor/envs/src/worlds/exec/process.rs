@@ -51,7 +51,6 @@ pub(super) struct Exchange {
     pub(super) doing: &'static str,
     /// The time-out of each reply.
     pub(super) timeout: Duration,
-    /// The setting that changes `timeout`.
     pub(super) timeout_setting: &'static str,
 }
 
@@ -60,7 +59,6 @@ pub(super) struct Exchange {
 /// The guard leads a process group that both belong to. What the command starts ends with the group, unless it leaves the group.
 pub(super) struct WorldProcess {
     command: String,
-    /// The current exchange.
     pub(super) exchange: Exchange,
     guard: Child,
     child: Child,
@@ -230,7 +228,6 @@ impl WorldProcess {
         EnvError::Exec(format!("the world `{}` {how}{tail}", self.command))
     }
 
-    /// Returns the error for an error of the operating system.
     pub(super) fn io_error(&self, source: &io::Error) -> EnvError {
         let doing = self.exchange.doing;
         self.error(&format!("cannot be used: {doing}: {source}"))

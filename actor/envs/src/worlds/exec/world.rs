@@ -52,7 +52,6 @@ pub struct ExecWorld {
     block: Block,
     config: ExecConfig,
     num_envs: usize,
-    /// Whether the process offers to save its state.
     can_save: bool,
 }
 

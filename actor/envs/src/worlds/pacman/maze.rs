@@ -41,7 +41,6 @@ const LAYOUT: [&[u8; WIDTH]; HEIGHT] = [
     b"###################",
 ];
 
-/// The only maze.
 pub(crate) static MAZE: LazyLock<Maze> = LazyLock::new(Maze::new);
 
 /// A way out of a cell; `direction ^ 1` is its opposite.

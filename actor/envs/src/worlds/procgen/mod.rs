@@ -46,7 +46,6 @@ use shrink::{FrameShrinker, RGB};
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
 
-/// The smallest side of a frame.
 const SIDE_MIN: u32 = 8;
 
 /// Resets in a row that may fail to draw a level of the set before it is an error. One is enough unless the game's
@@ -62,7 +61,6 @@ pub struct ProcgenWorld {
     time_limit_steps: u32,
     /// Keeps sequential levels in their set; `None` without sequential levels, where the engine does so itself.
     level_set: Option<LevelSet>,
-    /// The shape of this world's frames.
     shape: FrameShape,
     /// Makes frames smaller or grey; `None` if this world's frames are the engine's.
     shrinker: Option<FrameShrinker>,
