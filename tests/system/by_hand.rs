@@ -12,7 +12,7 @@ use crate::{
     closed_terminal::skipped_under_nohup,
     failures::interrupt_until_it_ends,
     leftovers::{check_removed, shared_memory},
-    system,
+    system, tls_system,
 };
 
 /// Starts a run by hand, and checks that its processes find each other and exit in order.
@@ -55,7 +55,7 @@ fn processes_find_each_other_and_end_in_order() {
 
 #[test]
 fn so_they_do_over_tls() {
-    if let Some(system) = system().over_tls() {
+    if let Some(system) = tls_system() {
         check_whole_run(&system);
     }
 }

@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, fs};
 
 use driml_tests::{Outcome, Summary, TestSystem, check_has, wait_until};
 
-use crate::{LONG, PATIENT, SHORT, chain, listen_on_free_port, system};
+use crate::{LONG, PATIENT, SHORT, chain, listen_on_free_port, system, tls_system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
@@ -140,7 +140,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
 /// The run's own processes connect through a unix socket.
 #[test]
 fn an_actor_from_elsewhere_plays_over_tls() {
-    if let Some(system) = system().over_tls() {
+    if let Some(system) = tls_system() {
         plays_with_an_actor_from_elsewhere(&system);
     }
 }

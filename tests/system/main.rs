@@ -53,6 +53,11 @@ fn system() -> TestSystem {
     TestSystem::new(env!("CARGO_BIN_EXE_driml-under-test"))
 }
 
+/// As [`system`], over TLS; `None` without openssl.
+fn tls_system() -> Option<TestSystem> {
+    system().over_tls()
+}
+
 /// Returns an unused endpoint and its listener. The loopback address belongs to this process, so no other takes the port meanwhile.
 fn listen_on_free_port() -> (String, TcpListener) {
     let [_, high, middle, low] = std::process::id().to_be_bytes();

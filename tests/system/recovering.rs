@@ -18,7 +18,7 @@ use serde_json::Value;
 use crate::{
     refusals::{Row, batch_request, check_replies, upload},
     status::status_text,
-    system, tiny_replay,
+    system, tiny_replay, tls_system,
 };
 
 /// Transitions in a log, one record each. A slow machine reads them for longer than the time-out for an unreachable server.
@@ -288,9 +288,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
 /// Each role receives the progress in place of the reply.
 #[test]
 fn roles_are_told_too() {
-    let Some(system) = system().over_tls() else {
-        return;
-    };
+    let Some(system) = tls_system() else { return };
     let (_, serve) = prepare_log(&system);
     let mut server = system.start_replay_server(&serve);
     let slow = slow_down(&mut server);

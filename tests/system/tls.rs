@@ -6,7 +6,7 @@ use driml_tests::{
 };
 use zenoh::{Session, Wait};
 
-use crate::{LONG, PATIENT, system};
+use crate::{LONG, PATIENT, tls_system};
 
 /// Copies the good certificates to another folder, where a test can make them invalid.
 fn tls_copy(system: &TestSystem, name: &str) -> Certificates {
@@ -49,9 +49,7 @@ fn open_raw(
 /// Files that are wrong are named before anything is sent.
 #[test]
 fn own_files_that_cannot_be_used() {
-    let Some(system) = system().over_tls() else {
-        return;
-    };
+    let Some(system) = tls_system() else { return };
     let key = tls_copy(&system, "key").path("actor-0.key");
     std::fs::copy(system.path("tls/actor-1.key"), key).unwrap();
     std::fs::write(tls_copy(&system, "garbage").path("learner.key"), "no key").unwrap();
@@ -97,9 +95,7 @@ fn own_files_that_cannot_be_used() {
 /// A replay server rejects each certificate that is not good, and logs why; accepted connections stay.
 #[test]
 fn strangers_at_a_replay_server() {
-    let Some(system) = system().over_tls() else {
-        return;
-    };
+    let Some(system) = tls_system() else { return };
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG} {PATIENT}"));
     let observer = system.connect();
     let (learner, actor) = (system.start_learner("run"), system.start_actor(1));
@@ -147,9 +143,7 @@ fn strangers_at_a_replay_server() {
 /// A process does not join a stranger in place of its replay server, and names the endpoint.
 #[test]
 fn strangers_in_the_place_of_a_replay_server() {
-    let Some(system) = system().over_tls() else {
-        return;
-    };
+    let Some(system) = tls_system() else { return };
     let old = tls_copy(&system, "old").sign_again("replay-server", EXPIRED);
     let new = tls_copy(&system, "new").sign_again("replay-server", FUTURE);
     let foreign = Certificates::make(system.path("foreign"), "");
@@ -195,9 +189,7 @@ fn strangers_in_the_place_of_a_replay_server() {
 /// For every role that has a file in the folder, the report says whether it can be used, and what to do if not.
 #[test]
 fn the_doctor_looks_at_certificates() {
-    let Some(system) = system().over_tls() else {
-        return;
-    };
+    let Some(system) = tls_system() else { return };
     let doctor = |dir: &str| system.run(&format!("doctor --tls-dir {dir}"));
     let well = doctor("tls");
     let check_line = |exit: &Exit, state: &str, what: &str, words: &str| {

@@ -17,7 +17,7 @@ use super::{
     NO_REPLY, Row, affinity, batch_request, check_continues, check_replies, chunk_header, encoded,
     upload,
 };
-use crate::{LONG, system};
+use crate::{LONG, tls_system};
 
 /// A run over TLS, and an observer.
 struct TlsRun {
@@ -29,7 +29,7 @@ struct TlsRun {
 
 impl TlsRun {
     fn new() -> Option<Self> {
-        let system = system().over_tls()?;
+        let system = tls_system()?;
         let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
         let processes = [system.start_learner("run"), system.start_actor(0)];
         let observer = system.connect();
