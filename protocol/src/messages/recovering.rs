@@ -33,22 +33,13 @@ impl fmt::Display for RecoveryProgress {
 }
 
 /// The replay server cannot answer yet, because it is reading its replay back. The query had no effect.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, thiserror::Error)]
+#[error("the replay server reads its replay back from disk, {progress}")]
 pub struct Recovering {
     /// The progress of the reading.
     pub progress: RecoveryProgress,
     /// The run's resolved settings, TOML, from which a status shows which run this is.
     pub config_toml: String,
-}
-
-impl fmt::Display for Recovering {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let progress = self.progress;
-        write!(
-            f,
-            "the replay server reads its replay back from disk, {progress}"
-        )
-    }
 }
 
 impl Recovering {

@@ -38,7 +38,7 @@ pub enum SessionError {
     #[error("{key}: no answer within {within_ms} ms")]
     TimedOut { key: String, within_ms: u128 },
     /// The replay server runs, but still reads its replay back from disk. It answers afterwards, so a caller may wait without a limit.
-    #[error("{0}")]
+    #[error(transparent)]
     Recovering(Recovering),
     #[error("{key}: {why}")]
     Unreadable { key: String, why: CodecError },
