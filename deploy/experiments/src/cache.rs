@@ -132,7 +132,12 @@ impl Session {
     }
 
     pub(crate) fn store<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
-        self.write(key, "", 0.0, &result)
+        let piece = StoredPiece {
+            of: String::new(),
+            seconds: 0.0,
+            result,
+        };
+        self.write(key, &piece)
     }
 
     fn read<T: DeserializeOwned>(&self, key: &str) -> Option<StoredPiece<T>> {
@@ -140,19 +145,8 @@ impl Session {
         serde_json::from_slice(&text).ok()
     }
 
-    fn write(
-        &self,
-        key: &str,
-        source: &str,
-        seconds: f64,
-        result: &impl Serialize,
-    ) -> anyhow::Result<()> {
-        let piece = StoredPiece {
-            of: source.to_owned(),
-            seconds,
-            result,
-        };
-        let text = serde_json::to_vec(&piece).context("encoding a piece")?;
+    fn write(&self, key: &str, piece: &StoredPiece<impl Serialize>) -> anyhow::Result<()> {
+        let text = serde_json::to_vec(piece).context("encoding a piece")?;
         Ok(output::write_file("--out", &self.piece_path(key), &text)?)
     }
 
@@ -211,15 +205,18 @@ impl Session {
         };
         self.progress.set_task(key);
         let (started, before) = (Instant::now(), self.progress.done());
-        let result = make(&mut self.progress).inspect_err(report_stop)?;
-        let seconds = started.elapsed().as_secs_f64();
-        self.write(key, source, seconds, &result)?;
-        self.seconds.insert(key.to_owned(), seconds);
+        let piece = StoredPiece {
+            result: make(&mut self.progress).inspect_err(report_stop)?,
+            of: source.to_owned(),
+            seconds: started.elapsed().as_secs_f64(),
+        };
+        self.write(key, &piece)?;
+        self.seconds.insert(key.to_owned(), piece.seconds);
         // Counts the units that `make` did not count. This comes after the write, so that an interrupt here does not lose the piece.
         let rest = units.saturating_sub(self.progress.done() - before);
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
         counted.inspect_err(report_stop)?;
-        Ok(result)
+        Ok(piece.result)
     }
 
     /// Like [`Session::load_or_make`] for what this program computes from `inputs`. For a report, pieces of other programs are valid too.
