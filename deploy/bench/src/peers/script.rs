@@ -55,16 +55,12 @@ impl Script {
         flags: &BenchFlags,
         frames: &Path,
     ) -> Self {
-        let (peer, module, file) = match component {
-            Component::Learner => ("PyTorch", "torch", "torch_update.py"),
-            Component::Policy => ("PyTorch", "torch", "torch_policy.py"),
-            Component::Replay => ("Reverb", "reverb", "reverb_replay.py"),
-            Component::Env => ("gym3", "procgen", "gym3_steps.py"),
-        };
-        let (short_name, own) = match component {
-            Component::Learner | Component::Policy => ("torch", &args.torch_python),
-            Component::Replay => ("reverb", &args.reverb_python),
-            Component::Env => ("gym3", &args.gym3_python),
+        let (torch, reverb, gym3) = (&args.torch_python, &args.reverb_python, &args.gym3_python);
+        let (peer, module, short_name, file, own) = match component {
+            Component::Learner => ("PyTorch", "torch", "torch", "torch_update.py", torch),
+            Component::Policy => ("PyTorch", "torch", "torch", "torch_policy.py", torch),
+            Component::Replay => ("Reverb", "reverb", "reverb", "reverb_replay.py", reverb),
+            Component::Env => ("gym3", "procgen", "gym3", "gym3_steps.py", gym3),
         };
         let mut words = vec!["--threads".to_owned(), flags.threads.to_string()];
         words.extend(flags.quick.then(|| "--quick".to_owned()));
