@@ -30,6 +30,16 @@ pub struct Incarnation {
 }
 
 impl Incarnation {
+    /// The first incarnation of an actor, in a run that starts from its first update.
+    pub const fn first(actor: u32, id: u64) -> Self {
+        Self {
+            actor,
+            id,
+            after_updates: 0,
+            earlier_incarnations: 0,
+        }
+    }
+
     /// Returns the seed of the generator for `purpose`. Incarnations that differ in `actor`, `after_updates` or
     /// `earlier_incarnations` get different seeds, whatever the values of these fields.
     pub fn seed(&self, spec: &RunSpec, purpose: &str) -> [u8; 32] {
@@ -179,12 +189,7 @@ mod tests {
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
-    const FIRST: Incarnation = Incarnation {
-        actor: 3,
-        id: 1,
-        after_updates: 0,
-        earlier_incarnations: 0,
-    };
+    const FIRST: Incarnation = Incarnation::first(3, 1);
 
     /// The preset `smoke` on the chain, with more environments and a constant epsilon.
     fn settings(epsilon: f64) -> ActorSettings {

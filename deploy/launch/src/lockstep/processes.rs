@@ -168,12 +168,7 @@ impl Lockstep {
         let settings = ActorSettings::from_toml(&config.to_toml())?;
         let (header, safetensors) = &turn.acting;
         let actor = |actor| {
-            let incarnation = Incarnation {
-                actor,
-                id: INCARNATION,
-                after_updates: 0,
-                earlier_incarnations: 0,
-            };
+            let incarnation = Incarnation::first(actor, INCARNATION);
             let pool = BufferPool::new(1);
             Collector::new(&settings, pool, incarnation, header.version, safetensors)
         };

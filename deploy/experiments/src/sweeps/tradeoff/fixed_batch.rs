@@ -26,12 +26,7 @@ pub(super) fn sample(
     let actor = &mut settings.actor;
     (actor.envs, actor.epsilon_ladder) = (ENVS, None);
     (actor.epsilon_start, actor.epsilon_end) = (epsilon, epsilon);
-    let first = Incarnation {
-        actor: 0,
-        id: 1,
-        after_updates: 0,
-        earlier_incarnations: 0,
-    };
+    let first = Incarnation::first(0, 1);
     let mut actor = Collector::new(&settings, BufferPool::new(1), first, 0, weights)?;
     let held = Config::unlimited((ENVS * CHUNKS * CHUNK_STEPS).into());
     let mut replay = Replay::new(&settings.spec, &held, config.learner.batch_size)?;
