@@ -44,13 +44,6 @@ impl TrainCall {
         given.flatten().collect()
     }
 
-    pub(crate) fn with_seed(&self, seed: u32) -> Self {
-        Self {
-            seed,
-            ..self.clone()
-        }
-    }
-
     /// Resolves the settings for this machine, whatever memory is free now.
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
         self.config_within(u64::MAX)

@@ -79,7 +79,8 @@ impl Runs {
             found.expect("a run's settings have a table [run]").0
         };
         for (_, plan) in plans {
-            let (folder, call) = (self.folder(plan), plan.call.with_seed(1));
+            let (folder, mut call) = (self.folder(plan), plan.call.clone());
+            call.seed = 1;
             // The queue begins other runs again.
             let is_used = self.get_finished(plan).is_some() || folder.newest_checkpoint().is_some();
             if !self.is_made_by(plan) || !is_used {

@@ -116,13 +116,9 @@ impl Results {
 /// Returns the number and the return of each training episode.
 fn training_returns(folder: &RunFolder) -> anyhow::Result<Points> {
     let episodes = Table::read(&folder.episodes())?;
-    let of = |row| {
-        Some((
-            episodes.value(row, "episode")?,
-            episodes.value(row, "return")?,
-        ))
-    };
-    Ok(episodes.rows.iter().filter_map(of).collect())
+    let value = |row, name| episodes.value(row, name);
+    let point = |row| value(row, "episode").zip(value(row, "return"));
+    Ok(episodes.rows.iter().filter_map(point).collect())
 }
 
 fn mean_from(points: &Points, frames: f64) -> Option<f64> {

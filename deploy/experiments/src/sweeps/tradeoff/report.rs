@@ -11,7 +11,10 @@ use serde::Serialize;
 use super::{
     measured,
     menu::Common,
-    results::{FRAMES_PER_SECOND, GREEDY, MEASURES, Measure, PointResult, Results, Row, TRAINING},
+    results::{
+        FRAMES_PER_SECOND, GREEDY, MEASURES, Measure, PointResult, Results, Row, SeedResult,
+        TRAINING,
+    },
 };
 use crate::{
     cache::Session,
@@ -111,18 +114,13 @@ impl EqualTime {
             mean(&ends.map(|end| end.0).collect::<Vec<_>>())
         });
         let seconds = base?.min(level?);
-        let then = sides.map(|point| -> Vec<f64> {
-            let seeds = point.uninterrupted();
-            seeds
-                .filter_map(|it| value_at(&it.curve, seconds))
-                .collect()
-        });
+        let at_seconds = |it: &SeedResult| value_at(&it.curve, seconds);
         let comparison = Self {
             agent: row.point.agent.clone(),
             base: row.dial.agent.clone(),
             seconds,
             end: sides.map(|point| point.values(TRAINING)),
-            then,
+            then: sides.map(|it| it.uninterrupted().filter_map(at_seconds).collect()),
         };
         (!comparison.then.iter().any(Vec::is_empty)).then_some(comparison)
     }
