@@ -288,11 +288,8 @@ impl Screen {
     /// Writes one line. A line about a full disk is left out if another one was written less than ten minutes ago.
     pub fn print_line(&self, text: &str) {
         let is_full = FULL_DISK_CAUSES.iter().any(|it| text.contains(it));
-        if is_full
-            && lock(&self.full_disk)
-                .admit_within(FULL_DISK_PERIOD)
-                .is_none()
-        {
+        let admitted = || lock(&self.full_disk).admit_within(FULL_DISK_PERIOD);
+        if is_full && admitted().is_none() {
             return;
         }
         match &self.bar {

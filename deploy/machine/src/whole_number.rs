@@ -24,10 +24,8 @@ pub fn read(text: &str) -> Result<u64, String> {
         true => 0,
         false => zeros.min(20),
     };
-    let digits = digits + &"0".repeat(zeros);
-    digits
-        .parse()
-        .map_err(|_| format!("{text} is more than {}", u64::MAX))
+    let number = (digits + &"0".repeat(zeros)).parse();
+    number.map_err(|_| format!("{text} is more than {}", u64::MAX))
 }
 
 /// Returns a parser for a flag whose value is a whole number in `range`.

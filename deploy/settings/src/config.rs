@@ -101,14 +101,12 @@ impl RunConfig {
         let [before, after] = [0, 1].map(|at| BTreeMap::from_iter(leaves(&tables[at])));
         let differs = |path: &&String| before.get(*path) != after.get(*path);
         let is_kept = |path: &&String| !path.ends_with("_timeout_ms") && differs(path);
-        ["world.", "run.", "learner.update.auxiliary_loss"]
-            .into_iter()
-            .find_map(|table| {
-                let mut paths = before.keys().chain(after.keys());
-                paths
-                    .find(|path| path.starts_with(table) && is_kept(path))
-                    .cloned()
-            })
+        let of_task = ["world.", "run.", "learner.update.auxiliary_loss"];
+        of_task.into_iter().find_map(|table| {
+            let mut paths = before.keys().chain(after.keys());
+            let found = paths.find(|path| path.starts_with(table) && is_kept(path));
+            found.cloned()
+        })
     }
 
     /// Reads every table into its component's Config. The derived settings must be in `table`.

@@ -168,9 +168,8 @@ impl RunFolder {
     pub(crate) fn check_intact(&self) -> anyhow::Result<()> {
         let files = [self.config(), self.metrics(), self.episodes()];
         // An error of a network file system may be temporary.
-        let missing = files
-            .iter()
-            .filter(|it| matches!(it.try_exists(), Ok(false)));
+        let is_missing = |it: &&PathBuf| matches!(it.try_exists(), Ok(false));
+        let missing = files.iter().filter(is_missing);
         let missing: Vec<_> = missing.map(|it| it.display().to_string()).collect();
         anyhow::ensure!(
             missing.is_empty(),
