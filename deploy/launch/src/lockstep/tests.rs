@@ -20,10 +20,7 @@ fn sha256(lockstep: &Lockstep) -> String {
 }
 
 fn weights(config: &RunConfig) -> String {
-    ended(Lockstep::in_memory(config).unwrap())
-}
-
-fn ended(mut lockstep: Lockstep) -> String {
+    let mut lockstep = Lockstep::in_memory(config).unwrap();
     while lockstep.run_round().unwrap() {}
     lockstep.finish().unwrap();
     sha256(&lockstep)
