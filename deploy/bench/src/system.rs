@@ -218,7 +218,7 @@ impl Run {
     /// Returns the first sample after the learner's warm-up, and the last one at which both sides were still at work.
     fn watch_to_end(&mut self) -> anyhow::Result<[StatusSample; 2]> {
         let (mut first, mut last) = (None, None);
-        // The run ends by itself; then it no longer answers.
+        // The run ends by itself; then it does not answer.
         while let Ok(sample) = self.sample_status() {
             thread::sleep(POLL_INTERVAL);
             let Some(sample) = sample else { continue };

@@ -21,7 +21,7 @@ pub struct Film<W: Write> {
 }
 
 impl<W: Write> Film<W> {
-    /// Begins a film of pictures of `size` (width, height), shown at `pictures_per_second`, `to` receives the bytes of the file.
+    /// Begins a film of pictures of `size` (width, height), shown at `pictures_per_second`. `to` receives the bytes of the file.
     ///
     /// # Panics
     /// A side is above 65,535 pixels, the most that a GIF can have.

@@ -94,7 +94,7 @@ pub fn leave() {
     }
 }
 
-/// Removes this user's folders in `parent` that are no longer in use. A folder that cannot be removed stays and does no harm.
+/// Removes this user's folders in `parent` that no process uses. A folder that cannot be removed stays and does no harm.
 fn remove_unused(parent: &Path) {
     let entries = fs::read_dir(parent).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
