@@ -3,9 +3,11 @@
 #![cfg(target_arch = "x86_64")]
 
 use std::arch::x86_64::{
-    __cpuid, __m512, __m512bh, __m512i, _mm512_add_ps, _mm512_dpbf16_ps, _mm512_fmadd_ps,
-    _mm512_loadu_ps, _mm512_loadu_si512, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps,
-    _mm512_set1_epi32, _mm512_set1_ps, _mm512_setzero_ps, _mm512_shuffle_i32x4,
+    __cpuid, __m256, __m256bh, __m256i, __m512, __m512bh, __m512i, _mm256_add_ps, _mm256_dpbf16_ps,
+    _mm256_fmadd_ps, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_mask_storeu_ps,
+    _mm256_maskz_loadu_ps, _mm256_set1_epi32, _mm256_set1_ps, _mm512_add_ps, _mm512_dpbf16_ps,
+    _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_loadu_si512, _mm512_mask_storeu_ps,
+    _mm512_maskz_loadu_ps, _mm512_set1_epi32, _mm512_set1_ps, _mm512_shuffle_i32x4,
     _mm512_storeu_si512, _mm512_unpackhi_epi32, _mm512_unpackhi_epi64, _mm512_unpacklo_epi32,
     _mm512_unpacklo_epi64,
 };
@@ -14,7 +16,6 @@ use std::mem::transmute;
 use half::bf16;
 
 use super::{
-    avx512_half::{self, HALF},
     avx512_rounding::{self, first_lanes},
     element::Rounding,
     simd::{LANES, Loop, RawTile, Simd},
@@ -127,15 +128,10 @@ macro_rules! simd {
     };
 }
 
-simd!(
-    F32,
-    avx512_half::F32,
-    f32,
-    "avx512f,avx512bw,avx512dq,avx512vl,fma"
-);
+simd!(F32, HalfF32, f32, "avx512f,avx512bw,avx512dq,avx512vl,fma");
 simd!(
     Bf16,
-    avx512_half::Bf16,
+    HalfBf16,
     bf16,
     "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,fma"
 );
@@ -226,79 +222,107 @@ unsafe fn transpose_block(block: &mut [[u32; LANES]; LANES]) {
     }
 }
 
-impl Sums for __m512 {
-    #[inline(always)]
-    unsafe fn zero() -> Self {
-        unsafe { _mm512_setzero_ps() }
-    }
+/// Vectors of half a register, for tiles of at most [`HALF`] columns, as the first stage of a narrow residual torso has. A processor that
+/// executes instructions on whole registers in two halves, such as Zen 4, then needs half the time.
+#[derive(Clone, Copy)]
+enum HalfF32 {}
 
-    #[inline(always)]
-    unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
-        debug_assert!(count <= LANES);
-        let mask = first_lanes(count);
-        // SAFETY: the mask excludes lanes that must not be accessed; the caller guarantees the others.
-        unsafe {
-            let sums = if add {
-                _mm512_add_ps(_mm512_maskz_loadu_ps(mask, at), self)
-            } else {
-                self
-            };
-            _mm512_mask_storeu_ps(at, mask, sums);
+/// [`HalfF32`] of bf16 operands in pairs.
+#[derive(Clone, Copy)]
+enum HalfBf16 {}
+
+const HALF: usize = LANES / 2;
+
+/// Defines the vectors of registers of one width by their types and intrinsics.
+macro_rules! vectors {
+    (
+        $f32:ty, $bf16:ty, $lanes:expr, $mask:ty, $floats:ty, $words:ty, $pairs:ty;
+        $set_float:ident $set_word:ident $load_floats:ident $load_words:ident $multiply:ident $multiply_pairs:ident
+        $add:ident $load_first:ident $store_first:ident
+    ) => {
+        impl Sums for $floats {
+            #[inline(always)]
+            unsafe fn zero() -> Self {
+                unsafe { $set_float(0.0) }
+            }
+
+            #[inline(always)]
+            unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
+                let mask = first_lanes(count.min($lanes)) as $mask;
+                // SAFETY: the mask excludes lanes that must not be accessed; the caller guarantees the others.
+                unsafe {
+                    let sums = if add {
+                        $add($load_first(mask, at), self)
+                    } else {
+                        self
+                    };
+                    $store_first(at, mask, sums);
+                }
+            }
         }
-    }
-}
 
-// SAFETY for both: loads and stores use addresses that the caller guarantees. None of them needs alignment.
+        // SAFETY for both: loads use addresses that the caller guarantees. None of them needs alignment.
 
-impl Vector for F32 {
-    type Element = f32;
-    type Sums = __m512;
-    type Operand = __m512;
-    const REGISTERS: usize = 32;
+        impl Vector for $f32 {
+            type Element = f32;
+            type Sums = $floats;
+            type Operand = $floats;
+            const REGISTERS: usize = 32;
 
-    #[inline(always)]
-    unsafe fn load_row(at: *const f32) -> __m512 {
-        unsafe { _mm512_set1_ps(*at) }
-    }
+            #[inline(always)]
+            unsafe fn load_row(at: *const f32) -> $floats {
+                unsafe { $set_float(*at) }
+            }
 
-    #[inline(always)]
-    unsafe fn load_columns(at: *const f32) -> __m512 {
-        unsafe { _mm512_loadu_ps(at) }
-    }
+            #[inline(always)]
+            unsafe fn load_columns(at: *const f32) -> $floats {
+                unsafe { $load_floats(at) }
+            }
 
-    #[inline(always)]
-    unsafe fn mul_add(sums: __m512, row: __m512, columns: __m512) -> __m512 {
-        unsafe { _mm512_fmadd_ps(row, columns, sums) }
-    }
-}
-
-impl Vector for Bf16 {
-    type Element = bf16;
-    type Sums = __m512;
-    type Operand = __m512i;
-    const REGISTERS: usize = 32;
-
-    #[inline(always)]
-    unsafe fn load_row(at: *const bf16) -> __m512i {
-        unsafe { _mm512_set1_epi32(at.cast::<i32>().read_unaligned()) }
-    }
-
-    #[inline(always)]
-    unsafe fn load_columns(at: *const bf16) -> __m512i {
-        unsafe { _mm512_loadu_si512(at.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sums: __m512, row: __m512i, columns: __m512i) -> __m512 {
-        // The row is the last argument, because the instruction can broadcast that one from memory. A
-        // separate broadcast takes a third of the loop's time.
-        // SAFETY: both types are one register of 32 bf16.
-        unsafe {
-            _mm512_dpbf16_ps(
-                sums,
-                transmute::<__m512i, __m512bh>(columns),
-                transmute::<__m512i, __m512bh>(row),
-            )
+            #[inline(always)]
+            unsafe fn mul_add(sums: $floats, row: $floats, columns: $floats) -> $floats {
+                unsafe { $multiply(row, columns, sums) }
+            }
         }
-    }
+
+        impl Vector for $bf16 {
+            type Element = bf16;
+            type Sums = $floats;
+            type Operand = $words;
+            const REGISTERS: usize = 32;
+
+            #[inline(always)]
+            unsafe fn load_row(at: *const bf16) -> $words {
+                unsafe { $set_word(at.cast::<i32>().read_unaligned()) }
+            }
+
+            #[inline(always)]
+            unsafe fn load_columns(at: *const bf16) -> $words {
+                unsafe { $load_words(at.cast()) }
+            }
+
+            #[inline(always)]
+            unsafe fn mul_add(sums: $floats, row: $words, columns: $words) -> $floats {
+                // The row is the last argument, because the instruction can broadcast that one from memory. A
+                // separate broadcast takes a third of the loop's time.
+                // SAFETY: both types are one register of bf16.
+                unsafe {
+                    let columns = transmute::<$words, $pairs>(columns);
+                    $multiply_pairs(sums, columns, transmute::<$words, $pairs>(row))
+                }
+            }
+        }
+    };
 }
+
+vectors!(
+    F32, Bf16, LANES, u16, __m512, __m512i, __m512bh;
+    _mm512_set1_ps _mm512_set1_epi32 _mm512_loadu_ps _mm512_loadu_si512 _mm512_fmadd_ps _mm512_dpbf16_ps
+    _mm512_add_ps _mm512_maskz_loadu_ps _mm512_mask_storeu_ps
+);
+
+vectors!(
+    HalfF32, HalfBf16, HALF, u8, __m256, __m256i, __m256bh;
+    _mm256_set1_ps _mm256_set1_epi32 _mm256_loadu_ps _mm256_loadu_si256 _mm256_fmadd_ps _mm256_dpbf16_ps
+    _mm256_add_ps _mm256_maskz_loadu_ps _mm256_mask_storeu_ps
+);

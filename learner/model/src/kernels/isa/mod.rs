@@ -5,7 +5,6 @@ mod amx;
 mod amx_tiles;
 mod avx2;
 mod avx512;
-mod avx512_half;
 mod avx512_rounding;
 pub(crate) mod dispatch;
 pub(crate) mod element;
