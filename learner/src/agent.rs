@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batch::Batch,
-    error::UpdateError,
+    error::{Result, UpdateError},
     losses_and_gradients::{Losses, LossesAndGradients, Networks, UpdateNoise, detached_logits},
     optimiser::{
         adam::Adam,
@@ -78,7 +78,7 @@ impl Agent {
         settings: UpdateSettings,
         compute: &Compute,
         rng: &mut ChaCha8Rng,
-    ) -> Result<Self, UpdateError> {
+    ) -> Result<Self> {
         let online = Parameters::init(&model, rng, &compute.device)?;
         let key = settings.make_auxiliary_loss()?.key_tau();
         let key = key.map(|_| online.copy_part(Encoder::has_parameter));
@@ -99,7 +99,7 @@ impl Agent {
         settings: UpdateSettings,
         compute: &Compute,
         parameters: NetworkParameters,
-    ) -> Result<Self, UpdateError> {
+    ) -> Result<Self> {
         settings.validate()?;
         let (online, target) = (parameters.online, parameters.target);
         let key_encoder = parameters.key_encoder;
@@ -208,7 +208,7 @@ impl Agent {
     }
 
     /// Copies the averaged weights, if any, into torso and head of the online network, for evaluation. Returns whether there were any.
-    pub fn copy_average_to_online(&mut self) -> Result<bool, UpdateError> {
+    pub fn copy_average_to_online(&mut self) -> Result<bool> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online().get(name) {
                 online.set(var)?;
@@ -221,7 +221,7 @@ impl Agent {
     ///
     /// # Errors
     /// A weight that is not finite, or too large for the type; a failing serialisation.
-    pub fn weights(&self, stored: WeightDtype) -> Result<Vec<u8>, UpdateError> {
+    pub fn weights(&self, stored: WeightDtype) -> Result<Vec<u8>> {
         Ok(self
             .online()
             .to_safetensors_as(stored, |name| !is_dim(name))?)
@@ -232,7 +232,7 @@ impl Agent {
     /// # Errors
     /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. [`UpdateError::Diverged`] if the
     /// step makes a parameter or moment infinite or NaN: the agent can then neither learn nor be published or saved.
-    pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+    pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport> {
         fail_point::hold(self.updates());
         // Runs on a thread of the pool: from another thread, each matrix product would cost a switch to the pool and back.
         rayon::scope(|_| {
@@ -249,7 +249,7 @@ impl Agent {
     }
 
     /// Checks that `batch` fits this network and this auxiliary loss.
-    pub(crate) fn check_batch(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
+    pub(crate) fn check_batch(&self, batch: &Batch<'_>) -> Result<()> {
         batch.validate(self.model(), self.settings().auxiliary_loss.positives())
     }
 
@@ -262,7 +262,7 @@ impl Agent {
     ///
     /// # Errors
     /// A batch that does not fit, or losses that are not finite.
-    pub fn gradients(&self, batch: &Batch<'_>) -> Result<LossesAndGradients, UpdateError> {
+    pub fn gradients(&self, batch: &Batch<'_>) -> Result<LossesAndGradients> {
         self.gradients_with(batch, &self.noise())
     }
 
@@ -274,14 +274,14 @@ impl Agent {
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
-    ) -> Result<LossesAndGradients, UpdateError> {
+    ) -> Result<LossesAndGradients> {
         self.check_batch(batch)?;
         self.networks.gradients(batch, noise)
     }
 
     /// Q-values [B, A] of the online network in the batch's s_t, by a separate forward pass: an update computes only the values of the
     /// taken actions. Noisy layers use their means.
-    pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
+    pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>> {
         let networks = &self.networks;
         let states = states_tensor(self.model(), batch.states_t, &networks.compute.device)?;
         let logits = detached_logits(&networks.online, &states, None)?;
@@ -290,7 +290,7 @@ impl Agent {
 
     /// Clips `gradients`, takes one Adam step and moves the slow networks that are due.
     /// Returns the global norm of the gradients before clipping.
-    pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
+    pub fn apply(&mut self, gradients: &Gradients) -> Result<f64> {
         let (settings, online) = (&self.networks.settings, &self.networks.parameters);
         let kernels = self.networks.compute.kernels;
         let norm = gradients.norm(kernels)?;

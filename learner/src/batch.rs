@@ -4,7 +4,10 @@
 use driml_model::ModelConfig;
 use driml_protocol::NO_ACTION;
 
-use crate::{auxiliary::positives::Positives, error::UpdateError};
+use crate::{
+    auxiliary::positives::Positives,
+    error::{Result, UpdateError},
+};
 
 /// B rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), stored column by column.
 ///
@@ -77,7 +80,7 @@ impl OwnedBatch {
 
 impl<'a> Batch<'a> {
     /// Checks lengths against `model`, positives against what the auxiliary loss requires, actions, returns and discounts.
-    pub fn validate(&self, model: &ModelConfig, required: Positives) -> Result<(), UpdateError> {
+    pub fn validate(&self, model: &ModelConfig, required: Positives) -> Result<()> {
         let invalid = |what: String| Err(UpdateError::Batch(what));
         let rows = self.rows;
         if rows == 0 {

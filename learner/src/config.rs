@@ -15,7 +15,7 @@ use crate::{
     },
     augment::AugmentSettings,
     auxiliary::positives::Positives,
-    error::UpdateError,
+    error::{Result, UpdateError},
     settings::UpdateSettings,
 };
 
@@ -209,7 +209,7 @@ impl LearnerConfig {
     ///
     /// # Errors
     /// A table that is missing or does not fit, or invalid values.
-    pub fn from_toml(text: &str) -> Result<Self, UpdateError> {
+    pub fn from_toml(text: &str) -> Result<Self> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,

@@ -37,3 +37,6 @@ pub enum UpdateError {
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),
 }
+
+/// The result type of this crate's functions.
+pub type Result<T, E = UpdateError> = std::result::Result<T, E>;

@@ -6,7 +6,7 @@ use driml_model::{Compute, Features, ModelConfig, Network, Parameters, Resizer};
 
 use crate::{
     auxiliary::dim::{DIM, HeadVectors},
-    error::UpdateError,
+    error::Result,
     losses::{c51::softmax, scores::ScoreClip},
     settings::UpdateSettings,
     tensors::{states_tensor, to_vec_f32},
@@ -43,7 +43,7 @@ impl Insight {
         parameters: &Parameters,
         compute: Compute,
         enlarge: Option<Resizer>,
-    ) -> Result<Self, UpdateError> {
+    ) -> Result<Self> {
         let is_local = settings.auxiliary_loss.name() == DIM.name
             && settings.lambda.active_pairs()[0]
             && model.dim.psi3
@@ -64,7 +64,7 @@ impl Insight {
     }
 
     /// Computes the network's outputs for states [B, H, W, C].
-    pub fn evaluate(&self, states: &[u8]) -> Result<NetworkOutputs, UpdateError> {
+    pub fn evaluate(&self, states: &[u8]) -> Result<NetworkOutputs> {
         let enlarged = self.enlarge.as_ref().map(|it| it.resized(states));
         let input = enlarged.as_deref().unwrap_or(states);
         let states = states_tensor(&self.model, input, &self.compute.device)?;
@@ -98,7 +98,7 @@ impl Insight {
         now: &NetworkOutputs,
         actions: &[u8],
         later: &NetworkOutputs,
-    ) -> Result<Option<Vec<f64>>, UpdateError> {
+    ) -> Result<Option<Vec<f64>>> {
         let Some(tanh_clip) = self.local_clip else {
             return Ok(None);
         };

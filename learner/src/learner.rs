@@ -13,7 +13,7 @@ use crate::{
     agent::{Agent, UpdateReport},
     checkpoint::{self, CheckpointError, Extras, LearnerState},
     config::LearnerConfig,
-    error::UpdateError,
+    error::Result,
     importance::resample_evenly,
     prepare::{Columns, Preparation},
     run_counts::RunCounts,
@@ -46,7 +46,7 @@ fn apply_settings(agent: Agent, config: &LearnerConfig) -> Agent {
 
 impl Learner {
     /// Creates a learner before its first update. All its random generators are derived from the run's seed.
-    pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, UpdateError> {
+    pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self> {
         let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
@@ -130,8 +130,8 @@ impl Learner {
     ///
     /// # Errors
     /// A batch that does not fit, or a result that is not finite. Nothing has changed then, except after
-    /// [`UpdateError::Diverged`]: the learner can then neither publish weights nor save a checkpoint.
-    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, UpdateError> {
+    /// [`UpdateError::Diverged`](crate::UpdateError::Diverged): the learner can then neither publish nor save.
+    pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport> {
         let beta = self.config.sampling.beta(self.updates());
         let columns = Columns::new(batch, beta);
         // A copy, which replaces the generator only if the update succeeds.
@@ -215,7 +215,7 @@ impl Learner {
     }
 
     /// Exports the current weights under a new version number.
-    pub fn export_weights(&mut self) -> Result<Weights, UpdateError> {
+    pub fn export_weights(&mut self) -> Result<Weights> {
         let dtype = self.config.learner.publish_dtype;
         let safetensors = self.agent().weights(dtype)?;
         self.state.weights_version += 1;

@@ -80,7 +80,7 @@ pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
 pub use batch::{Batch, OwnedBatch};
 pub use config::{AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerConfig};
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
-pub use error::UpdateError;
+pub use error::{Result, UpdateError};
 pub use learner::Learner;
 pub use losses_and_gradients::{Losses, LossesAndGradients, UpdateNoise};
 pub use optimiser::adam::AdamSettings;

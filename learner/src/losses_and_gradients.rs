@@ -12,7 +12,7 @@ use crate::{
     auxiliary::loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
     batch::Batch,
     deduplicate::{PassInput, StateBytes},
-    error::UpdateError,
+    error::{Result, UpdateError},
     losses::{
         c51::{kl_loss, row_kls, softmax},
         projection::{project, share_beyond},
@@ -116,7 +116,7 @@ impl Networks {
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
-    ) -> Result<LossesAndGradients, UpdateError> {
+    ) -> Result<LossesAndGradients> {
         // The two are independent: while one works on a single thread, the other's matrix products use the remaining threads.
         let (target, features) = rayon::join(
             || self.bellman_target(batch, noise),
@@ -179,7 +179,7 @@ impl Networks {
 
     /// Passes the states of `batch` that the auxiliary loss needs through the online network. It does not deduplicate augmented batches:
     /// each state has a draw.
-    pub(crate) fn online_features(&self, batch: &Batch<'_>) -> Result<OnlineFeatures, UpdateError> {
+    pub(crate) fn online_features(&self, batch: &Batch<'_>) -> Result<OnlineFeatures> {
         let len = self.model.frame_len();
         let mut states: Vec<StateBytes<'_>> = batch.states_t.chunks_exact(len).map(Some).collect();
         let anchors = batch.anchors.unwrap_or_default().chunks_exact(len);
@@ -211,7 +211,7 @@ impl Networks {
         &self,
         batch: &Batch<'_>,
         features: &OnlineFeatures,
-    ) -> Result<Vec<WeightedLoss>, UpdateError> {
+    ) -> Result<Vec<WeightedLoss>> {
         self.auxiliary.losses(&LossInputs {
             online: &self.online,
             model: &self.model,
@@ -225,11 +225,7 @@ impl Networks {
     /// Computes the target distributions, of the actions that are greedy in s_{t+n}, without a graph.
     ///
     /// Rows that do not bootstrap skip the pass: whatever s_{t+n} is, all of their probability goes to their return.
-    fn bellman_target(
-        &self,
-        batch: &Batch<'_>,
-        noise: &UpdateNoise,
-    ) -> Result<BellmanTarget, UpdateError> {
+    fn bellman_target(&self, batch: &Batch<'_>, noise: &UpdateNoise) -> Result<BellmanTarget> {
         let atoms = self.model.atoms;
         let mut next_greedy_action = vec![NO_ACTION; batch.rows];
         let mut probs = vec![0f32; batch.rows * atoms];
@@ -265,7 +261,7 @@ impl Networks {
         &self,
         batch: &Batch<'_>,
         noise: &UpdateNoise,
-    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+    ) -> Result<(Vec<u8>, Vec<f32>)> {
         let (num_actions, atoms) = (self.model.num_actions, self.model.atoms);
         let len = self.model.frame_len();
         let frames = batch.next_states(len);
@@ -303,7 +299,7 @@ pub(crate) fn detached_logits(
     network: &Network,
     frames: &Tensor,
     noise: Option<&HeadNoise>,
-) -> Result<Tensor, UpdateError> {
+) -> Result<Tensor> {
     let f4 = network.features(frames)?.f4;
     Ok(network.logits(&f4, noise)?.detach())
 }

@@ -3,17 +3,13 @@
 
 use std::ops::RangeInclusive;
 
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// Range of tau, the share of the online network in a move of a slow copy, whose parameters are f32.
 pub(crate) const TAU_RANGE: RangeInclusive<f64> = 1e-5..=1.0;
 
 /// Checks that a setting is in its range. NaN is outside every range.
-pub(crate) fn check_range(
-    name: &str,
-    value: f64,
-    range: RangeInclusive<f64>,
-) -> Result<(), UpdateError> {
+pub(crate) fn check_range(name: &str, value: f64, range: RangeInclusive<f64>) -> Result<()> {
     range_error(name, value, &range).map_or(Ok(()), |why| Err(UpdateError::Settings(why)))
 }
 
@@ -25,14 +21,14 @@ fn range_error(name: &str, value: f64, range: &RangeInclusive<f64>) -> Option<St
 }
 
 /// Checks that each setting of an affinity is in its range.
-pub(crate) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(), UpdateError> {
+pub(crate) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<()> {
     let mut all = all.iter();
     let why = all.find_map(|(name, value, range)| range_error(name, *value, range));
     why.map_or(Ok(()), |why| Err(UpdateError::Affinity(why)))
 }
 
 /// Checks the length of an affinity's array, and that its numbers are finite. Errors contain `name`.
-pub(crate) fn check_array(name: &str, array: &[f64], len: usize) -> Result<(), UpdateError> {
+pub(crate) fn check_array(name: &str, array: &[f64], len: usize) -> Result<()> {
     if array.len() != len {
         let found = array.len();
         return Err(UpdateError::Affinity(format!(
@@ -48,7 +44,7 @@ pub(crate) fn check_numbers(
     array: &[f64],
     wrong: &str,
     is_right: fn(f64) -> bool,
-) -> Result<(), UpdateError> {
+) -> Result<()> {
     match array.iter().position(|&number| !is_right(number)) {
         Some(at) => Err(UpdateError::Affinity(format!(
             "{name} is {wrong} at index {at}"
@@ -58,11 +54,7 @@ pub(crate) fn check_numbers(
 }
 
 /// Like [`check_array`], and checks that every number is a probability.
-pub(crate) fn check_probabilities(
-    name: &str,
-    array: &[f64],
-    len: usize,
-) -> Result<(), UpdateError> {
+pub(crate) fn check_probabilities(name: &str, array: &[f64], len: usize) -> Result<()> {
     check_array(name, array, len)?;
     let is_probability = |number: f64| (0.0..=1.0 + 1e-6).contains(&number);
     check_numbers(name, array, "not a probability", is_probability)

@@ -12,7 +12,7 @@ use crate::{
         loss::AuxiliaryLoss,
         settings::{AuxiliarySettings, Lambda},
     },
-    error::UpdateError,
+    error::{Result, UpdateError},
     optimiser::adam::AdamSettings,
     ranges::{TAU_RANGE, check_range},
 };
@@ -68,7 +68,7 @@ fn deserialize_loss_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::T
 
 impl UpdateSettings {
     /// Checks the ranges.
-    pub fn validate(&self) -> Result<(), UpdateError> {
+    pub fn validate(&self) -> Result<()> {
         check_range("tanh_clip", self.tanh_clip, TANH_CLIP_RANGE)?;
         check_range("max_grad_norm", self.max_grad_norm, MAX_GRAD_NORM_RANGE)?;
         check_range("target_tau", self.target_tau, TAU_RANGE)?;
@@ -89,7 +89,7 @@ impl UpdateSettings {
     ///
     /// # Errors
     /// Invalid settings of the loss.
-    pub fn make_auxiliary_loss(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+    pub fn make_auxiliary_loss(&self) -> Result<Box<dyn AuxiliaryLoss>> {
         self.auxiliary_loss.make_loss(&AuxiliarySettings {
             auxiliary_loss: self.auxiliary_loss.name(),
             lambda: self.lambda,

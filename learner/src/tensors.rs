@@ -5,7 +5,7 @@ use std::{borrow::Cow, cell::RefCell};
 use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, bail};
 use driml_model::{ModelConfig, floats};
 
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// The bytes of states as a tensor [B, H, W, C] u8 on `device`, where the network converts them to floats.
 pub(crate) fn states_tensor<'a>(
@@ -69,7 +69,7 @@ impl<F: FnMut(&mut [f32], &[f32]) -> candle_core::Result<()>> InplaceOp2 for InP
 }
 
 /// Reads a scalar loss; an error that names it if it is not finite.
-pub(crate) fn read_finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
+pub(crate) fn read_finite(what: &str, loss: &Tensor) -> Result<f32> {
     let value = loss.to_scalar::<f32>()?;
     match value.is_finite() {
         true => Ok(value),

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// A map from raw actions to visible actions, which are numbered without gaps.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,7 +18,7 @@ impl Alphabet {
     ///
     /// # Errors
     /// A table that is empty, longer than 255, or maps to an action that does not map to itself.
-    pub fn new(map: &[u8]) -> Result<Self, UpdateError> {
+    pub fn new(map: &[u8]) -> Result<Self> {
         let count = map.len();
         if !(1..=255).contains(&count) {
             return Err(UpdateError::Affinity(format!(
@@ -47,7 +47,7 @@ impl Alphabet {
     ///
     /// # Errors
     /// No actions, or more than 255.
-    pub fn raw(num_actions: usize) -> Result<Self, UpdateError> {
+    pub fn raw(num_actions: usize) -> Result<Self> {
         let map = (0..num_actions.min(256)).map(|action| action as u8);
         Self::new(&map.collect::<Vec<_>>())
     }
@@ -64,7 +64,7 @@ impl Alphabet {
     }
 
     /// Checks the invariants of [`Alphabet::new`]. An alphabet that was read from a file may violate them.
-    pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
+    pub(super) fn check_valid(&self) -> Result<()> {
         let mut used = self.index.clone();
         used.sort_unstable();
         used.dedup();
@@ -79,7 +79,7 @@ impl Alphabet {
     }
 
     /// Maps pairs of raw actions to pairs of dense indices.
-    pub(super) fn index_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>, UpdateError> {
+    pub(super) fn index_pairs(&self, pairs: &[(u8, u8)]) -> Result<Vec<(u8, u8)>> {
         let index = |action: u8| {
             let index = self.index.get(usize::from(action)).copied();
             let count = self.index.len();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::alphabet::Alphabet;
 use crate::{
-    error::UpdateError,
+    error::Result,
     ranges::{check_array, check_numbers, check_probabilities, check_ranges},
 };
 
@@ -39,7 +39,7 @@ pub struct ExactAffinity {
 }
 
 impl ExactSettings {
-    pub(crate) fn check_valid(&self) -> Result<(), UpdateError> {
+    pub(crate) fn check_valid(&self) -> Result<()> {
         check_ranges(&[
             ("decay", self.decay, 1e-300..=1.0),
             ("smoothing", self.smoothing, SMOOTHING_RANGE),
@@ -52,7 +52,7 @@ impl ExactAffinity {
     ///
     /// # Errors
     /// A setting out of its range.
-    pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self, UpdateError> {
+    pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self> {
         settings.check_valid()?;
         let m = alphabet.len();
         Ok(Self {
@@ -62,7 +62,7 @@ impl ExactAffinity {
         })
     }
 
-    pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
+    pub(super) fn check_valid(&self) -> Result<()> {
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         check_array("counts", &self.counts, m * m)?;

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::alphabet::Alphabet;
 use crate::{
-    error::UpdateError,
+    error::Result,
     ranges::{check_array, check_numbers, check_probabilities, check_ranges},
 };
 
@@ -47,7 +47,7 @@ pub struct LearnedAffinity {
 const HIDDEN_MAX: f64 = 4096.0;
 
 impl LearnedSettings {
-    pub(crate) fn check_valid(&self) -> Result<(), UpdateError> {
+    pub(crate) fn check_valid(&self) -> Result<()> {
         let share = 0.0..=0.999_999;
         check_ranges(&[
             ("hidden", self.hidden as f64, 1.0..=HIDDEN_MAX),
@@ -69,7 +69,7 @@ impl LearnedAffinity {
         alphabet: Alphabet,
         settings: LearnedSettings,
         rng: &mut ChaCha8Rng,
-    ) -> Result<Self, UpdateError> {
+    ) -> Result<Self> {
         settings.check_valid()?;
         let hidden = settings.hidden;
         let m = alphabet.len();
@@ -92,7 +92,7 @@ impl LearnedAffinity {
         })
     }
 
-    pub(super) fn check_valid(&self) -> Result<(), UpdateError> {
+    pub(super) fn check_valid(&self) -> Result<()> {
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         let count = parameter_count(m, self.settings.hidden);

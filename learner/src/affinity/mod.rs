@@ -12,7 +12,7 @@ pub use alphabet::Alphabet;
 pub use exact::{ExactAffinity, ExactSettings};
 pub use learned::{LearnedAffinity, LearnedSettings};
 
-use crate::error::UpdateError;
+use crate::error::Result;
 
 /// An estimator of A from the pairs (a_t, a_{t+1}) of the learner's batches, with all of its state, which checkpoints save.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,7 +30,7 @@ impl AffinityEstimator {
     /// # Errors
     /// An action that the alphabet does not have: nothing has then changed. Numbers that are no longer finite: the estimate is then
     /// unusable.
-    pub fn observe(&mut self, pairs: &[(u8, u8)], rng: &mut ChaCha8Rng) -> Result<(), UpdateError> {
+    pub fn observe(&mut self, pairs: &[(u8, u8)], rng: &mut ChaCha8Rng) -> Result<()> {
         let pairs = self.alphabet().index_pairs(pairs)?;
         if !pairs.is_empty() {
             match self {
@@ -46,7 +46,7 @@ impl AffinityEstimator {
     /// # Errors
     /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
     /// are not probabilities.
-    pub fn check_valid(&self) -> Result<(), UpdateError> {
+    pub fn check_valid(&self) -> Result<()> {
         self.alphabet().check_valid()?;
         match self {
             Self::Learned(learned) => learned.check_valid(),

@@ -14,7 +14,7 @@ use super::{
 use crate::{
     batch::Batch,
     deduplicate::StateBytes,
-    error::UpdateError,
+    error::Result,
     losses::{info_nce::info_nce_loss, scores::DotProducts},
 };
 
@@ -59,7 +59,7 @@ impl AuxiliaryLoss for Cpc {
     ///
     /// Source: van den Oord et al. 2018, section 2.3, with the heads of Mazoure et al. 2020 ("exactly the same networks
     /// for measuring similarity").
-    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>> {
         let mut offsets = self.dot_products_by_offset(inputs)?;
         let (kernels, tanh_clip) = (inputs.online.kernels(), self.dim.tanh_clip);
         let pairs = NAMES.into_iter().zip(self.dim.lambda.values());
@@ -91,7 +91,7 @@ impl Cpc {
     fn dot_products_by_offset(
         &self,
         inputs: &LossInputs<'_>,
-    ) -> Result<Vec<[Option<DotProducts>; 4]>, UpdateError> {
+    ) -> Result<Vec<[Option<DotProducts>; 4]>> {
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());
         };

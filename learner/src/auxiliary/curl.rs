@@ -17,7 +17,7 @@ use super::{
     settings::AuxiliarySettings,
 };
 use crate::{
-    error::UpdateError,
+    error::{Result, UpdateError},
     losses::info_nce::info_nce_loss,
     ranges::{TAU_RANGE, check_range},
 };
@@ -39,7 +39,7 @@ pub struct CurlSettings {
     pub key_tau: f64,
 }
 
-fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>> {
     settings.check_any_pair_active()?;
     let said = |what: &str| format!("auxiliary_loss = curl {what}");
     let fault = |what: &str| Err(UpdateError::AuxiliaryLoss(said(what)));
@@ -97,7 +97,7 @@ impl AuxiliaryLoss for Curl {
 
     /// Computes the InfoNCE of the online network's vectors of one view with the key encoder's vectors of the other view. All rows take
     /// part, as no later state is needed.
-    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>> {
         let keys = inputs.key_vectors()?;
         let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;

@@ -12,7 +12,7 @@ use super::{
 use crate::{
     batch::Batch,
     deduplicate::StateBytes,
-    error::UpdateError,
+    error::Result,
     losses::{info_nce::info_nce_loss, scores::DotProducts},
 };
 
@@ -38,7 +38,7 @@ pub struct Dim {
 
 impl Dim {
     /// Creates the loss from settings; at least one lambda must be above 0.
-    pub fn new(settings: &AuxiliarySettings<'_>) -> Result<Self, UpdateError> {
+    pub fn new(settings: &AuxiliarySettings<'_>) -> Result<Self> {
         settings.check_no_own_table()?;
         settings.check_any_pair_active()?;
         Ok(Self {
@@ -58,7 +58,7 @@ impl Dim {
         features_k: &Features,
         action: &Tensor,
         valid: &[u8],
-    ) -> Result<Vec<WeightedLoss>, UpdateError> {
+    ) -> Result<Vec<WeightedLoss>> {
         let active = self.lambda.active_pairs();
         let vectors = HeadVectors::new(network, features_t, features_k, action, active)?;
         let pairs = NAMES.into_iter().zip(self.lambda.values());
@@ -91,7 +91,7 @@ impl AuxiliaryLoss for Dim {
         batch.positive_states(state_bytes)
     }
 
-    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>> {
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());
         };
@@ -125,7 +125,7 @@ impl HeadVectors {
         features_k: &Features,
         action: &Tensor,
         active: [bool; 4],
-    ) -> Result<Self, UpdateError> {
+    ) -> Result<Self> {
         let heads = Lambda::heads_for_pairs(active, true);
         let psi3 = heads
             .psi3

@@ -13,7 +13,7 @@ use super::{
 use crate::{
     batch::Batch,
     deduplicate::{PassInput, StateBytes},
-    error::UpdateError,
+    error::Result,
     losses::scores::{DotProducts, ScoreClip},
     tensors::states_tensor,
 };
@@ -33,7 +33,7 @@ pub struct MenuItem {
     /// The names of all losses that may be reported, which are columns of a run's metrics.
     pub loss_names: &'static [&'static str],
     /// Creates the loss from settings; rejects settings that contradict each other.
-    pub make: fn(&AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError>,
+    pub make: fn(&AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>>,
 }
 
 /// What an agent learns beside the return.
@@ -65,7 +65,7 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     }
 
     /// Computes the losses of one batch, with their graphs.
-    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError>;
+    fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>>;
 }
 
 /// The passes through parts of the networks beyond those of C51, per row of a batch.
@@ -171,7 +171,7 @@ impl LossInputs<'_> {
     ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
-    pub fn key_vectors(&self) -> Result<Tensor, UpdateError> {
+    pub fn key_vectors(&self) -> Result<Tensor> {
         let encoder = self.key_encoder;
         let encoder = encoder.expect("a loss with key_tau is given its encoder");
         let (batch, len) = (self.batch, self.model.frame_len());
@@ -181,7 +181,7 @@ impl LossInputs<'_> {
     }
 
     /// a_t [B], on the CPU, where the network reads it.
-    pub fn action(&self) -> Result<Tensor, UpdateError> {
+    pub fn action(&self) -> Result<Tensor> {
         let action = self.batch.action;
         Ok(Tensor::from_slice(action, action.len(), &Device::Cpu)?)
     }

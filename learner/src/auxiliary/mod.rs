@@ -19,7 +19,7 @@ use positives::Positives;
 use serde::{Deserialize, Serialize};
 use settings::AuxiliarySettings;
 
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// All auxiliary losses of this crate; a new one adds a line here.
 pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
@@ -80,10 +80,7 @@ impl AuxiliaryKind {
     }
 
     /// Creates the loss from settings.
-    pub fn make_loss(
-        self,
-        settings: &AuxiliarySettings<'_>,
-    ) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+    pub fn make_loss(self, settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>> {
         let loss = (self.0.make)(settings)?;
         match settings.own.keys().find(|other| *other != self.name()) {
             Some(other) => Err(UpdateError::AuxiliaryLoss(format!(

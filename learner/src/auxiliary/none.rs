@@ -5,7 +5,7 @@ use super::{
     positives::Positives,
     settings::{AuxiliarySettings, PAIRS},
 };
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// The menu item for no auxiliary loss.
 pub const NONE: MenuItem = MenuItem {
@@ -15,7 +15,7 @@ pub const NONE: MenuItem = MenuItem {
     make,
 };
 
-fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>> {
     settings.check_no_own_table()?;
     if settings.condition_on_action {
         return Err(UpdateError::AuxiliaryLoss(
@@ -39,7 +39,7 @@ impl AuxiliaryLoss for NoAuxiliaryLoss {
         Passes::default()
     }
 
-    fn losses(&self, _inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
+    fn losses(&self, _inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>> {
         Ok(Vec::new())
     }
 }

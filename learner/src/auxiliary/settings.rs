@@ -4,7 +4,7 @@
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// The pairs NtM, in the order of every array of four here: features N of (s_t, a_t) are compared with features M of s_{t+k}.
 pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
@@ -74,7 +74,7 @@ impl Lambda {
     }
 
     /// Checks that every weight is from 0 to 1e30.
-    pub fn validate(&self) -> Result<(), UpdateError> {
+    pub fn validate(&self) -> Result<()> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
             if !(0.0..=1e30).contains(&value) {
                 return Err(UpdateError::Settings(format!(
@@ -103,7 +103,7 @@ pub struct AuxiliarySettings<'a> {
 
 impl AuxiliarySettings<'_> {
     /// Reads the loss's own table; `None` if it is absent.
-    pub fn own_table<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
+    pub fn own_table<T: DeserializeOwned>(&self) -> Result<Option<T>> {
         let Some(table) = self.own.get(self.auxiliary_loss) else {
             return Ok(None);
         };
@@ -115,7 +115,7 @@ impl AuxiliarySettings<'_> {
     }
 
     /// Rejects a table for a loss that has no own settings.
-    pub fn check_no_own_table(&self) -> Result<(), UpdateError> {
+    pub fn check_no_own_table(&self) -> Result<()> {
         let name = self.auxiliary_loss;
         if !self.own.contains_key(name) {
             return Ok(());
@@ -126,7 +126,7 @@ impl AuxiliarySettings<'_> {
     }
 
     /// Checks that at least one lambda is above 0, for a loss that lambda weights.
-    pub fn check_any_pair_active(&self) -> Result<(), UpdateError> {
+    pub fn check_any_pair_active(&self) -> Result<()> {
         if self.lambda.active_pairs().contains(&true) {
             return Ok(());
         }

@@ -20,7 +20,7 @@ use super::{
 use crate::{
     affinity::AffinityEstimator,
     agent::Agent,
-    error::UpdateError,
+    error::Result,
     run_counts::{COUNT_MAX, RunCounts},
 };
 
@@ -192,10 +192,7 @@ fn files(
 }
 
 /// Serialises the networks and the moments, all of which must be finite, into files with their names.
-fn tensor_files(
-    agent: &Agent,
-    extras: Extras<'_>,
-) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
+fn tensor_files(agent: &Agent, extras: Extras<'_>) -> Result<Vec<(&'static str, Vec<u8>)>> {
     let described = |parameters: &Parameters, model: &ModelConfig| {
         let description = describe(extras.spec, model, extras.input);
         parameters.to_described_safetensors(WeightDtype::F32, METADATA_KEY, &description)

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::gradients::Gradients;
 use crate::{
-    error::UpdateError,
+    error::{Result, UpdateError},
     ranges::check_range,
     tensors::{modify_in_place, to_vec_f32},
 };
@@ -68,7 +68,7 @@ pub struct AdamSettings {
 
 impl AdamSettings {
     /// Checks each number against its range.
-    pub fn validate(&self) -> Result<(), UpdateError> {
+    pub fn validate(&self) -> Result<()> {
         check_range("adam.lr", self.lr, LR_RANGE)?;
         check_range("adam.beta1", self.beta1, BETA_RANGE)?;
         check_range("adam.beta2", self.beta2, BETA_RANGE)?;
@@ -92,11 +92,7 @@ impl Adam {
     ///
     /// # Errors
     /// Settings out of their ranges; the device has no memory left for the moments.
-    pub fn new(
-        settings: AdamSettings,
-        parameters: &Parameters,
-        kernels: Kernels,
-    ) -> Result<Self, UpdateError> {
+    pub fn new(settings: AdamSettings, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         settings.validate()?;
         let mut moments = BTreeMap::new();
         for (name, var) in parameters.iter() {
@@ -126,7 +122,7 @@ impl Adam {
         parameters: &Parameters,
         gradients: &Gradients,
         factor: f64,
-    ) -> Result<(), UpdateError> {
+    ) -> Result<()> {
         self.step += 1;
         let coefficients = StepCoefficients::new(self.settings, self.step, factor);
         for (name, moments) in &mut self.moments {
@@ -151,7 +147,7 @@ impl Adam {
     ///
     /// # Errors
     /// A failing allocation, or a moment that is not finite.
-    pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>, UpdateError> {
+    pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>> {
         let mut tensors = HashMap::new();
         for (name, moments) in &self.moments {
             for (which, moment) in ["m", "v"].into_iter().zip(moments) {
@@ -172,13 +168,9 @@ impl Adam {
     ///
     /// # Errors
     /// A moment that is missing, of another shape or type, not finite, or of no parameter of this optimiser.
-    pub fn restore(
-        &mut self,
-        step: u64,
-        mut tensors: HashMap<String, Tensor>,
-    ) -> Result<(), UpdateError> {
+    pub fn restore(&mut self, step: u64, mut tensors: HashMap<String, Tensor>) -> Result<()> {
         let error = |name: &str, why: &str| UpdateError::State(format!("the moment {name} {why}"));
-        let mut take = |which: &str, name: &str, ours: &Tensor| -> Result<_, UpdateError> {
+        let mut take = |which: &str, name: &str, ours: &Tensor| -> Result<_> {
             let name = format!("{which}.{name}");
             let error = |why: &str| error(&name, why);
             let tensor = tensors.remove(&name).ok_or_else(|| error("is missing"))?;

@@ -7,7 +7,7 @@ use candle_core::{DType, Tensor};
 use driml_model::{Kernels, Parameters, backward, values_of};
 use rayon::prelude::*;
 
-use crate::error::UpdateError;
+use crate::error::{Result, UpdateError};
 
 /// Elements that a thread sums at a time.
 const CHUNK: usize = 1 << 14;
@@ -24,7 +24,7 @@ pub struct Gradients {
 
 impl Gradients {
     /// Computes the gradients of the scalar `loss` by `parameters`.
-    pub fn compute(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
+    pub fn compute(parameters: &Parameters, loss: &Tensor) -> Result<Self> {
         Ok(Self {
             by_name: backward(loss, parameters.iter())?,
         })
@@ -39,7 +39,7 @@ impl Gradients {
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] with the first parameter whose gradient is infinite or NaN.
-    pub fn norm(&self, kernels: Kernels) -> Result<f64, UpdateError> {
+    pub fn norm(&self, kernels: Kernels) -> Result<f64> {
         let squares: Vec<f64> = match kernels {
             Kernels::Fused(_) => {
                 let per_tensor = self.by_name.values().map(squares_on_cpu);

@@ -3,7 +3,10 @@
 
 use driml_model::{Kernels, Parameters};
 
-use crate::{error::UpdateError, tensors::modify_in_place};
+use crate::{
+    error::{Result, UpdateError},
+    tensors::modify_in_place,
+};
 
 /// Largest size of a parameter for which a copy can follow: the difference of two parameters is then finite.
 pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
@@ -25,12 +28,7 @@ pub fn follow_error(tau: f64) -> f64 {
 ///
 /// # Errors
 /// A parameter of the target that the online network lacks.
-pub fn follow(
-    target: &Parameters,
-    online: &Parameters,
-    tau: f64,
-    kernels: Kernels,
-) -> Result<(), UpdateError> {
+pub fn follow(target: &Parameters, online: &Parameters, tau: f64, kernels: Kernels) -> Result<()> {
     for (name, var) in target.iter() {
         let Some(source) = online.get(name) else {
             return Err(UpdateError::State(format!(

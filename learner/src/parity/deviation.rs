@@ -5,7 +5,7 @@ use candle_core::Device;
 use driml_model::{Compute, Kernels, argmax};
 use driml_protocol::NO_ACTION;
 
-use crate::{agent::Agent, batch::Batch, error::UpdateError, tensors::to_vec_f64};
+use crate::{agent::Agent, batch::Batch, error::Result, tensors::to_vec_f64};
 
 /// The reference's way of computing: on the CPU, without this project's kernels.
 pub const REFERENCE: Compute = Compute {
@@ -32,7 +32,7 @@ pub struct UpdateDeviation {
 
 impl UpdateDeviation {
     /// Compares `agent` on `batch` with `reference`, an agent of the same parameters on [`REFERENCE`]. Both use the noise of `agent`.
-    pub fn new(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
+    pub fn new(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self> {
         let noise = agent.noise();
         let own = agent.gradients_with(batch, &noise)?;
         let expected = reference.gradients_with(batch, &noise)?;
