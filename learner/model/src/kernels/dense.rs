@@ -59,40 +59,30 @@ impl<S: Simd> Dense<S> {
         self.inputs
     }
 
-    /// Scalars from one row of inputs to the next: `inputs` rounded up to whole steps of `DEPTH`.
-    pub(crate) fn row_len(&self) -> usize {
-        self.inputs.next_multiple_of(S::Element::DEPTH)
-    }
-
-    /// Computes [count, out] of `x` [count, in], whose rows are [`Dense::row_len`] long.
-    pub(crate) fn forward(&self, x: &[S::Element], count: usize) -> Buffer<f32> {
+    /// Computes [n, out] of `x` [n, in].
+    pub(crate) fn forward(&self, x: Buffer<S::Element>) -> Buffer<f32> {
         let (outputs, simd) = (self.bias.len(), self.simd);
+        let count = x.len() / self.inputs;
         let mut y = Buffer::new(count * outputs);
         for row in y.chunks_exact_mut(outputs) {
             row.copy_from_slice(&self.bias);
         }
-        let left = LeftOperand::rows(x, self.row_len());
+        let x = pad_rows(x, self.inputs);
+        let left = LeftOperand::rows(&x, self.inputs.next_multiple_of(S::Element::DEPTH));
         self.weight
             .multiply_rows(simd, count, left, Mode::Add, &mut y, outputs);
         y
     }
 
     fn forward_relu(&self, hidden: &[f32]) -> Buffer<f32> {
-        let count = hidden.len() / self.inputs;
-        let stride = self.row_len();
-        let mut active = Buffer::<S::Element>::new(count * stride);
-        let rows = active.chunks_exact_mut(stride);
-        for (row, hidden) in rows.zip(hidden.chunks_exact(self.inputs)) {
-            let (begin, end) = row.split_at_mut(self.inputs);
-            store_relu(self.simd, hidden, begin);
-            end.fill(S::Element::default());
-        }
-        self.forward(&active, count)
+        let mut active = Buffer::<S::Element>::new(hidden.len());
+        store_relu(self.simd, hidden, &mut active);
+        self.forward(active)
     }
 }
 
 /// Pads rows of `len` scalars with zeros to whole steps of `DEPTH`.
-pub(crate) fn pad_rows<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
+fn pad_rows<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
     let stride = len.next_multiple_of(E::DEPTH);
     if stride == len {
         return rows;

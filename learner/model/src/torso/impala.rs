@@ -14,7 +14,7 @@ use crate::kernels::impala::Stages;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::linear::add_rows;
 use crate::kernels::precision::Precision;
-use crate::kernels::rounding::write_rows;
+use crate::kernels::rounding::store;
 use crate::layers::LayerSpec;
 
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [
@@ -142,18 +142,18 @@ fn f4<S: Simd>(
     frames: &[u8],
 ) -> Buffer<f32> {
     let images = frames.chunks_exact(stages.image_len());
-    let (count, inputs, stride) = (images.len(), fc.inputs(), fc.row_len());
-    let mut rows = Buffer::new(count * stride);
+    let inputs = fc.inputs();
+    let mut rows = Buffer::new(images.len() * inputs);
     let (mut tape, mut f3) = (stages.allocate_tape(1), Buffer::new(stages.output_len()));
-    for (image, row) in images.zip(rows.chunks_exact_mut(stride)) {
+    for (image, row) in images.zip(rows.chunks_exact_mut(inputs)) {
         stages.forward(image, &mut tape, &mut f3);
         if takes_mean {
-            write_rows(simd, &mean_of_locations(&f3, inputs), inputs, stride, row);
+            store(simd, &mean_of_locations(&f3, inputs), row);
         } else {
-            write_rows(simd, &f3, inputs, stride, row);
+            store(simd, &f3, row);
         }
     }
-    fc.forward(&rows, count)
+    fc.forward(rows)
 }
 
 /// Computes the mean of `map` [locations, channels] over its locations.

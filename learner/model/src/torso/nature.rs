@@ -9,7 +9,7 @@ use crate::geometry::{ConvLayer, ConvShape, read_size};
 use crate::init::Initializer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::conv::Stack;
-use crate::kernels::dense::{Dense, pad_rows};
+use crate::kernels::dense::Dense;
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
@@ -121,8 +121,8 @@ impl Torso for Nature {
 }
 
 fn f4<S: Simd>(stack: &Stack<S>, fc: &Dense<S>, frames: &[u8]) -> Buffer<f32> {
-    let (count, inputs) = (frames.len() / stack.image_len(), fc.inputs());
-    let mut maps = Buffer::<S::Element>::new(count * inputs);
+    let count = frames.len() / stack.image_len();
+    let mut maps = Buffer::<S::Element>::new(count * fc.inputs());
     stack.forward(Pixels::Bytes(frames), &mut maps);
-    fc.forward(&pad_rows(maps, inputs), count)
+    fc.forward(maps)
 }
