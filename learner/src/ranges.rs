@@ -7,6 +7,10 @@ use crate::error::{Result, UpdateError};
 
 /// Range of tau, the share of the online network in a move of a slow copy, whose parameters are f32.
 pub(crate) const TAU_RANGE: RangeInclusive<f64> = 1e-5..=1.0;
+/// Range of an affinity's counts and means of squares.
+pub(crate) const NOT_NEGATIVE: RangeInclusive<f64> = 0.0..=f64::MAX;
+/// Range of a probability that was computed in f64.
+pub(crate) const PROBABILITY: RangeInclusive<f64> = 0.0..=1.0 + 1e-6;
 
 /// Checks that a setting is in its range. NaN is outside every range.
 pub(crate) fn check_range(name: &str, value: f64, range: RangeInclusive<f64>) -> Result<()> {
@@ -27,35 +31,21 @@ pub(crate) fn check_ranges(all: &[(&str, f64, RangeInclusive<f64>)]) -> Result<(
     why.map_or(Ok(()), |why| Err(UpdateError::Affinity(why)))
 }
 
-/// Checks the length of an affinity's array, and that its numbers are finite. Errors contain `name`.
-pub(crate) fn check_array(name: &str, array: &[f64], len: usize) -> Result<()> {
+/// Checks the length of an affinity's array, and that each of its numbers is in `range`.
+pub(crate) fn check_array(
+    name: &str,
+    array: &[f64],
+    len: usize,
+    range: RangeInclusive<f64>,
+) -> Result<()> {
     if array.len() != len {
         let found = array.len();
         return Err(UpdateError::Affinity(format!(
             "{name} has {found} numbers, not {len}"
         )));
     }
-    check_numbers(name, array, "not finite", f64::is_finite)
-}
-
-/// Checks that each number of an affinity's array `is_right`. The error says that `name` is `wrong`, and where.
-pub(crate) fn check_numbers(
-    name: &str,
-    array: &[f64],
-    wrong: &str,
-    is_right: fn(f64) -> bool,
-) -> Result<()> {
-    match array.iter().position(|&number| !is_right(number)) {
-        Some(at) => Err(UpdateError::Affinity(format!(
-            "{name} is {wrong} at index {at}"
-        ))),
+    match array.iter().position(|number| !range.contains(number)) {
+        Some(at) => check_ranges(&[(format!("{name}[{at}]").as_str(), array[at], range)]),
         None => Ok(()),
     }
-}
-
-/// Like [`check_array`], and checks that every number is a probability.
-pub(crate) fn check_probabilities(name: &str, array: &[f64], len: usize) -> Result<()> {
-    check_array(name, array, len)?;
-    let is_probability = |number: f64| (0.0..=1.0 + 1e-6).contains(&number);
-    check_numbers(name, array, "not a probability", is_probability)
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::alphabet::Alphabet;
 use crate::{
     error::Result,
-    ranges::{check_array, check_numbers, check_probabilities, check_ranges},
+    ranges::{NOT_NEGATIVE, PROBABILITY, check_array, check_ranges},
 };
 
 /// Decay and smoothing of the pair counts.
@@ -65,9 +65,8 @@ impl ExactAffinity {
     pub(super) fn check_valid(&self) -> Result<()> {
         self.settings.check_valid()?;
         let m = self.alphabet.len();
-        check_array("counts", &self.counts, m * m)?;
-        check_numbers("counts", &self.counts, "below 0", |count| count >= 0.0)?;
-        check_probabilities("matrix", &self.ratios(), m * m)
+        check_array("counts", &self.counts, m * m, NOT_NEGATIVE)?;
+        check_array("matrix", &self.ratios(), m * m, PROBABILITY)
     }
 
     /// Learns from pairs of dense indices.

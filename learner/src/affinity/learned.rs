@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::alphabet::Alphabet;
 use crate::{
     error::Result,
-    ranges::{check_array, check_numbers, check_probabilities, check_ranges},
+    ranges::{NOT_NEGATIVE, PROBABILITY, check_array, check_ranges},
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -96,12 +96,11 @@ impl LearnedAffinity {
         self.settings.check_valid()?;
         let m = self.alphabet.len();
         let count = parameter_count(m, self.settings.hidden);
-        check_array("parameters", &self.parameters, count)?;
-        check_array("first_moments", &self.first_moments, count)?;
-        let second_moments = &self.second_moments;
-        check_array("second_moments", second_moments, count)?;
-        check_numbers("second_moments", second_moments, "below 0", |it| it >= 0.0)?;
-        check_probabilities("smoothed", &self.smoothed, m * m)
+        let finite = f64::MIN..=f64::MAX;
+        check_array("parameters", &self.parameters, count, finite.clone())?;
+        check_array("first_moments", &self.first_moments, count, finite)?;
+        check_array("second_moments", &self.second_moments, count, NOT_NEGATIVE)?;
+        check_array("smoothed", &self.smoothed, m * m, PROBABILITY)
     }
 
     /// Takes one Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
