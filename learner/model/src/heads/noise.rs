@@ -12,7 +12,7 @@ use crate::init::draw_normals;
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeadNoise {
     /// One entry per layer, in the order of the head's layers.
-    layers: Vec<LayerNoise>,
+    pub(crate) layers: Vec<LayerNoise>,
 }
 
 /// f(eps) of one layer, with f(x) = sgn(x) sqrt|x|. A weight's noise is its output's times its input's, a bias's is its output's.
@@ -60,14 +60,9 @@ impl HeadNoise {
         Ok(Some(Self { layers }))
     }
 
-    /// Returns the noise of the head's layer with this index.
-    pub(crate) fn layer(&self, index: usize) -> &LayerNoise {
-        &self.layers[index]
-    }
-
     /// Returns the noise of the weight [out, in] and the bias [out] of the head's layer with this index.
     pub fn weight_and_bias(&self, index: usize) -> (Vec<f64>, Vec<f64>) {
-        let LayerNoise { inputs, outputs } = self.layer(index);
+        let LayerNoise { inputs, outputs } = &self.layers[index];
         let mut weight = Vec::with_capacity(inputs.len() * outputs.len());
         for output in outputs {
             weight.extend(inputs.iter().map(|input| input * output));

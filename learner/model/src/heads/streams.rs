@@ -108,7 +108,7 @@ pub(crate) fn merge_values(
     let with_noise = |(index, layer): (usize, &HeadLayer<Vec<f32>>)| {
         let mut sum = layer.mean.clone();
         if let (Some(noise), Some(sigma)) = (noise, &layer.sigma) {
-            let noise = noise.layer(index);
+            let noise = &noise.layers[index];
             let narrow = |noise: &[f64]| noise.iter().map(|&it| it as f32).collect::<Vec<_>>();
             let (inputs, outputs) = (narrow(&noise.inputs), narrow(&noise.outputs));
             let rows = sum.weight.chunks_exact_mut(inputs.len());
