@@ -117,12 +117,7 @@ pub struct WeightedLoss {
 impl WeightedLoss {
     /// Whether this loss, of `nats` over `valid` rows, is stuck at chance because its scores lie beyond the soft clip's bound, where they have
     /// no gradient. That happens if what all states share outweighs what tells them apart.
-    pub(crate) fn is_stuck(
-        &self,
-        nats: f32,
-        valid: usize,
-        tanh_clip: f64,
-    ) -> candle_core::Result<bool> {
+    pub(crate) fn is_stuck(&self, nats: f32, valid: usize, tanh_clip: f64) -> Result<bool> {
         let Some(dots) = self.dot_products.first() else {
             return Ok(false);
         };

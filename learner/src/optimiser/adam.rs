@@ -259,12 +259,7 @@ impl StepCoefficients {
     }
 
     /// [`StepCoefficients::apply`] on tensors on the CPU, in parallel.
-    fn apply_in_place(
-        &self,
-        p: &Tensor,
-        g: &Tensor,
-        [m, v]: &[Tensor; 2],
-    ) -> candle_core::Result<bool> {
+    fn apply_in_place(&self, p: &Tensor, g: &Tensor, [m, v]: &[Tensor; 2]) -> Result<bool> {
         let mut all_finite = true;
         // Nested, as an operation changes one tensor.
         modify_in_place(m, g, |m, _| {
@@ -282,18 +277,13 @@ impl StepCoefficients {
         Ok(all_finite)
     }
 
-    fn apply_to_tensors(
-        &self,
-        p: &Var,
-        g: &Tensor,
-        [m, v]: &mut [Tensor; 2],
-    ) -> candle_core::Result<()> {
+    fn apply_to_tensors(&self, p: &Var, g: &Tensor, [m, v]: &mut [Tensor; 2]) -> Result<()> {
         let by = |tensor: &Tensor, factor: f32| tensor.affine(factor.into(), 0.0);
         let g = by(g, self.factor)?;
         *m = (by(m, self.beta1)? + by(&g, self.one_minus_beta1)?)?;
         *v = (by(v, self.beta2)? + by(&g.sqr()?, self.one_minus_beta2)?)?;
         let root = v.sqrt()?.affine(self.root_scale.into(), self.eps.into())?;
-        p.set(&(p.as_detached_tensor() - (by(m, self.step_size)? / root)?)?)
+        Ok(p.set(&(p.as_detached_tensor() - (by(m, self.step_size)? / root)?)?)?)
     }
 }
 
