@@ -4,9 +4,9 @@ use candle_core::Tensor;
 use driml_learner::{AuxiliaryKind, Batch, Compute, Lambda, OwnedBatch, Precision};
 use driml_model::Kernels;
 
-use crate::agents::{GLOBAL, curl_table};
+use crate::agents::{GLOBAL, configs};
 use crate::synthetic::{
-    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, NONE, model, new_agent, pool, random_batch, settings,
+    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, NONE, new_agent, pool, random_batch,
 };
 
 const ROWS: usize = 40;
@@ -25,14 +25,8 @@ fn found(
     deduplicate: bool,
     batch: &Batch<'_>,
 ) -> UpdateResult {
-    let mut settings = settings(lambda);
-    (settings.auxiliary_loss, settings.double_dqn) = (auxiliary_loss, double_dqn);
-    if auxiliary_loss == CURL {
-        settings.condition_on_action = false;
-        settings.own = curl_table(Some(0.5));
-    }
-    let mut model = model(lambda);
-    model.dim = settings.dim_heads(model.num_actions);
+    let (model, mut settings) = configs(auxiliary_loss, lambda);
+    settings.double_dqn = double_dqn;
     let agent = new_agent(model, settings, compute, 1).with_deduplication(deduplicate);
     let it = agent.gradients(batch).unwrap();
     let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
