@@ -259,9 +259,6 @@ impl Agent {
     }
 
     /// Losses and gradients of one batch at the current parameters, with the noise of the next update.
-    ///
-    /// # Errors
-    /// A batch that does not fit, or losses that are not finite.
     pub fn gradients(&self, batch: &Batch<'_>) -> Result<LossesAndGradients> {
         self.gradients_with(batch, &self.noise())
     }
@@ -269,7 +266,7 @@ impl Agent {
     /// [`Agent::gradients`] with the given noise of the noisy layers.
     ///
     /// # Errors
-    /// As [`Agent::gradients`], and noise for a head without noisy layers.
+    /// A batch that does not fit, losses that are not finite, noise for a head without noisy layers.
     pub fn gradients_with(
         &self,
         batch: &Batch<'_>,

@@ -37,9 +37,6 @@ pub struct AugmentSettings {
 
 impl AugmentSettings {
     /// Checks each strength against its range.
-    ///
-    /// # Errors
-    /// The first setting out of its range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let share = "it must lie above 0 and be at most 1, which crops nothing";
         let strength = "it must lie between 0 and 1";

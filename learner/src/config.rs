@@ -89,9 +89,6 @@ pub struct AffinityConfig {
 
 impl AffinityConfig {
     /// Creates the chosen estimator, with its weights drawn from `rng`; `None` for [`EstimatorKind::None`].
-    ///
-    /// # Errors
-    /// A setting or table that is missing or out of range.
     pub fn make_estimator(
         &self,
         num_actions: usize,
@@ -139,9 +136,6 @@ impl AffinityConfig {
 
 impl Config {
     /// Checks the ranges of all fields except `update`, which has its own [`UpdateSettings::validate`].
-    ///
-    /// # Errors
-    /// The first invalid field, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let within = |key: &str, value: u64, most: u64| {
             let why = match most {
@@ -206,9 +200,6 @@ struct ReplayTable {
 
 impl LearnerConfig {
     /// Reads the tables from a run's resolved settings.
-    ///
-    /// # Errors
-    /// A table that is missing or does not fit, or invalid values.
     pub fn from_toml(text: &str) -> Result<Self> {
         let settings = Settings::parse(text)?;
         let this = Self {

@@ -70,9 +70,6 @@ impl Learner {
     }
 
     /// Restores the state of the newest checkpoint in `folder`; without checkpoints, nothing changes.
-    ///
-    /// # Errors
-    /// A checkpoint that is damaged or belongs to another run or to other settings.
     pub fn resume(mut self, folder: &Path) -> Result<Self, CheckpointError> {
         let restored = checkpoint::load_latest(
             folder,

@@ -86,9 +86,6 @@ impl UpdateSettings {
     }
 
     /// Creates the auxiliary loss.
-    ///
-    /// # Errors
-    /// Invalid settings of the loss.
     pub fn make_auxiliary_loss(&self) -> Result<Box<dyn AuxiliaryLoss>> {
         self.auxiliary_loss.make_loss(&AuxiliarySettings {
             auxiliary_loss: self.auxiliary_loss.name(),

@@ -85,9 +85,6 @@ impl Kernels {
 
     /// Dot products [L, B, B] of anchors and candidates, location by location, in f32. `psi` and `phi` are
     /// [B, L, R], or [B, R] for one vector that is paired with every location of the other.
-    ///
-    /// # Errors
-    /// The shapes of `psi` and `phi` do not match.
     pub fn dot_products(self, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Tensor> {
         match self {
             Self::Fused(_) => dots::dot_products(psi, phi),

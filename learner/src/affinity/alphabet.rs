@@ -44,9 +44,6 @@ impl Alphabet {
     }
 
     /// Creates the alphabet in which each of `num_actions` actions is visible.
-    ///
-    /// # Errors
-    /// No actions, or more than 255.
     pub fn raw(num_actions: usize) -> Result<Self> {
         let map = (0..num_actions.min(256)).map(|action| action as u8);
         Self::new(&map.collect::<Vec<_>>())

@@ -49,9 +49,6 @@ impl ExactSettings {
 
 impl ExactAffinity {
     /// Creates an estimate without counts: A is uniform over the alphabet.
-    ///
-    /// # Errors
-    /// A setting out of its range.
     pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self> {
         settings.check_valid()?;
         let m = alphabet.len();

@@ -62,9 +62,6 @@ impl LearnedSettings {
 
 impl LearnedAffinity {
     /// Creates a network with weights drawn from `rng` and q = 0 everywhere, so that A is uniform over the alphabet.
-    ///
-    /// # Errors
-    /// A setting out of its range.
     pub fn new(
         alphabet: Alphabet,
         settings: LearnedSettings,

@@ -57,9 +57,6 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
 }
 
 /// Reads the description in a safetensors file; `None` if the file has none.
-///
-/// # Errors
-/// The bytes are not a whole safetensors file.
 pub fn read_description(safetensors: &[u8]) -> Result<Option<Value>, SafeTensorError> {
     let (_, header) = SafeTensors::read_metadata(safetensors)?;
     let metadata = header.metadata().as_ref();

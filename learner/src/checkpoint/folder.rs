@@ -20,9 +20,6 @@ const LOCK_FILE: &str = ".lock";
 const OLD_SUFFIX: &str = ".replaced.tmp";
 
 /// Creates `folder`, and keeps other learners from saving in it as long as the returned file is open.
-///
-/// # Errors
-/// Another learner saves there, or the file system fails.
 pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
     fs::create_dir_all(folder).map_err(io_error("create", folder))?;
     let path = folder.join(LOCK_FILE);

@@ -117,26 +117,17 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
 }
 
 /// Reads the number of updates and the run's other counts from the checkpoint at `path`, without its tensors.
-///
-/// # Errors
-/// A missing or damaged file.
 pub fn read_run_counts(path: &Path) -> Result<(u64, RunCounts), CheckpointError> {
     let state = read_state(path)?;
     Ok((state.updates, state.progress))
 }
 
 /// Reads the affinity estimate from the checkpoint at `path`; `None` if the run has none.
-///
-/// # Errors
-/// A missing or damaged file.
 pub fn read_affinity(path: &Path) -> Result<Option<AffinityEstimator>, CheckpointError> {
     Ok(read_state(path)?.affinity)
 }
 
 /// Reads the caller's companion from the checkpoint at `path`, if any.
-///
-/// # Errors
-/// A missing or damaged file.
 pub fn read_companion(path: &Path) -> Result<Option<Vec<u8>>, CheckpointError> {
     let state = read_state(path)?;
     let has_companion = state.sha256.contains_key(COMPANION);

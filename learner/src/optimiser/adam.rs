@@ -89,9 +89,6 @@ pub struct Adam {
 
 impl Adam {
     /// Creates Adam's state before the first step, with moments of zero for each of `parameters`.
-    ///
-    /// # Errors
-    /// Settings out of their ranges; the device has no memory left for the moments.
     pub fn new(settings: AdamSettings, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         settings.validate()?;
         let mut moments = BTreeMap::new();

@@ -25,9 +25,6 @@ pub fn follow_error(tau: f64) -> f64 {
 /// `tau` in (0, 1]; at 1 the copy is exact. `1 - tau` is not used, as f32 rounds it for a small tau. If the online network stands still,
 /// the target stops within half a unit in the last place of a parameter divided by tau: [`follow_error`]. Parameters are within
 /// [`FOLLOWED_MAX`]; beyond it, a target is infinite, and the next update rejects the target network's distribution.
-///
-/// # Errors
-/// A parameter of the target that the online network lacks.
 pub fn follow(target: &Parameters, online: &Parameters, tau: f64, kernels: Kernels) -> Result<()> {
     for (name, var) in target.iter() {
         let Some(source) = online.get(name) else {

@@ -32,9 +32,6 @@ impl HeadNoise {
     /// Builds noise from standard normal numbers. `normals` receives a layer's name, `in` or `out`, and the
     /// count, and returns the numbers. Returns `None` for a head without noisy layers.
     ///
-    /// # Errors
-    /// The first error of `normals`.
-    ///
     /// # Panics
     /// If `normals` returns another count.
     pub fn from_normals<E>(
