@@ -4,8 +4,6 @@
 //! This module runs the same kernels as `Network`. It splits the batch over the rayon pool once, not layer by
 //! layer, so that a task's maps stay in its core's cache.
 
-use std::convert::Infallible;
-
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
@@ -145,15 +143,15 @@ impl Weights {
     /// Decodes the weights in the bytes of a safetensors file.
     fn decode(config: &ModelConfig, safetensors: &[u8], precision: Precision) -> Result<Self> {
         let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
-        let mut take = |layer: &str, part: &str| {
-            let (_, values) = parameters
-                .remove(&format!("{layer}.{part}"))
-                .expect("decode returns every parameter of the configuration");
-            Ok::<_, Infallible>(values)
+        let mut take = |layer: &str, part: &str| -> Result<Vec<f32>> {
+            let name = format!("{layer}.{part}");
+            let missing = || ModelError::parameter(&name, "is missing");
+            let (_, values) = parameters.remove(&name).ok_or_else(missing)?;
+            Ok(values)
         };
         let torso = config.torso();
-        let Ok(torso_parameters) = TorsoParameters::collect(&*torso, &mut take);
-        let Ok(head_layers) = HeadLayer::collect(config, take);
+        let torso_parameters = TorsoParameters::collect(&*torso, &mut take)?;
+        let head_layers = HeadLayer::collect(config, take)?;
         Ok(Self {
             torso: torso.for_actor(precision, torso_parameters),
             head: build_relu_layer(precision, merge_values(&head_layers, None)),

@@ -22,11 +22,11 @@ pub(crate) struct HeadLayer<T> {
 impl<T> HeadLayer<T> {
     /// Collects the layers of the head of `config`: value and advantage if dueling, else one. `take` returns
     /// a parameter by the layer's name and the parameter's, such as `weight_mu`.
-    pub(crate) fn collect<E>(
+    pub(crate) fn collect(
         config: &ModelConfig,
-        mut take: impl FnMut(&str, &str) -> std::result::Result<T, E>,
-    ) -> std::result::Result<Vec<Self>, E> {
-        let mut layer = |name: &str, suffix: &str| -> std::result::Result<Layer<T>, E> {
+        mut take: impl FnMut(&str, &str) -> Result<T>,
+    ) -> Result<Vec<Self>> {
+        let mut layer = |name: &str, suffix: &str| -> Result<Layer<T>> {
             Ok(Layer {
                 weight: take(name, &format!("weight{suffix}"))?,
                 bias: take(name, &format!("bias{suffix}"))?,

@@ -6,6 +6,7 @@ use std::fmt;
 use candle_core::Tensor;
 
 use crate::compute::Kernels;
+use crate::error::Result;
 use crate::geometry::ConvLayer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
@@ -79,10 +80,10 @@ pub(crate) struct TorsoParameters<T> {
 
 impl<T> TorsoParameters<T> {
     /// Collects the parameters of `torso`. `take` returns one, by the layer's name and `weight` or `bias`.
-    pub(crate) fn collect<E>(
+    pub(crate) fn collect(
         torso: &dyn Torso,
-        mut take: impl FnMut(&str, &str) -> Result<T, E>,
-    ) -> Result<Self, E> {
+        mut take: impl FnMut(&str, &str) -> Result<T>,
+    ) -> Result<Self> {
         let mut layer = |name: &str| {
             Ok(Layer {
                 weight: take(name, "weight")?,
@@ -90,10 +91,9 @@ impl<T> TorsoParameters<T> {
             })
         };
         let convolutions = torso.convolutions().into_iter();
+        let convolutions = convolutions.map(|it| layer(&it.name));
         Ok(Self {
-            convolutions: convolutions
-                .map(|it| layer(&it.name))
-                .collect::<Result<_, E>>()?,
+            convolutions: convolutions.collect::<Result<_>>()?,
             fc: layer("torso.fc")?,
         })
     }
