@@ -172,13 +172,13 @@ fn curl_masks_no_row() {
 }
 
 /// The entries of `values` whose names pass `part`.
-fn select(values: &Values, part: impl Fn(&str) -> bool) -> Values {
+pub(crate) fn select(values: &Values, part: impl Fn(&str) -> bool) -> Values {
     let named = values.iter().filter(|(name, _)| part(name));
     named.map(|(name, v)| (name.clone(), v.clone())).collect()
 }
 
 /// Moves an average towards the online values of the same names.
-fn average_in(average: &mut Values, online: &Values, rate: f32) {
+pub(crate) fn average_in(average: &mut Values, online: &Values, rate: f32) {
     for (name, values) in average {
         for (value, online) in values.iter_mut().zip(&online[name]) {
             *value += rate * (online - *value);
@@ -187,7 +187,7 @@ fn average_in(average: &mut Values, online: &Values, rate: f32) {
 }
 
 #[track_caller]
-fn assert_near(found: &Values, wanted: &Values) {
+pub(crate) fn assert_near(found: &Values, wanted: &Values) {
     assert_eq!(found.len(), wanted.len());
     for (name, found) in found {
         for (found, wanted) in found.iter().zip(&wanted[name]) {

@@ -17,6 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 use tempfile::tempdir;
 
+use crate::agents::{assert_near, average_in, select};
 use crate::synthetic::{
     ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, check_says, model, new_agent, random_batch,
     settings, values,
@@ -283,23 +284,17 @@ fn the_networks_say_what_they_are_and_need_not() {
     assert_eq!(network_bytes(&resume(folder.path())), network_bytes(&run));
 }
 
-/// Compares the averaged weights with float64. The average does not affect learning.
+/// The average does not affect learning.
 #[test]
 fn averaged_weights_follow_and_are_saved_and_played() {
-    const TAU: f64 = 0.25;
+    const TAU: f32 = 0.25;
     let folder = tempdir().unwrap();
     let mut run = initial_state();
     let mut settings = run.agent.settings().clone();
-    settings.average_tau = Some(TAU);
+    settings.average_tau = Some(TAU.into());
     run.agent = new_agent(model(ALL_DIM), settings.clone(), &Compute::CPU, 1);
-    let values = |parameters: &Parameters| -> Vec<f64> {
-        let all = parameters
-            .iter()
-            .filter(|(name, _)| !name.starts_with("dim."));
-        all.flat_map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap())
-            .map(f64::from)
-            .collect()
-    };
+    let values =
+        |parameters: &Parameters| select(&values(parameters), |name| !name.starts_with("dim."));
     let load = |settings: &_| {
         let model = model(ALL_DIM);
         let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, spec_hash());
@@ -312,18 +307,15 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     for t in 1..=6 {
         learn(&mut run, 1);
         // A plain mean at first, without the weights that the run began with.
-        let rate = TAU.max(1.0 / f64::from(t));
-        for (average, online) in expected.iter_mut().zip(values(run.agent.online())) {
-            *average += rate * (online - *average);
-        }
+        let rate = TAU.max(1.0 / t as f32);
+        average_in(&mut expected, &values(run.agent.online()), rate);
         if t == 2 {
             save(&run, folder.path(), 1);
             run.agent = load(&settings);
         }
     }
     let average = values(run.agent.average().unwrap());
-    let worst = average.iter().zip(&expected).map(|(a, b)| (a - b).abs());
-    assert!(worst.fold(0.0, f64::max) < 1e-6);
+    assert_near(&average, &expected);
     assert_ne!(average, values(run.agent.online()));
 
     save(&run, folder.path(), 1);
