@@ -166,9 +166,6 @@ impl Resizer {
     }
 
     /// Resizes `images` [n, from, c] to [n, to, c].
-    ///
-    /// # Panics
-    /// If the length is not that of whole images.
     pub fn resized(&self, images: &[u8]) -> Vec<u8> {
         let mut enlarged = vec![0; images.len() / self.input_bytes() * self.output_bytes()];
         self.apply(images, &mut enlarged);
@@ -176,9 +173,6 @@ impl Resizer {
     }
 
     /// Resizes `images` [n, from, c] into `enlarged` [n, to, c].
-    ///
-    /// # Panics
-    /// If the two lengths are not whole images of the same number.
     pub fn apply(&self, images: &[u8], enlarged: &mut [u8]) {
         let count = images.len() / self.input_bytes();
         let bytes = [self.input_bytes(), self.output_bytes()].map(|bytes| count * bytes);

@@ -122,9 +122,6 @@ impl PolicyNetwork {
 }
 
 /// Returns the action of the largest of `values` [A]. On a tie the lowest action wins.
-///
-/// # Panics
-/// If an action beyond 255 is best.
 pub fn argmax(values: &[f32]) -> u8 {
     let better = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
     let best = (1..values.len()).fold(0, better);

@@ -65,9 +65,6 @@ pub fn kl(
 }
 
 /// Computes `KL(target || softmax(logits))` of each row [B], in nats, accurate to [`KL_ERROR`]. A result below 0 by rounding is 0.
-///
-/// # Panics
-/// As [`kl`].
 pub fn row_kls(logits: &[f32], target: &[f32], atoms: usize) -> Vec<f64> {
     let rows = logits.chunks_exact(atoms).zip(target.chunks_exact(atoms));
     let row = |(logits, target)| kl(logits, target, None, atoms, &mut vec![0.0; atoms]).max(0.0);

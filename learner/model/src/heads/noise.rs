@@ -31,9 +31,6 @@ impl HeadNoise {
 
     /// Builds noise from standard normal numbers. `normals` receives a layer's name, `in` or `out`, and the
     /// count, and returns the numbers. Returns `None` for a head without noisy layers.
-    ///
-    /// # Panics
-    /// If `normals` returns another count.
     pub fn from_normals<E>(
         config: &ModelConfig,
         mut normals: impl FnMut(&str, &str, usize) -> Result<Vec<f64>, E>,

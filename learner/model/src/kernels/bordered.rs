@@ -113,9 +113,6 @@ impl<E: Element> BorderedConvolution<E> {
     }
 
     /// Computes the gradient of an image from its map's, `grad_map` [height, width, out], row by row as [`BorderedConvolution::forward`].
-    ///
-    /// # Panics
-    /// If the convolution was built without `backward`.
     pub(crate) fn image_gradient<S: Simd<Element = E>>(
         &self,
         simd: S,

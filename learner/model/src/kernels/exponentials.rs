@@ -10,9 +10,6 @@ use crate::kernels::precision::Precision;
 /// `tanh = (1 - e) / (1 + e)`, and its slope is `4 e / (1 + e)^2`. Unlike `1 - tanh^2`, the slope keeps its precision where the
 /// score saturates. `1 - e` is computed as `expm1`, which keeps its precision if the bound is far above the score. Both results
 /// are within a relative 2e-15 for scores and bounds from 1e-150 to 1e150. A slope below 1e-307 is 0; a NaN gives NaN.
-///
-/// # Panics
-/// If the lengths differ.
 pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slopes: &mut [f64]) {
     let lens = [scores.len(), slopes.len()];
     assert_eq!(lens, [dots.len(); 2], "a score and a slope of each dot");

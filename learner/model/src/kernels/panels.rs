@@ -35,9 +35,6 @@ impl<'a> Matrix<'a> {
     }
 
     /// Selects columns without copying. The result can be a right operand. A left operand needs adjacent runs.
-    ///
-    /// # Panics
-    /// If the matrix is transposed or lacks these columns.
     pub(crate) fn columns(self, columns: std::ops::Range<usize>) -> Self {
         assert!(
             !self.transposed && !columns.is_empty() && columns.end <= self.cols,
@@ -272,9 +269,6 @@ pub(crate) struct PackedRows<'a, E: Element> {
 
 impl<'a, E: Element> PackedRows<'a, E> {
     /// Packs the rows of `a` [m, k]: in place if they need no rounding, else as a rounded copy.
-    ///
-    /// # Panics
-    /// If the runs of `a` are not adjacent.
     pub(crate) fn pack<S: Simd<Element = E>>(simd: S, a: Matrix<'a>, threads: Threads) -> Self {
         let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
         assert_eq!(a.data.len(), m * k, "columns of a matrix as a left operand");

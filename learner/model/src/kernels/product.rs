@@ -31,9 +31,6 @@ pub(crate) struct Product<'a> {
 
 impl<'a> Product<'a> {
     /// Creates a product that is computed on the rayon pool.
-    ///
-    /// # Panics
-    /// If the shapes do not match.
     pub(crate) fn new(precision: Precision, a: Matrix<'a>, b: Matrix<'a>) -> Self {
         let (rows, cols) = (a.rows, b.cols);
         assert_eq!(a.cols, b.rows, "terms of a {rows}x{cols} product");
@@ -53,9 +50,6 @@ impl<'a> Product<'a> {
 
     /// Adds the product to `biases` [groups, n]. Each bias row serves an equal share of consecutive output
     /// rows. It is copied in the cache of the core that multiplies.
-    ///
-    /// # Panics
-    /// If the rows cannot be shared equally.
     pub(crate) fn with_biases(self, biases: &'a [f32]) -> Self {
         let (rows, cols) = (self.a.rows, self.b.cols);
         let groups = biases.len() / cols;
@@ -75,9 +69,6 @@ impl<'a> Product<'a> {
     }
 
     /// Computes the product into `out` [m, n].
-    ///
-    /// # Panics
-    /// If `out` has another length.
     pub(crate) fn write(self, out: &mut [f32], mode: Mode) {
         let len = self.a.rows * self.b.cols;
         assert_eq!(out.len(), len, "the scalars of a product");
@@ -85,9 +76,6 @@ impl<'a> Product<'a> {
     }
 
     /// Adds the product to the columns of `sums` from `first` on. The rows of `sums` are `stride` long.
-    ///
-    /// # Panics
-    /// If `sums` lacks these columns, or if the product has biases or a function for finished rows.
     pub(crate) fn add_to_columns(self, sums: &mut [f32], stride: usize, first: usize) {
         let (rows, end) = (self.a.rows, first + self.b.cols);
         assert_eq!(sums.len(), rows * stride, "{rows} rows of {stride}");
