@@ -282,13 +282,19 @@ impl<'a, E: Element> PackedRows<'a, E> {
         let values = if let Some(values) = E::in_place(a.data) {
             Scalars::InPlace(values)
         } else {
-            let mut values = Buffer::new(m * row_stride.max(steps * depth));
+            let mut values = Buffer::<E>::new(m * row_stride.max(steps * depth));
+            let rows = (TASK_LEN / row_stride).max(1);
             if a.transposed && S::LEFT_STEPS_ADJACENT {
-                pack_transposed_rows(simd, a.transposed(), row_stride, &mut values, threads);
+                let rows = rows.next_multiple_of(LANES);
+                threads.for_each_chunk(&mut values, rows * row_stride, |(part, values)| {
+                    transpose_rows(simd, a.transposed(), part * rows, row_stride, values);
+                });
             } else if a.transposed {
                 pack_steps(simd, a.transposed(), &mut values, threads);
             } else {
-                pack_rows(simd, a.data, k, row_stride, &mut values, threads);
+                threads.for_each_chunk(&mut values, rows * row_stride, |(part, values)| {
+                    write_rows(simd, &a.data[part * rows * k..], k, row_stride, values);
+                });
             }
             Scalars::Copied(values)
         };
@@ -313,37 +319,9 @@ impl<'a, E: Element> PackedRows<'a, E> {
 /// Scalars that one task rounds.
 const TASK_LEN: usize = 1 << 15;
 
-/// Rounds rows of `cols` scalars into rows of `stride`, padded with zeros.
-fn pack_rows<S: Simd>(
-    simd: S,
-    data: &[f32],
-    cols: usize,
-    stride: usize,
-    values: &mut [S::Element],
-    threads: Threads,
-) {
-    let rows = (TASK_LEN / stride).max(1);
-    threads.for_each_chunk(values, rows * stride, |(part, values)| {
-        write_rows(simd, &data[part * rows * cols..], cols, stride, values);
-    });
-}
-
-/// Packs the columns of `a` [k, m] as rows of `stride`, a multiple of `LANES` steps, padded with zeros.
-fn pack_transposed_rows<S: Simd>(
-    simd: S,
-    a: Matrix<'_>,
-    stride: usize,
-    values: &mut [S::Element],
-    threads: Threads,
-) {
-    let rows = (TASK_LEN / stride).max(1).next_multiple_of(LANES);
-    threads.for_each_chunk(values, rows * stride, |(part, values)| {
-        transpose_rows(simd, a, part * rows, stride, values);
-    });
-}
-
 vectorized! {
-    /// [`pack_transposed_rows`] of the columns from the `first` on: square blocks of steps are transposed in registers.
+    /// Packs the columns of `a` [k, m] from the `first` on as rows of `stride`, a multiple of `LANES` steps, padded with zeros. Square
+    /// blocks of steps are transposed in registers.
     fn transpose_rows<S>(
         simd,
         a: Matrix<'a>,
