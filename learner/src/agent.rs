@@ -218,9 +218,6 @@ impl Agent {
     }
 
     /// The weights that actors need, torso and head, as safetensors bytes with scalars of type `stored`.
-    ///
-    /// # Errors
-    /// A weight that is not finite, or too large for the type; a failing serialisation.
     pub fn weights(&self, stored: WeightDtype) -> Result<Vec<u8>> {
         Ok(self
             .online()

@@ -90,9 +90,6 @@ impl Insight {
     ///
     /// `later` holds s_{t+k} of the s_t in `now`, in the same order. Source: Mazoure et al. 2020, section 4, where the negatives are a
     /// batch's other states.
-    ///
-    /// # Errors
-    /// Batches of different lengths, or an unknown action.
     pub fn local_matches(
         &self,
         now: &NetworkOutputs,

@@ -225,9 +225,6 @@ impl Learner {
 
     /// Writes a checkpoint into `folder`, together with the bytes of the caller's `companion`, if any, which
     /// [`checkpoint::read_companion`] reads.
-    ///
-    /// # Errors
-    /// A state that is not finite, or a failing file system; older checkpoints are untouched.
     pub fn save(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), CheckpointError> {
         let extras = Extras {
             spec: &self.config.spec,

@@ -31,10 +31,6 @@ pub struct PolicyNetwork {
 impl PolicyNetwork {
     /// Builds the network of `config` from the bytes of a safetensors file, ignoring DIM parameters.
     /// `precision` is the precision of its matrix products.
-    ///
-    /// # Errors
-    /// An invalid configuration, bytes that are not safetensors, or a parameter that is missing, unknown, of another type
-    /// or shape, or not finite.
     pub fn new(config: &ModelConfig, safetensors: &[u8], precision: Precision) -> Result<Self> {
         let config = config.without_dim();
         let weights = Weights::decode(&config, safetensors, precision)?;

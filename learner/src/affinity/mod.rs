@@ -42,10 +42,6 @@ impl AffinityEstimator {
     }
 
     /// Checks the invariants that [`AffinityEstimator::observe`] keeps. An estimate that was read from a file may violate them.
-    ///
-    /// # Errors
-    /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
-    /// are not probabilities.
     pub fn check_valid(&self) -> Result<()> {
         self.alphabet().check_valid()?;
         match self {

@@ -141,9 +141,6 @@ impl Adam {
     }
 
     /// The moments as tensors: `m.<name>` and `v.<name>`, in the parameters' shapes.
-    ///
-    /// # Errors
-    /// A failing allocation, or a moment that is not finite.
     pub fn to_tensors(&self) -> Result<HashMap<String, Tensor>> {
         let mut tensors = HashMap::new();
         for (name, moments) in &self.moments {
@@ -162,9 +159,6 @@ impl Adam {
     }
 
     /// Restores the moments from [`Adam::to_tensors`], bit for bit, and the count of steps.
-    ///
-    /// # Errors
-    /// A moment that is missing, of another shape or type, not finite, or of no parameter of this optimiser.
     pub fn restore(&mut self, step: u64, mut tensors: HashMap<String, Tensor>) -> Result<()> {
         let error = |name: &str, why: &str| UpdateError::State(format!("the moment {name} {why}"));
         let mut take = |which: &str, name: &str, ours: &Tensor| -> Result<_> {

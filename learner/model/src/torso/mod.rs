@@ -57,9 +57,6 @@ impl TorsoName {
     }
 
     /// Checks that `settings` has what this torso needs and no setting of another torso.
-    ///
-    /// # Errors
-    /// [`ModelError::Config`] names the setting and the torso.
     pub(crate) fn check_settings(self, settings: &TorsoSettings<'_>) -> Result<()> {
         let given = [
             ("conv", !settings.conv.is_empty()),
