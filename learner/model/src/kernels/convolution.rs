@@ -212,9 +212,7 @@ vectorized! {
             *to = relu_gradient(active.value(), grad);
         }
     }
-}
 
-vectorized! {
     /// Adds each location of `map` [locations, out] to `sums` [out].
     pub(crate) fn add_locations<S>(simd, map: &'a [f32], sums: &'a mut [f32]) {
         let out = sums.len();

@@ -39,9 +39,7 @@ vectorized! {
             *slope = scale * 4.0 * e * part * part;
         }
     }
-}
 
-vectorized! {
     fn exp_of_differences<S>(simd, values: &'a mut [f64], max: f64) {
         for value in values {
             *value = exp_pair(*value - max).0;

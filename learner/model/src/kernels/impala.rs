@@ -347,17 +347,13 @@ vectorized! {
             *to = value * scale + bias;
         }
     }
-}
 
-vectorized! {
     fn add_residual<S>(simd, row: &'a [f32], bias: &'a [f32], to: &'a mut [f32]) {
         for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
             *to += value + bias;
         }
     }
-}
 
-vectorized! {
     /// Adds to `to` the gradients before a ReLU whose output was `active`.
     fn add_relu_backward<S>(simd, active: &'a [S::Element], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {

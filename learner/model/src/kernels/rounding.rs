@@ -7,16 +7,12 @@ vectorized! {
     pub(crate) fn store_bytes<S>(simd, bytes: &'a [u8], values: &'a mut [S::Element]) {
         S::Element::store_bytes(simd, bytes, values);
     }
-}
 
-vectorized! {
     /// Rounds `floats` into `values`, which has the same length.
     pub(crate) fn store<S>(simd, floats: &'a [f32], values: &'a mut [S::Element]) {
         S::Element::store(simd, floats, values);
     }
-}
 
-vectorized! {
     /// Rounds rows of `cols` scalars into rows of `stride`, padded with zeros.
     pub(crate) fn write_rows<S>(
         simd,
@@ -32,9 +28,7 @@ vectorized! {
             end.fill(S::Element::default());
         }
     }
-}
 
-vectorized! {
     /// Stores elements as operands of a sum over windows: [`Element::store_steps`].
     pub(crate) fn store_steps<S>(
         simd,
@@ -44,9 +38,7 @@ vectorized! {
     ) {
         S::Element::store_steps(simd, values, shift, steps);
     }
-}
 
-vectorized! {
     /// Transposes an image [rows, cols], in square blocks that fit the registers.
     pub(crate) fn transpose<S>(
         simd,

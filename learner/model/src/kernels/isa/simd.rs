@@ -86,14 +86,14 @@ pub(crate) trait Loop {
     fn run(self);
 }
 
-/// Defines a function whose body is compiled for the instruction set in its first argument.
+/// Defines functions whose bodies are compiled for the instruction set in their first argument.
 ///
 /// `fn name<S>(simd, argument: &'a [S::Element], ..) { .. }`; further type parameters are elements, and references have the lifetime `'a`.
 macro_rules! vectorized {
-    (
+    ($(
         $(#[$meta:meta])*
         $vis:vis fn $name:ident<$S:ident $(, $E:ident)*>($simd:ident $(, $arg:ident: $ty:ty)* $(,)?) $body:block
-    ) => {
+    )+) => {$(
         $(#[$meta])*
         $vis fn $name<'a, $S: $crate::kernels::isa::simd::Simd $(, $E: $crate::kernels::isa::element::Element)*>(
             $simd: $S
@@ -116,6 +116,6 @@ macro_rules! vectorized {
             }
             $simd.vectorize(Work::<$S $(, $E)*>($simd, $($arg,)* std::marker::PhantomData));
         }
-    };
+    )+};
 }
 pub(crate) use vectorized;
