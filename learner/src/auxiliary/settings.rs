@@ -4,7 +4,10 @@
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use crate::error::{Result, UpdateError};
+use crate::{
+    error::{Result, UpdateError},
+    ranges::check_range,
+};
 
 /// The pairs NtM, in the order of every array of four here: features N of (s_t, a_t) are compared with features M of s_{t+k}.
 pub const PAIRS: [&str; 4] = ["3t3", "3t4", "4t3", "4t4"];
@@ -76,11 +79,7 @@ impl Lambda {
     /// Checks that every weight is from 0 to 1e30.
     pub fn validate(&self) -> Result<()> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
-            if !(0.0..=1e30).contains(&value) {
-                return Err(UpdateError::Settings(format!(
-                    "lambda.{name} = {value}, which must be a number from 0 to 1e30"
-                )));
-            }
+            check_range(&format!("lambda.{name}"), value, 0.0..=1e30)?;
         }
         Ok(())
     }
