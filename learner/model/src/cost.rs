@@ -62,10 +62,8 @@ impl ModelConfig {
         let mut views = Vec::with_capacity(shapes.len());
         for (name, shape) in &shapes {
             let values = &zeros[..scalars(shape)];
-            views.push((
-                name,
-                TensorView::new(dtype.safetensors_dtype(), shape.clone(), values)?,
-            ));
+            let view = TensorView::new(dtype.safetensors_dtype(), shape.clone(), values)?;
+            views.push((name, view));
         }
         Ok(safetensors::serialize(views, None)?.len())
     }

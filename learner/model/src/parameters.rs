@@ -126,10 +126,8 @@ impl Parameters {
         }
         let mut views = Vec::with_capacity(tensors.len());
         for (name, shape, bytes) in &tensors {
-            views.push((
-                *name,
-                TensorView::new(dtype.safetensors_dtype(), shape.clone(), bytes)?,
-            ));
+            let view = TensorView::new(dtype.safetensors_dtype(), shape.clone(), bytes)?;
+            views.push((*name, view));
         }
         Ok(safetensors::serialize(views, metadata)?)
     }

@@ -20,19 +20,18 @@ use crate::kernels::tensors::{Input, values_of};
 /// tensors are f32. The bits of results and gradients do not depend on the number of threads.
 pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     let sizes = |vectors: &Tensor| match *vectors.dims() {
-        [rows, embedding_dim] => Some((rows, 1, embedding_dim)),
-        [rows, locations, embedding_dim] => Some((rows, locations, embedding_dim)),
-        _ => None,
+        [rows, embedding_dim] => (rows, 1, embedding_dim),
+        [rows, locations, embedding_dim] => (rows, locations, embedding_dim),
+        // Of another rank: no vectors.
+        _ => (0, 0, 0),
     };
-    let (Some(anchors), Some(candidates)) = (sizes(psi), sizes(phi)) else {
-        bail!("dot products of {:?} and {:?}", psi.shape(), phi.shape());
-    };
+    let (anchors, candidates) = (sizes(psi), sizes(phi));
     let locations = anchors.1.max(candidates.1);
     let broadcasts = |own: usize| own == locations || own == 1;
     let fits = (anchors.0, anchors.2) == (candidates.0, candidates.2)
         && broadcasts(anchors.1)
         && broadcasts(candidates.1)
-        && psi.elem_count() * phi.elem_count() > 0;
+        && anchors.0 * anchors.2 * locations > 0;
     if !fits {
         bail!("dot products of {:?} and {:?}", psi.shape(), phi.shape());
     }

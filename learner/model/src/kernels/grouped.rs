@@ -35,12 +35,9 @@ pub(crate) fn grouped_linear(
     let fits = w.dims() == [count * out, inputs] && b.dims() == [count * out];
     let known = groups.iter().all(|&group| usize::from(group) < count);
     if !fits || rows != groups.len() || !known || rows * inputs * out == 0 {
+        let (x, w, b, rows) = (x.shape(), w.shape(), b.shape(), groups.len());
         bail!(
-            "layer of x {:?} with weight {:?}, bias {:?} and {out} outputs for each of {} rows' groups",
-            x.shape(),
-            w.shape(),
-            b.shape(),
-            groups.len()
+            "layer of x {x:?} with weight {w:?}, bias {b:?} and {out} outputs for each of {rows} rows' groups"
         );
     }
     let mut order: Vec<usize> = (0..rows).collect();

@@ -66,12 +66,8 @@ fn apply(
     let outputs = w.dims().first().copied().unwrap_or(0);
     let fits = w.dims() == [outputs, inputs] && b.dims() == [outputs] && inputs * outputs > 0;
     if !fits {
-        bail!(
-            "linear layer of x {:?} with weight {:?} and bias {:?}",
-            x.shape(),
-            w.shape(),
-            b.shape()
-        );
+        let (x, w, b) = (x.shape(), w.shape(), b.shape());
+        bail!("linear layer of x {x:?} with weight {w:?} and bias {b:?}");
     }
     let operation = Linear {
         rows: x.elem_count() / inputs,

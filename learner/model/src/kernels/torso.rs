@@ -34,11 +34,8 @@ pub(crate) fn torso(
     let (count, outputs) = (images.dim(0)?, weight.dims2()?.0);
     let inputs = shapes[shapes.len() - 1].map_len();
     if weight.dims() != [outputs, inputs] || bias.dims() != [outputs] {
-        bail!(
-            "linear layer of {inputs} inputs with weight {:?} and bias {:?}",
-            weight.shape(),
-            bias.shape()
-        );
+        let (weight, bias) = (weight.shape(), bias.shape());
+        bail!("linear layer of {inputs} inputs with weight {weight:?} and bias {bias:?}");
     }
     with_simd!(AnySimd::fastest(precision), simd => {
         let torso = Torso {
