@@ -90,61 +90,24 @@ impl<O: Operation<N>, const N: usize> CandleOp<O, N> {
     }
 }
 
-impl<O: Operation<2>> CustomOp2 for CandleOp<O, 2> {
-    fn name(&self) -> &'static str {
-        O::NAME
-    }
+/// Implements candle's trait for an operation on this number of tensors, each a name and that of its layout.
+macro_rules! custom_op {
+    ($Op:ident, $count:literal, $($x:ident $layout:ident),+; $Gradients:ty) => {
+        impl<O: Operation<$count>> $Op for CandleOp<O, $count> {
+            fn name(&self) -> &'static str {
+                O::NAME
+            }
 
-    fn cpu_fwd(
-        &self,
-        a: &CpuStorage,
-        a_layout: &Layout,
-        b: &CpuStorage,
-        b_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        self.forward([Input::new(a, a_layout), Input::new(b, b_layout)])
-    }
+            fn cpu_fwd(&self, $($x: &CpuStorage, $layout: &Layout),+) -> Result<(CpuStorage, Shape)> {
+                self.forward([$(Input::new($x, $layout)),+])
+            }
 
-    fn bwd(
-        &self,
-        a: &Tensor,
-        b: &Tensor,
-        y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        Ok(self.backward([a, b], y, grad_y)?.into())
-    }
+            fn bwd(&self, $($x: &Tensor,)+ y: &Tensor, grad_y: &Tensor) -> Result<$Gradients> {
+                Ok(self.backward([$($x),+], y, grad_y)?.into())
+            }
+        }
+    };
 }
 
-impl<O: Operation<3>> CustomOp3 for CandleOp<O, 3> {
-    fn name(&self) -> &'static str {
-        O::NAME
-    }
-
-    fn cpu_fwd(
-        &self,
-        a: &CpuStorage,
-        a_layout: &Layout,
-        b: &CpuStorage,
-        b_layout: &Layout,
-        c: &CpuStorage,
-        c_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        self.forward([
-            Input::new(a, a_layout),
-            Input::new(b, b_layout),
-            Input::new(c, c_layout),
-        ])
-    }
-
-    fn bwd(
-        &self,
-        a: &Tensor,
-        b: &Tensor,
-        c: &Tensor,
-        y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        Ok(self.backward([a, b, c], y, grad_y)?.into())
-    }
-}
+custom_op!(CustomOp2, 2, a a_layout, b b_layout; (Option<Tensor>, Option<Tensor>));
+custom_op!(CustomOp3, 3, a a_layout, b b_layout, c c_layout; (Option<Tensor>, Option<Tensor>, Option<Tensor>));
