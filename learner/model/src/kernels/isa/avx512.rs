@@ -68,23 +68,19 @@ pub(super) fn is_bf16_fast_by(vendor: [u8; 4]) -> bool {
     vendor == *b"Auth"
 }
 
-/// Most rows of a tile. The accumulators, the columns and one row must fit into the 32 registers.
-const fn rows_max(vecs: usize) -> usize {
-    match vecs {
-        1 => 16,
-        2 => 12,
-        _ => 6,
-    }
-}
-
 macro_rules! simd {
     ($simd:ident, $half:ty, $element:ty, $features:literal) => {
         impl Simd for $simd {
             type Element = $element;
             const VECS_MAX: usize = 4;
 
+            /// The accumulators, the columns and one row fit into the 32 registers.
             fn rows_max(vecs: usize) -> usize {
-                rows_max(vecs)
+                match vecs {
+                    1 => 16,
+                    2 => 12,
+                    _ => 6,
+                }
             }
 
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
