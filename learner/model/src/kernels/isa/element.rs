@@ -82,7 +82,9 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     fn unpack(bits: u32, step: &mut [Self]);
 
     /// Returns `values` themselves if they need no rounding.
-    fn in_place(values: &[f32]) -> Option<&[Self]>;
+    fn in_place(_values: &[f32]) -> Option<&[Self]> {
+        None
+    }
 }
 
 impl Element for f32 {
@@ -227,9 +229,5 @@ impl Element for bf16 {
     fn unpack(bits: u32, step: &mut [Self]) {
         step[0] = Self::from_bits(bits as u16);
         step[1] = Self::from_bits((bits >> 16) as u16);
-    }
-
-    fn in_place(_: &[f32]) -> Option<&[Self]> {
-        None
     }
 }
