@@ -31,11 +31,6 @@ macro_rules! simd {
                 let is_available = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
                 is_available.then_some(Self(()))
             }
-
-            #[target_feature(enable = "avx2,fma")]
-            unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4 5 6;);
-            }
         }
 
         impl Rounding for $simd {}
@@ -48,9 +43,10 @@ macro_rules! simd {
                 6
             }
 
+            #[target_feature(enable = "avx2,fma")]
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
                 // SAFETY: `new` found the instructions; the caller guarantees the rest.
-                unsafe { Self::compute_sized(tile, rows, vecs) }
+                compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4 5 6;);
             }
 
             #[inline(always)]

@@ -83,9 +83,19 @@ macro_rules! simd {
                 }
             }
 
+            #[target_feature(enable = $features)]
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
                 // SAFETY: `new` found the instructions; the caller guarantees the rest.
-                unsafe { Self::compute_sized(tile, rows, vecs) }
+                if vecs == 1 && tile.cols <= HALF {
+                    return compute_sizes!($half, tile, rows, vecs;
+                        1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
+                    );
+                }
+                compute_sizes!(Self, tile, rows, vecs;
+                    1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
+                    2: 1 2 3 4 5 6 7 8 9 10 11 12;
+                    4: 1 2 3 4 5 6;
+                )
             }
 
             #[inline(always)]
@@ -105,20 +115,6 @@ macro_rules! simd {
             #[target_feature(enable = $features)]
             unsafe fn vectorized<W: Loop>(work: W) {
                 work.run();
-            }
-
-            #[target_feature(enable = $features)]
-            unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                if vecs == 1 && tile.cols <= HALF {
-                    return compute_sizes!($half, tile, rows, vecs;
-                        1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
-                    );
-                }
-                compute_sizes!(Self, tile, rows, vecs;
-                    1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
-                    2: 1 2 3 4 5 6 7 8 9 10 11 12;
-                    4: 1 2 3 4 5 6;
-                )
             }
         }
     };
