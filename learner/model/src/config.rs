@@ -227,7 +227,7 @@ impl ModelConfig {
 
     /// Builds the torso. If the configuration is invalid, the torso is unusable.
     pub(crate) fn torso(&self) -> Box<dyn Torso> {
-        self.torso.kind().build(&self.torso_settings())
+        (self.torso.kind().build)(&self.torso_settings())
     }
 
     /// Returns the height, width and channels of f3. Meaningful for a valid configuration.

@@ -62,7 +62,7 @@ impl InputSize {
         frame: (usize, usize),
     ) -> ReadArea {
         let whole = self.whole_input();
-        let read = torso.kind().read_size(conv, whole);
+        let read = (torso.kind().read_size)(conv, whole);
         let Some(input) = read.filter(|&(rows, cols)| rows.min(cols) > 0) else {
             let input = whole;
             return ReadArea { input, frame };

@@ -25,37 +25,20 @@ const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "block2.conv2",
 ];
 
-#[derive(PartialEq)]
-pub(super) enum Kind {
-    Impala,
-    Impoola,
-}
+pub(super) const IMPALA: TorsoKind = TorsoKind {
+    settings: &["channels", "scale_blocks"],
+    build: |settings| Box::new(Impala::new(settings, false)),
+    read_size: |_, image| Some(image),
+    convolutions: "with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and \
+                   x + conv2(ReLU(conv1(ReLU(x)))) for block1 and block2",
+    fc_input: "ReLU of the last stage's output as channel, row, column",
+};
 
-impl TorsoKind for Kind {
-    fn settings(&self) -> &'static [&'static str] {
-        &["channels", "scale_blocks"]
-    }
-
-    fn build(&self, settings: &TorsoSettings<'_>) -> Box<dyn Torso> {
-        Box::new(Impala {
-            input: settings.input,
-            widths: settings.channels.to_vec(),
-            scale_blocks: settings.scale_blocks,
-            takes_mean: *self == Self::Impoola,
-        })
-    }
-
-    fn describe(&self) -> String {
-        let read = match self {
-            Self::Impala => "ReLU of the last stage's output as channel, row, column",
-            Self::Impoola => "the mean over the locations of ReLU of the last stage's output",
-        };
-        format!(
-            "with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
-             and block2; torso.fc takes {read}"
-        )
-    }
-}
+pub(super) const IMPOOLA: TorsoKind = TorsoKind {
+    build: |settings| Box::new(Impala::new(settings, true)),
+    fc_input: "the mean over the locations of ReLU of the last stage's output",
+    ..IMPALA
+};
 
 /// The torso `impala` or `impoola`, on an input of (height, width, channels).
 #[derive(Debug)]
@@ -66,6 +49,17 @@ struct Impala {
     scale_blocks: bool,
     /// Whether the fully connected layer takes the mean of f3 over its locations, as in `impoola`.
     takes_mean: bool,
+}
+
+impl Impala {
+    fn new(settings: &TorsoSettings<'_>, takes_mean: bool) -> Self {
+        Self {
+            input: settings.input,
+            widths: settings.channels.to_vec(),
+            scale_blocks: settings.scale_blocks,
+            takes_mean,
+        }
+    }
 }
 
 impl Torso for Impala {

@@ -22,20 +22,16 @@ pub(crate) struct TorsoSettings<'a> {
 }
 
 /// What the menu knows of a torso.
-pub(crate) trait TorsoKind: Sync {
+pub(crate) struct TorsoKind {
     /// The names of the settings that it reads. It is made of the first, which must be given.
-    fn settings(&self) -> &'static [&'static str];
-
-    fn build(&self, settings: &TorsoSettings<'_>) -> Box<dyn Torso>;
-
+    pub(crate) settings: &'static [&'static str],
+    pub(crate) build: fn(&TorsoSettings<'_>) -> Box<dyn Torso>,
     /// Returns (height, width) of the part of `image` that it reads, from the upper left corner; `None` if `conv` does not fit. With
     /// zero padding, every pixel is in a window.
-    fn read_size(&self, _conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
-        Some(image)
-    }
-
-    /// See [`super::TorsoName::describe`].
-    fn describe(&self) -> String;
+    pub(crate) read_size: fn(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)>,
+    /// How the convolutions are applied, and what the fully connected layer takes: see [`super::TorsoName::describe`].
+    pub(crate) convolutions: &'static str,
+    pub(crate) fc_input: &'static str,
 }
 
 /// A torso of given sizes, without its parameters. It turns frames into f3, the output of its convolutions, and f4, a fully

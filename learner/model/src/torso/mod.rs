@@ -24,7 +24,7 @@ macro_rules! torsos {
         impl TorsoName {
             const ALL: &[Self] = &[$(Self::$Torso),+];
 
-            pub(crate) fn kind(self) -> &'static dyn TorsoKind {
+            pub(crate) fn kind(self) -> &'static TorsoKind {
                 match self {
                     $(Self::$Torso => &$kind,)+
                 }
@@ -36,24 +36,25 @@ macro_rules! torsos {
 torsos! {
     /// The convolutions of `conv`. Source: Mnih et al. 2015.
     #[default]
-    Nature = nature::Kind;
+    Nature = nature::NATURE;
     /// A residual network with a stage for each entry of `channels`. Source: Espeholt et al. 2018.
-    Impala = impala::Kind::Impala;
+    Impala = impala::IMPALA;
     /// As `Impala`, but f4 reads the mean of f3 over its locations. Source: Trumpp et al. 2025.
-    Impoola = impala::Kind::Impoola;
+    Impoola = impala::IMPOOLA;
 }
 
 impl TorsoName {
     /// Returns the settings that only other torsos use.
     pub fn settings_of_others(self) -> impl Iterator<Item = &'static str> {
-        let all = Self::ALL.iter().flat_map(|it| it.kind().settings());
+        let all = Self::ALL.iter().flat_map(|it| it.kind().settings);
         all.copied()
-            .filter(move |it| !self.kind().settings().contains(it))
+            .filter(move |it| !self.kind().settings.contains(it))
     }
 
     /// Describes for the reader of a checkpoint how the convolutions are applied, and what the fully connected layer takes.
     pub fn describe(self) -> String {
-        self.kind().describe()
+        let kind = self.kind();
+        format!("{}; torso.fc takes {}", kind.convolutions, kind.fc_input)
     }
 
     /// Checks that `settings` has what this torso needs and no setting of another torso.
@@ -63,9 +64,9 @@ impl TorsoName {
             ("channels", !settings.channels.is_empty()),
             ("scale_blocks", settings.scale_blocks),
         ];
-        let known = self.kind().settings();
+        let known = self.kind().settings;
         let own = known[0];
-        let others = Self::ALL.iter().filter(|it| it.kind().settings()[0] != own);
+        let others = Self::ALL.iter().filter(|it| it.kind().settings[0] != own);
         let others: Vec<_> = others.map(Self::to_string).collect();
         let way = format!("model.torso to {}", others.join(" or "));
         for (name, is_given) in given {

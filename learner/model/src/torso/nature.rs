@@ -3,7 +3,7 @@
 
 use candle_core::{Result, Tensor};
 
-use super::interface::{ActingTorso, Torso, TorsoKind, TorsoParameters, TorsoSettings};
+use super::interface::{ActingTorso, Torso, TorsoKind, TorsoParameters};
 use crate::compute::Kernels;
 use crate::geometry::{ConvLayer, ConvShape, read_size};
 use crate::init::Initializer;
@@ -16,25 +16,13 @@ use crate::kernels::precision::Precision;
 use crate::kernels::torso::torso;
 use crate::layers::LayerSpec;
 
-pub(super) struct Kind;
-
-impl TorsoKind for Kind {
-    fn settings(&self) -> &'static [&'static str] {
-        &["conv"]
-    }
-
-    fn build(&self, settings: &TorsoSettings<'_>) -> Box<dyn Torso> {
-        Box::new(Nature::new(settings.input, settings.conv))
-    }
-
-    fn read_size(&self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
-        read_size(conv, image)
-    }
-
-    fn describe(&self) -> String {
-        "without padding, each followed by ReLU; torso.fc takes their output as channel, row, column".into()
-    }
-}
+pub(super) const NATURE: TorsoKind = TorsoKind {
+    settings: &["conv"],
+    build: |settings| Box::new(Nature::new(settings.input, settings.conv)),
+    read_size,
+    convolutions: "without padding, each followed by ReLU",
+    fc_input: "their output as channel, row, column",
+};
 
 #[derive(Debug)]
 struct Nature {
