@@ -60,16 +60,7 @@ pub(crate) fn residual_block(
         && parameters.skip_weight.dims() == [outputs, inputs]
         && parameters.out_biases.iter().all(is_bias);
     if !fits {
-        bail!(
-            "residual block of x {:?} and {:?} with weights {:?}, {:?}, {:?} and biases {:?}, {:?}",
-            x.shape(),
-            joined.map(Tensor::shape),
-            parameters.hidden_weight.shape(),
-            parameters.out_weight.shape(),
-            parameters.skip_weight.shape(),
-            parameters.hidden_bias.shape(),
-            parameters.out_biases
-        );
+        bail!("residual block of {x:?} and {joined:?} with {parameters:?}");
     }
     let block = ResidualBlock {
         parameters: parameters.clone(),
