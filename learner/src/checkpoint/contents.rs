@@ -14,7 +14,7 @@ use sha2::{Digest, Sha256};
 
 use super::{
     description::{METADATA_KEY, describe},
-    error::{CheckpointError, damaged},
+    error::{CheckpointError, damaged, io_error},
     folder::{PREFIX, list, prune, store},
 };
 use crate::{
@@ -180,11 +180,8 @@ fn files(
             .map(|(name, bytes)| (name.to_string(), sha256_hex(bytes)))
             .collect(),
     };
-    let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {
-        what: "encode",
-        path: STATE.into(),
-        why: why.into(),
-    })?;
+    let text = serde_json::to_vec_pretty(&file);
+    let text = text.map_err(|why| io_error("encode", Path::new(STATE))(why.into()))?;
     // In the format of `sha256sum --check`.
     let sum = format!("{}  {STATE}\n", sha256_hex(&text));
     files.extend([(STATE, text), (STATE_SHA256, sum.into_bytes())]);
