@@ -15,7 +15,7 @@ use serde::Deserialize;
 
 use crate::{
     auxiliary::{AuxiliaryKind, dim::DIM, positives::Positives, settings::Lambda},
-    batch::{Batch, OwnedBatch},
+    batch::OwnedBatch,
     losses_and_gradients::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::UpdateSettings,
@@ -74,7 +74,7 @@ struct ModelSizes {
 pub(super) struct Case {
     config: Config,
     pub(super) settings: UpdateSettings,
-    inputs: OwnedBatch,
+    pub(super) inputs: OwnedBatch,
     tensors: Tensors,
     /// Names of expectations that nothing was compared with yet.
     unused: RefCell<BTreeSet<String>>,
@@ -140,17 +140,13 @@ impl Case {
         })
     }
 
-    pub(super) fn batch(&self) -> Batch<'_> {
-        self.inputs.batch()
-    }
-
-    fn tensors_under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
+    /// The tensors whose names begin with `prefix`, by the rest of their names: `online.` are the parameters before the update.
+    pub(super) fn tensors_under<'a>(
+        &'a self,
+        prefix: &'a str,
+    ) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
         let all = self.tensors.0.iter();
         all.filter_map(move |(name, tensor)| Some((name.strip_prefix(prefix)?, tensor)))
-    }
-
-    pub(super) fn online_parameters(&self) -> impl Iterator<Item = (&str, &Tensor)> {
-        self.tensors_under("online.")
     }
 
     /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.

@@ -93,7 +93,7 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>> {
     let mut agent = case_agent(case, case.settings.clone(), compute)?;
     let forward = forward_losses(case, compute)?;
-    let computed = agent.gradients_with(&case.batch(), &case.noise(agent.model())?)?;
+    let computed = agent.gradients_with(&case.inputs.batch(), &case.noise(agent.model())?)?;
     let mut check = CaseCheck {
         case,
         allowed: Tolerances::new(compute.kernels, agent.model().torso),
@@ -124,7 +124,7 @@ impl CaseCheck<'_> {
     /// Compares values of s_t, greedy actions in s_{t+n} and projected targets.
     fn targets(&mut self, agent: &Agent, computed: &LossesAndGradients) -> Result<()> {
         let (case, allowed, model) = (self.case, self.allowed, agent.model());
-        let batch = case.batch();
+        let batch = case.inputs.batch();
         let expected = case.expected("q_values_t", &[batch.rows, model.num_actions])?;
         let error = largest_error(&to_f64(&agent.q_values_t(&batch)?), &expected);
         let width = f64::from(model.v_max - model.v_min);
@@ -185,7 +185,7 @@ impl CaseCheck<'_> {
         let (case, allowed) = (self.case, self.allowed);
         let global_norm = case.expected("grad_norm", &[1])?[0];
         let (mut worst, mut angles) = (WorstByGroup::default(), WorstByGroup::default());
-        for (name, tensor) in case.online_parameters() {
+        for (name, tensor) in case.tensors_under("online.") {
             let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
             let got = match computed.gradients.get(name) {
                 Some(gradient) => to_vec_f64(gradient)?,
@@ -213,7 +213,7 @@ impl CaseCheck<'_> {
         let (case, allowed) = (self.case, self.allowed);
         let tolerance = allowed.updated + allowed.updated_rates * case.settings.adam.lr;
         let (mut online, mut keys) = (WorstByGroup::default(), WorstByGroup::default());
-        for (name, tensor) in case.online_parameters() {
+        for (name, tensor) in case.tensors_under("online.") {
             let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
             // Parameters that no lambda uses are not built, so they stay as in the file.
             let var = agent.online().get(name);
@@ -269,7 +269,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>> {
     if settings.auxiliary_loss == AuxiliaryKind::NONE {
         all_pairs.auxiliary_loss = AuxiliaryKind::from_item(&DIM);
         // Read from the case's parameters: if the update is C51's alone, the settings do not say it.
-        let mut parameters = case.online_parameters();
+        let mut parameters = case.tensors_under("online.");
         all_pairs.condition_on_action = parameters.any(|it| it.0.starts_with("dim.action."));
     }
     // A loss that rejects some of the pairs keeps the case's settings.
@@ -277,7 +277,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<ForwardLoss>> {
         all_pairs = settings.clone();
     }
     let networks = case_agent(case, all_pairs, compute)?.networks;
-    let batch = case.batch();
+    let batch = case.inputs.batch();
     let losses = networks.auxiliary_losses(&batch, &networks.online_features(&batch)?)?;
     let is_saturated = |it: &DotProducts| -> Result<bool> {
         let clip = ScoreClip::new(it.width, settings.tanh_clip);
