@@ -150,18 +150,16 @@ impl ModelConfig {
         if self.atoms < 2 {
             return fail(format!("atoms is {}, must be at least 2", self.atoms));
         }
-        for (name, end) in [("v_min", self.v_min), ("v_max", self.v_max)] {
+        let (v_min, v_max) = (self.v_min, self.v_max);
+        for (name, end) in [("v_min", v_min), ("v_max", v_max)] {
             if !(-RETURN_MAX..=RETURN_MAX).contains(&end) {
                 return fail(format!(
                     "{name} is {end:e}, must be within -{RETURN_MAX:e} and {RETURN_MAX:e}"
                 ));
             }
         }
-        if self.v_min >= self.v_max {
-            return fail(format!(
-                "v_min {} must be below v_max {}",
-                self.v_min, self.v_max
-            ));
+        if v_min >= v_max {
+            return fail(format!("v_min {v_min} must be below v_max {v_max}"));
         }
         self.head.validate()?;
         self.torso.check_settings(&self.torso_settings())?;

@@ -113,10 +113,8 @@ impl TryFrom<String> for AuxiliaryKind {
         let item = all_items().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
             let known: Vec<_> = all_items().map(|item| format!("`{}`", item.name)).collect();
-            format!(
-                "unknown variant `{name}`, expected one of {}",
-                known.join(", ")
-            )
+            let known = known.join(", ");
+            format!("unknown variant `{name}`, expected one of {known}")
         })
     }
 }

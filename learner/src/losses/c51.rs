@@ -117,11 +117,9 @@ pub fn kl_loss(
     kernels: Kernels,
 ) -> Result<Tensor> {
     let (rows, atoms) = logits.dims2()?;
-    if target.len() != rows * atoms {
-        bail!(
-            "logits of {rows} rows and {atoms} atoms meet a target of {} values",
-            target.len()
-        );
+    let values = target.len();
+    if values != rows * atoms {
+        bail!("logits of {rows} rows and {atoms} atoms meet a target of {values} values");
     }
     if let Some(weights) = &weights
         && weights.len() != rows

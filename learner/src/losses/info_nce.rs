@@ -120,11 +120,9 @@ pub fn info_nce_loss(
     let clip = ScoreClip::new(dot_products.width, tanh_clip);
     let dots = &dot_products.values;
     let (_, anchors, candidates) = dots.dims3()?;
-    if anchors != valid.len() || candidates != valid.len() {
-        bail!(
-            "scores of {anchors} anchors and {candidates} candidates meet {} rows",
-            valid.len()
-        );
+    let rows = valid.len();
+    if anchors != rows || candidates != rows {
+        bail!("scores of {anchors} anchors and {candidates} candidates meet {rows} rows");
     }
     if kernels == Kernels::Candle {
         return info_nce_by_candle(dots, valid, clip);

@@ -220,11 +220,8 @@ impl Fetcher {
             let is_last = !matches!(fetched, Ok(NextBatch::Ready(_)));
             if let Ok(NextBatch::Ready(served)) = &fetched {
                 let header = &served.batch.header;
-                let (newest, oldest) = header.weights_versions;
-                tracing::debug!(
-                    "a batch came: {} rows acted by weights {oldest} to {newest}",
-                    header.rows
-                );
+                let (rows, (newest, oldest)) = (header.rows, header.weights_versions);
+                tracing::debug!("a batch came: {rows} rows acted by weights {oldest} to {newest}");
             }
             if sender.send(fetched).is_err() || is_last {
                 return;

@@ -158,15 +158,12 @@ impl Publisher {
     /// Queues the weights for the replay servers, which announce them and give them to actors. Replaces weights that were not sent
     /// yet.
     pub(crate) fn publish(&self, weights: Weights) {
+        let (version, updates) = (weights.header.version, weights.header.updates);
         let mut status = lock(&self.status);
-        status.weights_version = weights.header.version;
+        status.weights_version = version;
         status.weights_sha256 = weights.header.sha256_hex();
         drop(status);
-        tracing::debug!(
-            "weights {} are published, after {} updates",
-            weights.header.version,
-            weights.header.updates
-        );
+        tracing::debug!("weights {version} are published, after {updates} updates");
         self.weights.push(weights);
     }
 

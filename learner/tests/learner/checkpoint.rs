@@ -110,13 +110,9 @@ pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value))
     let mut state = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
     change(&mut state);
     let text = serde_json::to_vec_pretty(&state).unwrap();
-    let sum = sha256(&text);
+    let sum = format!("{}  state.json\n", sha256(&text));
     fs::write(&file, text).unwrap();
-    fs::write(
-        path.join("state.json.sha256"),
-        format!("{sum}  state.json\n"),
-    )
-    .unwrap();
+    fs::write(path.join("state.json.sha256"), sum).unwrap();
 }
 
 /// A network of other sizes is not reported as damage: the error names the setting that differs.
