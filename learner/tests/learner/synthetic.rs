@@ -9,7 +9,7 @@ use driml_learner::{
     auxiliary::{cpc, curl, dim},
     parity::deviation::REFERENCE,
 };
-use driml_model::{Compute, ConvLayer, HeadConfig, ModelConfig, Parameters};
+use driml_model::{Compute, ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -91,14 +91,6 @@ pub(crate) fn agent(lambda: Lambda, seed: u64) -> Agent {
 
 pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
     new_agent(model(lambda), settings(lambda), compute, seed)
-}
-
-pub(crate) fn agent_with(head: HeadConfig, settings: UpdateSettings, seed: u64) -> Agent {
-    let model = ModelConfig {
-        head,
-        ..model(settings.lambda)
-    };
-    new_agent(model, settings, &Compute::CPU, seed)
 }
 
 /// The operations of a GPU, on the CPU.

@@ -2,10 +2,10 @@
 //! `parity` compares with outside numbers; at extreme inputs, the property "whole update" of `driml experiment stability` does.
 
 use driml_learner::{UpdateNoise, UpdateSettings};
-use driml_model::HeadConfig;
+use driml_model::{Compute, HeadConfig, ModelConfig};
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, agent_with, check_says, random_batch, settings,
+    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, check_says, model, new_agent, random_batch, settings,
     values,
 };
 
@@ -49,9 +49,14 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
         ..settings(NO_DIM)
     };
     let rows = random_batch(6, 2);
-    let agent =
-        |seed: u8| agent_with(HeadConfig::RAINBOW, settings.clone(), 1).with_noise_seed([seed; 32]);
-    let (mut one, mut same, other) = (agent(1), agent(1), agent(2));
+    let agent = |head, seed: u8| {
+        let model = ModelConfig {
+            head,
+            ..model(NO_DIM)
+        };
+        new_agent(model, settings.clone(), &Compute::CPU, 1).with_noise_seed([seed; 32])
+    };
+    let [mut one, mut same, other] = [1, 1, 2].map(|seed| agent(HeadConfig::RAINBOW, seed));
     let first = one.noise();
     assert!(first.online.is_some() && first.online != first.double_dqn);
     assert!(first.target != first.online && first.target != first.double_dqn);
@@ -67,7 +72,7 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
     let (noisy, means) = (one.gradients(&rows.batch()).unwrap(), means.unwrap());
     assert_ne!(noisy.losses.c51_kl, means.losses.c51_kl);
     assert!(means.gradients.get("head.value.weight_sigma").is_none());
-    let plain = agent_with(HeadConfig::PLAIN, settings, 1);
+    let plain = agent(HeadConfig::PLAIN, 1);
     assert_eq!(plain.noise(), UpdateNoise::default());
     let refused = plain.gradients_with(&rows.batch(), &first).unwrap_err();
     check_says(refused, &["without noisy layers"]);
