@@ -204,10 +204,8 @@ mod tests {
             };
             let [learned, exact] = after(100);
             let after_100 = distance(&learned, &exact);
-            assert!(
-                after_100 > 0.045,
-                "seed {seed}: {after_100} apart after 100 of {batch}"
-            );
+            let case = format!("seed {seed}, batches of {batch}");
+            assert!(after_100 > 0.045, "{case}: {after_100} apart after 100");
             let [learned, exact] = after(1400);
             for (one, other, most) in [
                 (&learned, &exact, 0.02),
@@ -215,10 +213,7 @@ mod tests {
                 (&exact, &truth, 0.005),
             ] {
                 let apart = distance(one, other);
-                assert!(
-                    apart < most,
-                    "seed {seed}: {apart} apart after 1500 of {batch}"
-                );
+                assert!(apart < most, "{case}: {apart} apart after 1500");
             }
         }
     }

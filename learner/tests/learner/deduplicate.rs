@@ -99,10 +99,7 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
                 let auxiliary = (auxiliary_loss, lambda);
                 let [each, once] = [false, true]
                     .map(|deduplicate| found(&compute, auxiliary, double_dqn, deduplicate, &batch));
-                assert!(
-                    each.forward == once.forward,
-                    "{case}: the same bits forward"
-                );
+                assert!(each.forward == once.forward, "{case}: bits forward");
                 let (each, once) = (each.gradients, once.gradients);
                 // Augmented states are never shared, and a target has no gradient. Candle's own operations compute each state.
                 let is_candle = compute.kernels == Kernels::Candle;
@@ -143,9 +140,7 @@ fn gradients_have_the_same_bits_for_any_number_of_threads() {
         })
     };
     let one = with_threads(1);
-    assert!(
-        [2, 3, 7]
-            .into_iter()
-            .all(|count| with_threads(count) == one)
-    );
+    for threads in [2, 3, 7] {
+        assert!(with_threads(threads) == one, "{threads} threads");
+    }
 }

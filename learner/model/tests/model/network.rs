@@ -80,10 +80,8 @@ fn inputs_that_do_not_fit_are_errors() {
     }
     for wrong in [5i64, -1] {
         let actions = Tensor::new(&[0, wrong], &Device::Cpu).unwrap();
-        assert!(matches!(
-            network.psi4(&features.f4, &actions),
-            Err(ModelError::Input(_))
-        ));
+        let psi4 = network.psi4(&features.f4, &actions);
+        assert!(matches!(psi4, Err(ModelError::Input(_))));
     }
     let actions = Tensor::new(&[0i64, 1, 2], &Device::Cpu).unwrap();
     let of_three = network.psi4(&features.f4, &actions);

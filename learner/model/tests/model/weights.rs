@@ -21,11 +21,8 @@ fn the_seed_decides_the_weights() {
     assert_eq!(all_bits(&first), all_bits(&parameters(&config, 5)));
     assert_ne!(all_bits(&first), all_bits(&parameters(&config, 6)));
     let acting = parameters(&config.without_dim(), 5);
-    assert_eq!(
-        all_bits(&acting),
-        all_bits(&first.without_dim().unwrap()),
-        "heads do not change the torso's weights"
-    );
+    // Heads do not change the torso's weights.
+    assert_eq!(all_bits(&acting), all_bits(&first.without_dim().unwrap()));
 }
 
 /// The layers that start like PyTorch's linear layers, with random biases. All others start orthogonal with gain sqrt(2) and zero bias.
