@@ -219,9 +219,8 @@ impl Agent {
 
     /// The weights that actors need, torso and head, as safetensors bytes with scalars of type `stored`.
     pub fn weights(&self, stored: WeightDtype) -> Result<Vec<u8>> {
-        Ok(self
-            .online()
-            .to_safetensors_as(stored, |name| !is_dim(name))?)
+        let online = self.online();
+        Ok(online.to_safetensors_as(stored, |name| !is_dim(name))?)
     }
 
     /// Learns from one batch.

@@ -139,9 +139,6 @@ pub struct DeviceError(String);
 
 impl DeviceName {
     /// Checks that a device of this kind supports `precision`, whether or not it is present.
-    ///
-    /// # Errors
-    /// `precision` is bf16 and the device is a GPU.
     pub fn check_precision(self, precision: Precision) -> Result<(), DeviceError> {
         match (self, precision) {
             // Only this project's CPU kernels support another precision than f32.
