@@ -21,14 +21,17 @@ pub(crate) struct TorsoSettings<'a> {
     pub(crate) scale_blocks: bool,
 }
 
+/// (height, width)
+type Size = (usize, usize);
+
 /// What the menu knows of a torso.
 pub(crate) struct TorsoKind {
     /// The names of the settings that it reads. It is made of the first, which must be given.
     pub(crate) settings: &'static [&'static str],
     pub(crate) build: fn(&TorsoSettings<'_>) -> Box<dyn Torso>,
-    /// Returns (height, width) of the part of `image` that it reads, from the upper left corner; `None` if `conv` does not fit. With
+    /// Returns the size of the part of `image` that it reads, from the upper left corner; `None` if `conv` does not fit. With
     /// zero padding, every pixel is in a window.
-    pub(crate) read_size: fn(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)>,
+    pub(crate) read_size: fn(conv: &[ConvLayer], image: Size) -> Option<Size>,
     /// How the convolutions are applied, and what the fully connected layer takes: see [`super::TorsoName::describe`].
     pub(crate) convolutions: &'static str,
     pub(crate) fc_input: &'static str,
