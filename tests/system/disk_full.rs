@@ -169,7 +169,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     assert!(bytes.as_u64().is_some_and(|it| it < 1_000), "{bytes}");
     fs::remove_file(filler).unwrap();
     client.wait_for_transitions(stopped.transitions_inserted + 1_000);
-    server.wait_for_stderr("can be written again; nothing was lost");
+    server.wait_for_stderr("can be written again; it has all stored transitions");
     let text = status_text(&system);
     check_has(&text, &["replay on disk: "]);
     assert!(!text.contains("WRITES FAIL"), "{text}");

@@ -193,7 +193,7 @@ impl Journal {
         self.newest_segment().bytes = at + bytes;
         if self.write_failure.take().is_some() {
             tracing::warn!(
-                "the replay's log in {} can be written again; nothing was lost",
+                "the replay's log in {} can be written again; it has all stored transitions",
                 self.folder.path.display()
             );
         }
