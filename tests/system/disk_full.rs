@@ -12,6 +12,7 @@ use driml_protocol::ActorJoin;
 use driml_tests::{
     Outcome, Process, TestSystem, check_has, checkpoint_updates, succeeds, wait_for, wait_until,
 };
+use nix::sys::signal::Signal;
 
 use crate::{
     LONG, SHORT,
@@ -31,10 +32,7 @@ impl Disk {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
-        if !succeeds(mount.arg(&folder)) {
-            return None;
-        }
-        Some(Self { folder })
+        succeeds(mount.arg(&folder)).then(|| Self { folder })
     }
 }
 
@@ -110,15 +108,28 @@ fn a_run_continues_while_the_disk_is_full() {
     });
 }
 
+/// The launcher waits for the learner, which retries its last save.
+#[test]
+fn the_last_checkpoint_is_saved_once_there_is_room() {
+    with_full_disk(PERIOD_NEVER, "No space left", |system, mut run, filler| {
+        run.signal(Signal::SIGINT);
+        run.wait_for_stderr("(no storage space): make room or make it writable");
+        fs::remove_file(filler).unwrap();
+        run.wait().expect_code(130);
+        assert!(system.run_folder("disk/run").saved_updates() >= 100);
+    });
+}
+
 #[test]
 fn the_first_error_is_the_one_shown() {
-    let words = "cannot be written: No space left";
-    with_full_disk(PERIOD_NEVER, words, |_, process, filler| {
-        let ended = process.interrupt().expect_code(1);
+    with_full_disk(PERIOD_NEVER, "No space left", |system, mut run, _| {
+        run.signal(Signal::SIGINT);
+        run.wait_for_stderr("(no storage space): make room or make it writable");
+        system.find_process("learner").signal(Signal::SIGKILL);
+        let ended = run.wait().expect_code(1);
         // The run fails because the checkpoint could not be saved. The error about the summary is only logged before.
-        let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
-        let last = &ended.stderr[errors..];
-        assert!(last.contains("learner exited with code 1"), "{ended:#?}");
+        let (_, last) = ended.stderr.rsplit_once("\nerror: ").unwrap();
+        assert!(last.contains("learner was killed by"), "{ended:#?}");
         check_has(&ended.stderr, &["summary.json: No space left"]);
         let lost = ended.stderr.lines().filter(|it| it.starts_with("lost "));
         let lost: Vec<_> = lost.collect();
@@ -127,7 +138,6 @@ fn the_first_error_is_the_one_shown() {
             let causes = line.matches("No space left").count();
             assert!(causes <= 1, "a cause is logged once: {line}");
         }
-        fs::remove_file(filler).unwrap();
     });
 }
 

@@ -27,8 +27,8 @@ use crate::{
     run_folder::{Outcome, ResumePoint, RunFolder, Summary},
 };
 
-/// How long the learner may take to save after its launcher was killed.
-const SAVING_MAX: Duration = Duration::from_secs(120);
+/// How long the learner may take to save after its launcher was killed, also if it retries on a full disk.
+const SAVING_MAX: Duration = Duration::from_secs(120 + checkpoint::RETRY_MAX.as_secs());
 /// How long the other processes may then take to exit; a replay server stays for 25 s if one of them is frozen.
 const ENDING_MAX: Duration = Duration::from_secs(35);
 const WAIT_POLL: Duration = Duration::from_millis(250);

@@ -3,8 +3,10 @@
 
 use std::{
     fs::{self, File},
-    io::{self, Write},
+    io::{ErrorKind, Write},
     path::{Path, PathBuf},
+    thread::sleep,
+    time::{Duration, Instant},
 };
 
 use driml_protocol::{atomic_write, lock_file};
@@ -13,6 +15,8 @@ use super::error::{CheckpointError, damaged, io_error};
 
 /// The name of the checkpoints' folder in a run's folder.
 pub const FOLDER: &str = "checkpoints";
+/// How long a learner process retries its last save while the disk is full or read-only.
+pub const RETRY_MAX: Duration = Duration::from_secs(600);
 /// Start of a checkpoint's name; the number of its update follows.
 pub(super) const PREFIX: &str = "checkpoint-";
 const LOCK_FILE: &str = ".lock";
@@ -32,7 +36,7 @@ pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
 pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
-        Err(why) if why.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(why) if why.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
         Err(why) => return Err(io_error("read", folder)(why)),
     };
     let mut all = Vec::new();
@@ -87,6 +91,45 @@ pub fn store(
     Ok(path)
 }
 
+/// Calls `save`, and again after each `pause` for at most `retry_max` as long as it fails with an error that a person can remove while
+/// the process waits, such as a full disk. Logs once what to do.
+pub(crate) fn retry_until_writable(
+    pause: Duration,
+    retry_max: Duration,
+    mut save: impl FnMut() -> Result<(), CheckpointError>,
+) -> Result<(), CheckpointError> {
+    let (started, mut is_logged) = (Instant::now(), false);
+    loop {
+        let (path, kind) = match save() {
+            Err(CheckpointError::Io { path, why, .. })
+                if is_removable(why.kind()) && started.elapsed() < retry_max =>
+            {
+                (path, why.kind())
+            }
+            saved => return saved,
+        };
+        if !std::mem::replace(&mut is_logged, true) {
+            // Not in the system's words: the launcher shows few lines with these, and this line says why it waits.
+            tracing::warn!(
+                "the last checkpoint is not saved yet, as {} cannot be written ({kind}): make room or make it writable; retrying for {} min",
+                path.display(),
+                retry_max.as_secs() / 60
+            );
+        }
+        sleep(pause);
+    }
+}
+
+const fn is_removable(kind: ErrorKind) -> bool {
+    matches!(
+        kind,
+        ErrorKind::StorageFull
+            | ErrorKind::QuotaExceeded
+            | ErrorKind::ReadOnlyFilesystem
+            | ErrorKind::PermissionDenied
+    )
+}
+
 /// Renames the checkpoint in `staging` to `path`. If `path` exists, as at a stop right after a periodic save, it is replaced: it
 /// first moves to another name, under which [`list`] finds it between the two renames.
 fn move_into_place(staging: &Path, path: &Path) -> Result<(), CheckpointError> {
@@ -125,7 +168,7 @@ fn clean_up(folder: &Path) -> Result<(), CheckpointError> {
 pub(super) fn read_file(folder: &Path, name: &str) -> Result<Vec<u8>, CheckpointError> {
     let path = folder.join(name);
     fs::read(&path).map_err(|why| match why.kind() {
-        io::ErrorKind::NotFound => damaged(folder, name, "it is missing".to_owned()),
+        ErrorKind::NotFound => damaged(folder, name, "it is missing".to_owned()),
         _ => io_error("read", &path)(why),
     })
 }
@@ -162,10 +205,35 @@ fn with_suffix(path: &Path, end: &str) -> PathBuf {
 /// Removes a folder, if it exists. A failure is only logged, as it does not affect what is saved.
 fn remove_or_warn(folder: &Path) {
     match fs::remove_dir_all(folder) {
-        Err(why) if why.kind() != io::ErrorKind::NotFound => {
+        Err(why) if why.kind() != ErrorKind::NotFound => {
             let why = io_error("remove", folder)(why);
             tracing::warn!("a checkpoint that is not needed was not removed: {why}");
         }
         _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_save_is_retried_while_a_person_can_remove_the_error() {
+        for (kind, retry_s, tries) in [
+            (ErrorKind::StorageFull, 60, 3),
+            (ErrorKind::ReadOnlyFilesystem, 60, 3),
+            (ErrorKind::StorageFull, 0, 1),
+            (ErrorKind::NotFound, 60, 1),
+        ] {
+            let mut tried = 0;
+            let saved = retry_until_writable(Duration::ZERO, Duration::from_secs(retry_s), || {
+                tried += 1;
+                match tried {
+                    3 => Ok(()),
+                    _ => Err(io_error("write", Path::new("x"))(kind.into())),
+                }
+            });
+            assert_eq!((tried, saved.is_ok()), (tries, tries == 3), "{kind}");
+        }
     }
 }

@@ -10,5 +10,6 @@ mod load;
 pub use contents::{AVERAGE, Extras, LearnerState, check_state, save};
 pub use description::{METADATA_KEY, describe, read_description};
 pub use error::CheckpointError;
-pub use folder::{FOLDER, list, lock, prune, store};
+pub(crate) use folder::retry_until_writable;
+pub use folder::{FOLDER, RETRY_MAX, list, lock, prune, store};
 pub use load::{load, load_latest, read_affinity, read_companion, read_run_counts};

@@ -20,7 +20,7 @@ use super::{
     shards::Shards,
 };
 use crate::{
-    checkpoint::{self, CheckpointError},
+    checkpoint::{self, CheckpointError, RETRY_MAX, retry_until_writable},
     config::LearnerConfig,
     learner::Learner,
 };
@@ -31,6 +31,8 @@ const LAST_COUNT_TIMEOUT: Duration = Duration::from_secs(1);
 const LAST_FETCH_MAX: Duration = Duration::from_secs(3);
 /// How long a batch may take before the wait is logged.
 const WAIT_LOG_AFTER: Duration = Duration::from_secs(10);
+/// The pause before a retry of the last save.
+const SAVE_PAUSE: Duration = Duration::from_secs(2);
 /// How often a waiting learner checks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
 
@@ -274,11 +276,12 @@ impl Checkpointer {
         (learner.updates(), learner.run_counts().frames())
     }
 
-    /// Saves a last checkpoint, if updates were made or frames stored since the newest one.
+    /// Saves a last checkpoint, if updates were made or frames stored since the newest one. On a full disk it retries for
+    /// [`RETRY_MAX`]; a second signal ends the process.
     fn save_last(mut self, learner: &Learner) -> Result<(), CheckpointError> {
         match self.saved_counts == Some(Self::counts(learner)) {
             true => Ok(()),
-            false => self.save(learner),
+            false => retry_until_writable(SAVE_PAUSE, RETRY_MAX, || self.save(learner)),
         }
     }
 }

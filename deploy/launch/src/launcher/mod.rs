@@ -11,8 +11,11 @@ pub(crate) use processes::process_names;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use driml_learner::checkpoint::RETRY_MAX;
 use driml_machine::units::{count, duration};
-use driml_protocol::{GracefulShutdown, Silence, config::Settings, session, shared_memory};
+use driml_protocol::{
+    GracefulShutdown, Silence, Waiting, config::Settings, session, shared_memory,
+};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -38,7 +41,7 @@ const STALL_MAX: Duration = Duration::from_secs(600);
 const ACTORS_DRAIN_MAX: Duration = Duration::from_secs(60);
 /// How long actors may take to exit once another process has failed.
 const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
-/// How long the learner may take to save, once it is told to stop.
+/// How long the learner may take to save, once it is told to stop. On a full disk it logs that it retries, and has [`RETRY_MAX`] more.
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to exit, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
@@ -199,6 +202,10 @@ impl Launch<'_> {
                 return Ok(Outcome::Finished);
             }
             let work = view.work_done();
+            let stall_max = match view.replay.waiting {
+                Waiting::Finished => stall_max + RETRY_MAX,
+                _ => stall_max,
+            };
             // While a replay server reads its replay back from disk, the other processes wait for it.
             if work != work_before || view.recovering().next().is_some() {
                 standstill.record_answer();
@@ -297,7 +304,7 @@ impl Launch<'_> {
             tracing::debug!("a question before the last: {e:#}");
         }
         learner.ask_to_stop();
-        let deadline = Instant::now() + LEARNER_DRAIN_MAX;
+        let deadline = Instant::now() + LEARNER_DRAIN_MAX + RETRY_MAX;
         let mut silence = Silence::default();
         while Instant::now() <= deadline
             && silence.length() <= LAST_STATUS_MAX
