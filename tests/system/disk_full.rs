@@ -126,7 +126,7 @@ fn the_first_error_is_the_one_shown() {
         run.signal(Signal::SIGINT);
         run.wait_for_stderr("(no storage space): make room or make it writable");
         system.find_process("learner").signal(Signal::SIGKILL);
-        let ended = run.wait().expect_code(1);
+        let ended = run.fails("there is no checkpoint yet: start the run again");
         // The run fails because the checkpoint could not be saved. The error about the summary is only logged before.
         let (_, last) = ended.stderr.rsplit_once("\nerror: ").unwrap();
         assert!(last.contains("learner was killed by"), "{ended:#?}");

@@ -43,13 +43,15 @@ pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
         })
 }
 
-/// Prints how to resume a run that was interrupted or failed, if that is possible.
-pub fn print_resume_hint(world: &WorldConfig, folder: &RunFolder) {
+/// Prints how to resume a run that was interrupted or failed, if that is possible, or that it has to start again.
+fn print_resume_hint(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::eprintln(&format!(
             "`driml train --resume {}` resumes it",
             folder.quoted()
         ));
+    } else if folder.config().exists() && folder.newest_checkpoint().is_none() {
+        console::eprintln("there is no checkpoint yet: start the run again");
     }
 }
 
