@@ -70,10 +70,10 @@ columns! {
         Value::Counter(updates);
     "frames_per_second", "frames per second", "speed", "Acting speed":
         "Frames a second, over the last 20 seconds.",
-        Value::Gauge(|it| Some(it.speed.frames));
+        Value::Gauge(|it| it.speed.map(|it| it.frames));
     "updates_per_second", "updates per second", "speed", "Learning speed":
         "Updates a second, over the last 20 seconds.",
-        Value::Gauge(|it| Some(it.speed.updates));
+        Value::Gauge(|it| it.speed.map(|it| it.updates));
     "replay_ratio", "rows sampled per transition", "run", "Replay ratio":
         "Rows sampled per transition stored, both since the warm-up.",
         Value::Gauge(|it| it.replay.replay_ratio());
@@ -272,8 +272,9 @@ mod tests {
         });
         let plan = make(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
         let unknown = json(&view(plan.clone(), replay.clone(), None));
-        assert_eq!(unknown["updates"], serde_json::Value::Null);
-        assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
+        for name in ["updates", "c51_kl", "frames_per_second"] {
+            assert_eq!(unknown[name], serde_json::Value::Null, "{name}");
+        }
         let mut known = view(plan, replay, Some(learner));
         known.rss_mib = vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)];
         let text = serde_json::to_string(&json(&known)).unwrap();

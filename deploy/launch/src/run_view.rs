@@ -117,9 +117,11 @@ pub(crate) struct ServerAnswer {
     pub(crate) is_another_run: bool,
 }
 
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
 pub(crate) struct Speed {
+    #[serde(rename = "frames_per_second")]
     pub(crate) frames: f64,
+    #[serde(rename = "updates_per_second")]
     pub(crate) updates: f64,
 }
 
@@ -190,7 +192,8 @@ pub struct RunView {
     /// Resident memory of each process by name, MiB, filled in by the recorder; none for a process that has ended.
     pub(crate) rss_mib: Vec<(String, Option<f64>)>,
     rates: Rates,
-    pub(crate) speed: Speed,
+    /// None until it is known: from the run's beginning, or once the run was observed for [`RATE_WINDOW`].
+    pub(crate) speed: Option<Speed>,
 }
 
 impl RunView {
@@ -208,6 +211,7 @@ impl RunView {
         self.learner.updates = updates;
         self.is_learner_known = true;
         self.rates.add(Instant::now(), frames, updates);
+        self.speed = Some(Speed::default());
     }
 
     /// Stores the learner's status; none if it does not answer.
@@ -236,10 +240,12 @@ impl RunView {
         self.k = Spread::of_k(&self.replay);
         (self.recorded_s, self.rss_mib) = (None, Vec::new());
         let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
-        self.rates.add(Instant::now(), frames, updates);
+        let now = Instant::now();
+        self.rates.add(now, frames, updates);
+        let is_known = self.speed.is_some() || now - self.rates.0[0].0 >= RATE_WINDOW;
         // After a pause, the speed before it is shown until the next sample.
-        if self.rates.0.len() > 1 {
-            self.speed = self.rates.speed();
+        if is_known && self.rates.0.len() > 1 {
+            self.speed = Some(self.rates.speed());
         }
     }
 
@@ -359,12 +365,18 @@ mod tests {
             view.set_learner(answer);
             view.set_replay(vec![ReplayStatus::default()]);
         }
-        assert_eq!(view.speed.updates, 0.0);
+        assert_eq!(view.rates.speed().updates, 0.0);
+        assert_eq!(view.speed, None, "counts arrive in lumps");
+        let begun = Instant::now().checked_sub(RATE_WINDOW).unwrap();
+        view.rates = Rates([begun, begun + RATE_WINDOW / 2].map(|at| (at, 0, 0)).into());
+        view.set_replay(vec![ReplayStatus::default()]);
+        assert_eq!(view.speed, Some(Speed::default()));
 
         let mut resumed = RunView::new(Plan::default());
         resumed.begin_at(0, 70);
         resumed.set_learner(None);
         assert_eq!(resumed.learner.updates, 70, "before it has answered");
+        assert!(resumed.speed.is_some(), "the launcher saw the run begin");
     }
 
     fn rates(samples: impl IntoIterator<Item = (u64, u64, u64)>) -> Rates {

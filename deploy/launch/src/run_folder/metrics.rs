@@ -7,7 +7,7 @@ use std::{
     path::Path,
 };
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::{
     folder::RunFolder,
@@ -103,8 +103,13 @@ pub struct Progress {
     pub episodes: u64,
 }
 
-/// The progress of the run in `folder`; none before its first row of metrics. Reads only the file's first line and its end.
+/// The progress of the run in `folder`; none before its first row of metrics.
 pub fn read_progress(folder: &RunFolder) -> Option<Progress> {
+    read_last_row(folder)
+}
+
+/// The last row of metrics; none if a column of `T` is empty. Reads only the file's first line and its end.
+pub(crate) fn read_last_row<T: DeserializeOwned>(folder: &RunFolder) -> Option<T> {
     let mut file = File::open(folder.metrics()).ok()?;
     let mut header = String::new();
     BufReader::new(&file).read_line(&mut header).ok()?;

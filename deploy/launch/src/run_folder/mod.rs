@@ -9,7 +9,7 @@ mod recorder;
 mod summary;
 mod table;
 
-pub(crate) use self::metrics::BeforeReplay;
+pub(crate) use self::metrics::{BeforeReplay, read_last_row};
 pub(crate) use self::{
     evaluations::Candidate,
     summary::{LastPlay, ReturnInterval, format_commands, plot_command},

@@ -25,7 +25,7 @@ pub fn loss_title(name: &str) -> String {
     }
 }
 
-/// The progress and the speed of a run; unknown frames and updates are shown as question marks.
+/// The progress and the speed of a run; unknown frames and updates are shown as question marks, an unknown speed as dashes.
 pub(super) fn progress_text(view: &RunView, frames: Option<u64>, updates: Option<u64>) -> String {
     // The last round may exceed the plan.
     let count = |count: Option<u64>, planned| match count {
@@ -34,17 +34,17 @@ pub(super) fn progress_text(view: &RunView, frames: Option<u64>, updates: Option
         Some(count) => format!("{count}/{planned}"),
     };
     format!(
-        "frames {} ({:.0}/s)  updates {} ({:.1}/s)  replay ratio {}",
+        "frames {} ({}/s)  updates {} ({}/s)  replay ratio {}",
         count(frames, view.plan.frames_planned),
-        view.speed.frames,
+        decimals(0, view.speed.map(|it| it.frames)),
         count(updates, view.plan.updates_planned),
-        view.speed.updates,
-        two_decimals(view.replay.replay_ratio()),
+        decimals(1, view.speed.map(|it| it.updates)),
+        decimals(2, view.replay.replay_ratio()),
     )
 }
 
-fn two_decimals(value: Option<f64>) -> String {
-    value.map_or("-".into(), |value| format!("{value:.2}"))
+fn decimals(digits: usize, value: Option<f64>) -> String {
+    value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }
 
 #[derive(Debug)]
@@ -84,7 +84,7 @@ impl Display {
     }
 
     fn lines(&self, view: &RunView) -> [String; 2] {
-        let (plan, speed, learner) = (&view.plan, view.speed, &view.learner);
+        let (plan, learner) = (&view.plan, &view.learner);
         let (frames, updates) = (view.replay.transitions_inserted, learner.updates);
         // Before the first update there are no losses.
         let losses = self.learning_since.map(|_| {
@@ -95,7 +95,8 @@ impl Display {
         let losses = losses.unwrap_or_default();
         let k = view.k.map(|k| format!("  mean k {:.2}", k.mean));
         let is_steady = |since: &Instant| since.elapsed() >= STEADY_MIN;
-        let left = self.learning_since.filter(is_steady).and_then(|_| {
+        let since = self.learning_since.filter(is_steady);
+        let left = since.zip(view.speed).and_then(|(_, speed)| {
             let frames = plan.frames_planned.saturating_sub(frames);
             let updates = plan.updates_planned.saturating_sub(updates);
             time_left((frames, speed.frames), (updates, speed.updates))
@@ -105,7 +106,7 @@ impl Display {
             progress_text(view, Some(frames), Some(updates)),
             format!(
                 "return {} ({}){losses}{}  {}{}",
-                two_decimals(episodes.mean_return),
+                decimals(2, episodes.mean_return),
                 count(episodes.count, "episode"),
                 k.unwrap_or_default(),
                 waiting_text(&view.replay),
@@ -175,7 +176,7 @@ mod tests {
         (view.episodes.count, view.episodes.mean_return) = (45, Some(1.234));
         let (mean, sd, frames, updates) = (2.25, 1.0, 160.0, 5.0);
         view.k = Some(Spread { mean, sd });
-        view.speed = Speed { frames, updates };
+        view.speed = Some(Speed { frames, updates });
         display.learning_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
@@ -195,11 +196,11 @@ mod tests {
             display.lines(&view).join("\n")
         };
         expect![[r#"
-            frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -
+            frames 0/8000 (-/s)  updates 0/218 (-/s)  replay ratio -
             return - (0 episodes)  neither side waits"#]]
         .assert_eq(&shown(0, 0));
         expect![[r#"
-            frames 8000/8000 (+192) (0/s)  updates 218/218 (+6) (0.0/s)  replay ratio 0.00
+            frames 8000/8000 (+192) (-/s)  updates 218/218 (+6) (-/s)  replay ratio 0.00
             return - (0 episodes)  C51 0.000  neither side waits"#]]
         .assert_eq(&shown(8_192, 224));
         assert_eq!(time_left((10, 0.0), (0, 0.0)), None, "no progress");

@@ -19,7 +19,8 @@ use crate::{
     checkpoint_choice::read_config,
     console, resume,
     run_folder::{
-        Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_progress,
+        Outcome, Progress, RunFolder, Summary, format_commands, plot_command, read_last_row,
+        read_progress,
     },
     view::{
         Poller, PrometheusFlag, actions_needed, describe_recovery, missing_shards, run_json,
@@ -76,7 +77,7 @@ pub fn status(
             none => {
                 let found = found.take().unwrap_or_else(&open);
                 let poller = none.insert(flags.exported.check_found(found)?);
-                // The first poll starts the speed, which counts what happens until the next.
+                // At the first poll, a process may not be reachable yet.
                 poller.poll();
                 if interrupted.wait_timeout(poller.pause()) {
                     return Err(Interrupted.into());
@@ -84,7 +85,10 @@ pub fn status(
                 poller
             }
         };
-        let view = poller.poll();
+        let mut view = poller.poll().clone();
+        // Until this process has observed the run for long enough, the launcher knows the speed.
+        view.speed = view.speed.or_else(|| read_last_row(folder?));
+        let view = &view;
         flags.exported.write(view)?;
         if let Some(folder) = folder.filter(|_| view.servers_ended()) {
             read_endpoints(folder)?;
