@@ -41,9 +41,22 @@ pub fn check_range<T: PartialOrd + Display>(
     check(range.contains(&value), key, value, why)
 }
 
-/// Describes in one line what is wrong with a table, and at which of its keys.
+/// Describes in one line what is wrong with a table, and at which of its keys. Words stand for the names of Rust's types.
 pub fn describe(error: &toml::de::Error) -> String {
-    error.to_string().trim_end().replace('\n', ", ")
+    let text = error.to_string().trim_end().replace('\n', ", ");
+    let Some((wrong, rest)) = text.split_once(", expected ") else {
+        return text;
+    };
+    let (expected, place) = rest.split_at(rest.find(',').unwrap_or(rest.len()));
+    let words = match expected {
+        "u8" => "a whole number from 0 to 255",
+        "u32" => "a whole number from 0 to 4294967295",
+        "u64" | "usize" => "a whole number from 0",
+        "f32" | "f64" => "a number",
+        name if name.contains("struct ") || name.contains("tagged enum ") => "a table in { }",
+        other => other,
+    };
+    format!("{wrong}, expected {words}{place}")
 }
 
 /// Finds the first value that differs. Returns its path, which starts with `name`, and both values.

@@ -141,9 +141,9 @@ pub(crate) fn fill_in_derived(table: &mut Table) -> Result<(), Usage> {
     }
     let set = read_optional(table, "actor.actions")?.unwrap_or(ActionSet::All);
     let num_actions = config.actions(set).len();
-    let stack: i64 = read(table, "run.frame_stack")?;
+    let stack: u32 = read(table, "run.frame_stack")?;
     let size = |value: usize| Value::Integer(value as i64);
-    let channels = stack.saturating_mul(shape.channels as i64);
+    let channels = i64::from(stack).saturating_mul(shape.channels as i64);
     for (path, value) in [
         ("run.frame_height", size(area.frame.0)),
         ("run.frame_width", size(area.frame.1)),
