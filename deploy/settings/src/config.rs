@@ -7,16 +7,16 @@ use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
-use driml_protocol::{
-    RunSpec,
-    config::{TransportConfig, describe},
-};
+use driml_protocol::{RunSpec, config::TransportConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::{derived, overrides::leaves};
+use crate::{
+    derived,
+    overrides::{explain, leaves},
+};
 
 /// The processes that the launcher starts, and their resources.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -112,7 +112,7 @@ impl RunConfig {
     /// Reads every table into its component's Config. The derived settings must be in `table`.
     pub(crate) fn read(table: Table) -> Result<Self, Usage> {
         let read = Value::Table(table).try_into();
-        read.map_err(|e| usage!("in the settings: {}", describe(&e)))
+        read.map_err(|e| usage!("in the settings: {}", explain(&e)))
     }
 
     /// Like [`Self::read`], after filling in the derived settings.

@@ -5,11 +5,10 @@ use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::UpdateSettings;
 use driml_machine::error::{Usage, usage};
 use driml_model::{ConvLayer, FrameSize, InputSize, ModelConfig, Precision, ReadArea, TorsoName};
-use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use crate::overrides::{find, inline_text, insert, insert_missing, remove};
+use crate::overrides::{explain, find, inline_text, insert, insert_missing, remove};
 
 /// The derived settings: their paths, and from what they follow.
 const DERIVED: &str = "\
@@ -257,7 +256,7 @@ fn read_optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Optio
     let value = find(table, path).cloned().map(Value::try_into);
     let read = value.transpose();
     read.map_err(|e| match find(table, path) {
-        Some(Value::Table(_)) => usage!("in the settings' [{path}] table: {}", describe(&e)),
-        _ => usage!("{path}: {}", describe(&e)),
+        Some(Value::Table(_)) => usage!("in the settings' [{path}] table: {}", explain(&e)),
+        _ => usage!("{path}: {}", explain(&e)),
     })
 }

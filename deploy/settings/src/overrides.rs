@@ -2,6 +2,7 @@
 //! Keys and types are checked against the existing settings; each component checks its own ranges.
 
 use driml_machine::error::{Usage, did_you_mean, usage};
+use driml_protocol::config::describe;
 use toml::{Table, Value};
 
 /// The largest number up to which a float represents every whole number exactly.
@@ -163,6 +164,16 @@ pub fn leaves(table: &Table) -> Vec<(String, &Value)> {
         }
     }
     found
+}
+
+/// Describes what is wrong with a table, with the known name that is nearest to an unknown one.
+pub(crate) fn explain(error: &toml::de::Error) -> String {
+    let text = describe(error);
+    let known = text.split(", in `").next().unwrap_or_default();
+    let mut names = known.split('`').skip(1).step_by(2);
+    let unknown = names.next().filter(|_| text.starts_with("unknown "));
+    let near = unknown.map_or(String::new(), |it| did_you_mean(it, names));
+    text.replacen(", expected", &format!("{near}, expected"), 1)
 }
 
 fn type_name(value: &Value) -> &'static str {

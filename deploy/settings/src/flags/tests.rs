@@ -203,7 +203,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         text.replace("world = \"mspacman\"", "world = \"chain\""),
         "[run]\n= 3".into(),
         String::new(),
-        text.replace("envs = 16", "envs = 16\ncolour = 1"),
+        text.replace("envs = 16", "envs = 16\nepsilon_stat = 1"),
     ]
     .map(|text| resolve_file("x.toml", text, &[]).unwrap_err() + "\n");
     expect![[r#"
@@ -213,7 +213,7 @@ fn a_file_at_odds_with_itself_is_refused() {
         x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`
         x.toml is not TOML: line 2: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`
         x.toml: the settings lack run.world, a word: use a config.toml that driml wrote
-        x.toml: in the settings: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`, in `actor`
+        x.toml: in the settings: unknown field `epsilon_stat` (did you mean "epsilon_start"?), expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`, in `actor`
     "#]]
     .assert_eq(&said.concat());
 }
