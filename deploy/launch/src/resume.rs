@@ -223,8 +223,6 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
     let before = read_config(folder)?;
     // A run that is still exiting holds memory.
     wait_until_free(folder)?;
-    let source = Source::File(folder.config().display().to_string(), before.to_toml());
-    let mut config = source.resolve(flags, &Machine::detect())?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
     let (_, newest) = all.last().with_context(|| {
@@ -232,6 +230,13 @@ pub fn prepare(folder: &RunFolder, flags: &Flags) -> anyhow::Result<Resumption> 
         usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
     })?;
     let (updates, counts) = checkpoint::read_run_counts(newest)?;
+    let mut flags = flags.clone();
+    if updates > 0 {
+        // The run has had its first batch, so fewer frames leave it complete, too.
+        flags.frames = flags.frames.map(|it| it.max(before.frames_min()));
+    }
+    let source = Source::File(folder.config().display().to_string(), before.to_toml());
+    let mut config = source.resolve(&flags, &Machine::detect())?;
     // A run in lockstep has a companion, which is empty if the state of its world cannot be saved.
     let companion = checkpoint::read_companion(newest)?;
     if companion.as_ref().is_some_and(Vec::is_empty) {

@@ -159,6 +159,13 @@ impl RunConfig {
         self.replay.transitions_max.unwrap_or(u64::MAX)
     }
 
+    /// The fewest frames with which a new run has a batch.
+    pub fn frames_min(&self) -> u64 {
+        let first_batch = f64::from(self.learner.batch_size) / self.replay.replay_ratio;
+        let warmup = self.replay.warmup_transitions;
+        warmup.saturating_add(first_batch.ceil() as u64)
+    }
+
     /// Updates of the whole run: those made before it was resumed with other settings, and those that the rest of its transitions allow at
     /// the replay ratio.
     pub fn updates(&self) -> u64 {
@@ -192,10 +199,14 @@ impl RunConfig {
         let (replay, learner, local) = (&self.replay, &self.learner, &self.local);
         let (frames, warmup) = (self.frames(), replay.warmup_transitions);
         if frames <= warmup {
+            let least = self.frames_min();
+            let room = (frames + warmup).checked_sub(least);
+            let shorter = room.map(|room| room.min(frames / 10));
+            let set = shorter.map(|it| format!(", or --set replay.warmup_transitions={it}"));
             return Err(usage!(
-                "a run of {} ends within the warm-up of {warmup}: ask for more --frames, or --set replay.warmup_transitions={}",
+                "a run of {} ends within the warm-up of {warmup}: ask for at least --frames {least}{}",
                 driml_machine::units::count(frames, "frame"),
-                frames / 10
+                set.unwrap_or_default()
             ));
         }
         check(replay.validate(&self.run, learner.batch_size))?;
