@@ -133,6 +133,16 @@ impl Config {
         Ok(())
     }
 
+    /// Checks that `disk_bytes_max` is no less than the replay needs, for a replay that is kept on disk.
+    pub fn check_disk_budget(&self, spec: &RunSpec) -> Result<(), ConfigError> {
+        let least = disk_bytes_min(spec, self);
+        let max = self.disk_bytes_max.unwrap_or(least);
+        let why = format_args!(
+            "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
+        );
+        check(max >= least, "replay.disk_bytes_max", max, why)
+    }
+
     /// Checks that the snapshot of each shard fits the codec's limit, for a replay that is kept on disk.
     pub(crate) fn check_on_disk(&self) -> Result<(), ConfigError> {
         let (key, capacity) = ("replay.capacity_transitions", self.capacity_transitions);
@@ -181,13 +191,6 @@ impl Config {
                 "one sample spans {window} transitions, which may not compress; use at least {least}"
             );
             check(max >= least, key, max, why)?;
-        }
-        if let Some(max) = self.disk_bytes_max {
-            let least = disk_bytes_min(spec, self);
-            let why = format_args!(
-                "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
-            );
-            check(max >= least, "replay.disk_bytes_max", max, why)?;
         }
         let fits = warmup <= capacity;
         let why = format_args!(

@@ -83,12 +83,13 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         let why = "replay shards behind one router would each store every transition: leave --connect out";
         return Err(usage!("{why}").into());
     }
-    match &args.replay_dir {
-        Some(dir) => check_folder("--replay-dir", dir)?,
-        None => {
-            let checked = config.replay.check_in_memory("--replay-dir DIR");
-            checked.map_err(|e| usage!("{e}"))?;
-        }
+    let checked = match &args.replay_dir {
+        Some(_) => config.replay.check_disk_budget(&config.run),
+        None => config.replay.check_in_memory("--replay-dir DIR"),
+    };
+    checked.map_err(|e| usage!("{e}"))?;
+    if let Some(dir) = &args.replay_dir {
+        check_folder("--replay-dir", dir)?;
     }
     let shutdown = prepare_join(&args.join, GracefulShutdown::on_signals)?;
     let notes = config.notes.iter().chain(&config.accuracy_note);

@@ -195,8 +195,11 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
              replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
         ));
     }
-    if !lockstep && !config.local.durable {
-        let checked = replay.check_in_memory("--durable");
+    if !lockstep {
+        let checked = match config.local.durable {
+            true => replay.check_disk_budget(&config.run),
+            false => replay.check_in_memory("--durable"),
+        };
         checked.map_err(|e| usage!("{e}"))?;
     }
     Ok(())
