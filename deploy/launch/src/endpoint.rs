@@ -3,7 +3,7 @@
 
 use std::{
     fs,
-    io::{Error, ErrorKind},
+    io::ErrorKind,
     net::{TcpListener, ToSocketAddrs, UdpSocket},
     os::unix::fs::FileTypeExt,
     path::Path,
@@ -82,9 +82,7 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
         let bound = match endpoint.split_once('/') {
             Some(("tcp", address)) => TcpListener::bind(address).map(drop),
             Some(("quic", address)) => UdpSocket::bind(address).map(drop),
-            _ if folder.is_some_and(|it| !it.is_dir()) => {
-                Err(Error::other("its folder does not exist, make it"))
-            }
+            _ if folder.is_some_and(|it| !it.is_dir()) => Err(ErrorKind::NotFound.into()),
             _ => match reach::check_listening(endpoint) {
                 Ok(()) => Err(ErrorKind::AddrInUse.into()),
                 Err(_) => Ok(()),
@@ -98,8 +96,11 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
             ErrorKind::PermissionDenied => {
                 usage!("cannot listen on {endpoint}: {e}; choose a port from 1024 on")
             }
+            ErrorKind::NotFound => usage!(
+                "cannot listen on {endpoint}: its folder does not exist: make it, or choose another path"
+            ),
             _ => usage!(
-                "cannot listen on {endpoint}: {e}; or choose an address of this machine, such as 127.0.0.1 or 0.0.0.0"
+                "cannot listen on {endpoint}: {e}; choose an address of this machine, such as 127.0.0.1 or 0.0.0.0"
             ),
         })?;
     }
@@ -152,7 +153,7 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
             Ok(())
         }
         _ => Err(usage!(
-            "{endpoint:?} is not an endpoint: use tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH, with neither # nor ?"
+            "{endpoint:?} is not an endpoint: use tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH, with a PORT from 1 to 65535, and neither # nor ?"
         )),
     }
 }
