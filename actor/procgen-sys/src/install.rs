@@ -77,14 +77,15 @@ impl Engine {
     pub fn from_library(library: &Path) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         // The loader would look for a name without a folder among the system's libraries.
-        let library =
-            fs::canonicalize(library).map_err(|error| ProcgenError::library(library, error))?;
+        let invalid =
+            |why: &str| ProcgenError::Options(format!("library = {}: {why}", library.display()));
+        let library = fs::canonicalize(library)
+            .map_err(|e| invalid(&format!("{e}; give the path of another build's libenv.so")))?;
         let mut folders = library.ancestors().skip(1).take(2);
         let assets =
             folders.find_map(|folder| Some(folder.join("assets")).filter(|it| it.is_dir()));
         let assets = assets.ok_or_else(|| {
-            let reason = "put Procgen's folder `assets` beside it or beside its folder";
-            ProcgenError::library(&library, reason)
+            invalid("put Procgen's folder `assets` beside it or beside its folder")
         })?;
         Ok(Engine { library, assets })
     }

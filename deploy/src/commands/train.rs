@@ -195,6 +195,11 @@ fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
              replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
         ));
     }
+    if config.world.library().is_some() {
+        // This looks for files of the user's, and fetches none.
+        let found = config.world.install(&mut console::eprintln);
+        found.map_err(|e| usage!("--env: {e}"))?;
+    }
     if !lockstep {
         let checked = match config.local.durable {
             true => replay.check_disk_budget(&config.run),
