@@ -79,6 +79,7 @@ fn a_launched_run_is_watched_and_continues_without() {
     system.run_ok(&format!("local --agent c51 {SHORT} --run-dir other"));
     system.rejects_each(
         "
+        watch other --run-dir late => nothing is written into late: the run is over
         watch run --run-dir run => run is written by `driml train` or by another `driml watch`
         watch run --run-dir other => other holds another run (chain with c51, seed 1)
         ",

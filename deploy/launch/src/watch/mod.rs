@@ -131,6 +131,11 @@ pub fn run(
     flags: &WatchFlags,
 ) -> anyhow::Result<()> {
     let found = flags.exported.check_found(found);
+    if let (Err(e), Some(dir)) = (&found, &flags.run_dir)
+        && e.is::<UnreachableRun>()
+    {
+        bail!(usage!("nothing is written into {}: {e}", dir.display()));
+    }
     let watched = found.and_then(|poller| watch(poller, folder, flags));
     watched.or_else(|e| console::print(&e.downcast::<UnreachableRun>()?.text(false)?))
 }
