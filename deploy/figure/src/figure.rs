@@ -18,8 +18,8 @@ const MARGIN: f64 = 18.0;
 const TITLE_SIZE: f64 = 17.0;
 const NOTE_SIZE: f64 = 12.5;
 const NOTE_LEADING: f64 = 17.0;
-/// The share of a panel that the legend of a chart may take.
-const LEGEND_SHARE_MAX: f64 = 0.25;
+/// The share of a panel that the legend of a chart may take: two rows of a small panel. More rows would leave no room for the y label.
+const LEGEND_SHARE_MAX: f64 = 0.16;
 
 /// One panel of a figure.
 #[derive(Debug)]
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn a_legend_that_would_fill_a_panel_is_above_all_panels() {
-        for (runs, entries) in [(3, 6), (20, 20)] {
+        for (runs, entries) in [(2, 4), (3, 3), (20, 20)] {
             let name = |at| format!("a run with a long name {at:02}");
             let names: Vec<_> = (0..runs).map(name).collect();
             let svg = svg(vec![chart("", &names), chart("", &names)], Look::Card);

@@ -150,6 +150,9 @@ fn lines_are_called_by_what_differs_and_by_their_seeds() {
     let expected = ["seed 1 (a)", "seed 1 (b)", "seed 2"];
     let expected = expected.map(|seed| format!("chain c51, lr=0.1, {seed}"));
     assert_eq!(names(false)[..3], expected);
+    let folders = runs.each_ref().map(|run| run.folder.path().to_owned());
+    let svg = drawn(&root.args(&folders.each_ref(), &[]));
+    assert!(!svg.contains('\u{2026}'), "a text was cut: {svg}");
 }
 
 #[test]
