@@ -89,8 +89,9 @@ fn a_launched_run_is_watched_and_continues_without() {
     wait_until("further rows", || rows() > before + 1);
     launcher.interrupt().expect_code(130);
     watched.wait_ok().expect_stdout("--resume run` resumes it");
-    let plot = system.run_ok("plot run other --column dim_4t4");
-    plot.expect_stderr("other is not in the chart of dim_4t4");
+    let plot = system.run_ok("plot run other run/config.toml --column dim_4t4");
+    plot.expect_stderr("other is not in the chart of dim_4t4")
+        .expect_stderr("skipped run/config.toml: not the folder of a run");
     system.rejects("plot other --affinity", "other has no affinity");
     let frames = seen.numeric_column("frames");
     assert!(frames.is_sorted(), "{frames:?}");

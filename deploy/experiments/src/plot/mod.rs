@@ -82,7 +82,7 @@ fn overview_columns(runs: &[Run]) -> Vec<String> {
     columns.into_iter().filter(has).map(String::from).collect()
 }
 
-/// Returns the named run folders, each once. Other folders are skipped with a message, files without one: a sweep's `runs/*` names both.
+/// Returns the named run folders, each once. Others are skipped with a message, files beside a run without one: a sweep's `runs/*` names both.
 fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let mut seen = BTreeSet::new();
     // A folder given twice is one run, not two seeds.
@@ -90,7 +90,8 @@ fn run_folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let named = args.runs.iter().filter(|it| seen.insert(whole(it)));
     let folders = named.map(RunFolder::new);
     let (runs, others): (Vec<_>, Vec<_>) = folders.partition(|it| it.metrics().is_file());
-    let is_told = |it: &&RunFolder| runs.is_empty() || !it.path().is_file();
+    let parents: BTreeSet<_> = runs.iter().map(|run| run.path().parent()).collect();
+    let is_told = |it: &&RunFolder| !it.path().is_file() || !parents.contains(&it.path().parent());
     let others = others.iter().filter(is_told);
     let mut others: Vec<String> = others.map(|it| it.display().to_string()).collect();
     if let more @ 1.. = others.len().saturating_sub(SKIPPED_MAX) {
