@@ -72,6 +72,12 @@ pub fn wrap(text: &str, separator: &str, indent: usize) -> String {
     wrap_to(text, separator, indent, width)
 }
 
+/// The columns of a page on stdout: 80, or those of a narrower terminal.
+pub(crate) fn page_width() -> usize {
+    let size = Term::stdout().size_checked();
+    size.map_or(80, |it| usize::from(it.1).min(80))
+}
+
 /// [`wrap`] to a width in characters. A break leaves no blanks at the end of its line.
 pub(crate) fn wrap_to(text: &str, separator: &str, indent: usize, width: usize) -> String {
     let mut lines = String::new();

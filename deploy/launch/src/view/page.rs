@@ -1,4 +1,4 @@
-//! A run as a page of text, 80 columns wide: `driml status`.
+//! A run as a page of text, at most 80 columns wide: `driml status`.
 
 use driml_machine::units::{count, rough_duration};
 use driml_protocol::{LogStatus, ProcessStatus, Waiting, Warning};
@@ -18,13 +18,12 @@ const ACTORS_MAX: usize = 64;
 /// From this age on, in seconds, the page shows how old a process's own report is.
 const REPORT_AGE_MAX: f64 = 10.0;
 
-/// The most characters of a line, except for a path or a command that is longer.
-const LINE_CHARS_MAX: usize = 80;
 const NAME_CHARS_MAX: usize = 21;
 /// The blanks before the rest of a line that is broken.
 const INDENT: usize = 4;
 
-pub(crate) fn status_page(view: &RunView) -> String {
+/// Writes the page in lines of at most `width` characters, except for a path or a command that is longer.
+pub(crate) fn status_page(view: &RunView, width: usize) -> String {
     let (replay, plan) = (&view.replay, &view.plan);
     let is_known = view.servers_answered() || view.servers_ended();
     let frames = is_known.then_some(replay.transitions_inserted);
@@ -45,7 +44,7 @@ pub(crate) fn status_page(view: &RunView) -> String {
         ("messages rejected", replay.messages_refused),
     ];
     page += &counts.map(|(what, n)| format!("{what} {n}")).join("  ");
-    page = wrap_to(&page, "  ", 0, LINE_CHARS_MAX);
+    page = wrap_to(&page, "  ", 0, width);
     let mut waits = limiter_waits(view);
     if waits.is_empty() {
         waits.push(Waiting::Neither.to_string());
@@ -90,18 +89,18 @@ pub(crate) fn status_page(view: &RunView) -> String {
     for needed in &needed {
         page += &format!("to do: {needed}\n");
     }
-    page.lines().map(fit).collect()
+    page.lines().map(|line| fit(line, width)).collect()
 }
 
 /// Breaks a line at blanks. A command in backticks stays whole, so that it can be pasted.
-fn fit(line: &str) -> String {
+fn fit(line: &str, width: usize) -> String {
     let parts = line.split('`').enumerate();
     let parts = parts.map(|(at, part)| match at % 2 {
         0 => part.to_owned(),
         _ => part.replace(' ', "\u{a0}"),
     });
     let line = parts.collect::<Vec<_>>().join("`");
-    wrap_to(&line, " ", INDENT, LINE_CHARS_MAX).replace('\u{a0}', " ") + "\n"
+    wrap_to(&line, " ", INDENT, width).replace('\u{a0}', " ") + "\n"
 }
 
 /// The end of a long name, which tells the servers of a run apart.
@@ -221,7 +220,7 @@ mod tests {
     };
 
     /// The page of a run in which all counts, and all times in seconds, are `number`.
-    fn page(endpoints: &[&str], doing: &str, number: u32) -> String {
+    fn page(endpoints: &[&str], doing: &str, number: u32, width: usize) -> String {
         let plan = make(|it: &mut Plan| (it.world, it.agent) = ("chain".into(), "c51".into()));
         let replay = ReplayStatus {
             transitions_inserted: number.into(),
@@ -255,21 +254,23 @@ mod tests {
             ..ServerAnswer::default()
         };
         view.servers = endpoints.iter().map(answer).collect();
-        status_page(&view)
+        status_page(&view, width)
     }
 
     #[test]
-    fn a_page_is_80_columns_wide() {
-        let small = page(&["tcp/host:1"], "plays", 1);
+    fn a_page_is_as_wide_as_its_terminal() {
+        let small = page(&["tcp/host:1"], "plays", 1, 80);
         expect_file!["../../tests/snapshots/page.txt"].assert_eq(&small);
         let endpoint = format!("unixsock-stream//{}/replay-server-0.sock", "x".repeat(60));
         let doing = "waits for the learner's first weights, which another machine is sending to it";
-        let wide = page(&[&endpoint, "tcp/10.0.0.1:7447"], doing, u32::MAX);
-        for line in wide.lines().filter(|line| !line.contains(&endpoint)) {
-            assert!(line.chars().count() <= LINE_CHARS_MAX, "{line}\n{wide}");
-        }
-        for part in ["\n…replay-server-0.sock  up ", "\nactor-4294967295  "] {
-            assert!(wide.contains(part), "{wide}");
+        for width in [72, 80] {
+            let wide = page(&[&endpoint, "tcp/10.0.0.1:7447"], doing, u32::MAX, width);
+            for line in wide.lines().filter(|line| !line.contains(&endpoint)) {
+                assert!(line.chars().count() <= width, "{line}\n{wide}");
+            }
+            for part in ["\n…replay-server-0.sock  up ", "\nactor-4294967295  "] {
+                assert!(wide.contains(part), "{wide}");
+            }
         }
     }
 }

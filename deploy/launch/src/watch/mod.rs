@@ -95,7 +95,7 @@ pub fn status(
         }
         let text = match flags.json {
             true => run_json(view)?,
-            false => status_page(view),
+            false => status_page(view, console::page_width()),
         };
         Ok((text, actions_needed(view).is_empty(), view.is_over()))
     };
