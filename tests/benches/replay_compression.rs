@@ -46,8 +46,7 @@ fn replay(config: &RunConfig, compression: Compression) -> Replay {
         ..Config::unlimited(TRANSITIONS)
     };
     let mut replay = Replay::new(&config.run, &replay, ROWS).unwrap();
-    let join = ActorJoin::new(0, 1);
-    replay.join_actor(join).unwrap();
+    replay.join_actor(ActorJoin::new(0, 1)).unwrap();
     replay
 }
 

@@ -23,8 +23,7 @@ pub struct RunFolder {
 /// Returns the number of updates in the name of a checkpoint's folder.
 pub fn checkpoint_updates(checkpoint: &Path) -> u64 {
     let name = checkpoint.file_name().unwrap().to_str().unwrap();
-    let updates = name.strip_prefix("checkpoint-").unwrap();
-    updates.parse().unwrap()
+    name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
 }
 
 impl RunFolder {

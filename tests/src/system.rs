@@ -281,8 +281,7 @@ impl TestSystem {
     /// Connects like [`Self::connect`], but with TLS uses the certificate of `role`.
     pub fn connect_as(&self, role: Role) -> Client {
         let read = || Credentials::read(&self.path("tls"), role).unwrap();
-        let credentials = (!self.tls.is_empty()).then(read);
-        Client::join(&self.endpoint, credentials)
+        Client::join(&self.endpoint, (!self.tls.is_empty()).then(read))
     }
 
     /// Returns a process's connection to the run with this `spec`, without a request to the replay server.

@@ -203,8 +203,7 @@ fn pacman() {
         assert_eq!(count_rows(&data_files(&folder), returns), 128, "{returns}");
     }
     let config = |name: &str| {
-        let path = folder.join("runs").join(name).join("config.toml");
-        fs::read_to_string(path).unwrap()
+        fs::read_to_string(folder.join("runs").join(name).join("config.toml")).unwrap()
     };
     assert!(config("epsilon0.25-seed1").contains("epsilon = 0.25"));
     let noise = config("noise-driml-fix-seed1");

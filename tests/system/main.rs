@@ -61,8 +61,7 @@ fn tls_system() -> Option<TestSystem> {
 /// Returns an unused endpoint and its listener. The loopback address belongs to this process, so no other takes the port meanwhile.
 fn listen_on_free_port() -> (String, TcpListener) {
     let [_, high, middle, low] = std::process::id().to_be_bytes();
-    let address = Ipv4Addr::new(127, high, middle, low);
-    let listener = TcpListener::bind((address, 0)).unwrap();
+    let listener = TcpListener::bind((Ipv4Addr::new(127, high, middle, low), 0)).unwrap();
     (format!("tcp/{}", listener.local_addr().unwrap()), listener)
 }
 

@@ -205,8 +205,7 @@ fn each_process_is_cut_off_for_long() {
             run.network.disconnect(machine);
             sleep(Duration::from_secs(seconds));
             run.network.reconnect(machine);
-            let before = run.inserted();
-            run.wait_for_frames(before + 1_000);
+            run.wait_for_frames(run.inserted() + 1_000);
         }
     }
     run.check_end();

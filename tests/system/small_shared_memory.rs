@@ -73,8 +73,7 @@ fn a_run_continues_when_others_fill_it_up() {
     process.wait_for_stderr("(restart 1 of at most 16)");
     process.wait_for_stderr("no shared memory, so messages go through sockets");
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
-    let then = client.learner_status().unwrap().updates;
-    client.wait_for_updates(then + 200);
+    client.wait_for_updates(client.learner_status().unwrap().updates + 200);
     drop(client);
     let ended = process.interrupt().expect_code(130);
     assert_eq!(warnings(&ended), 1, "{ended:#?}");

@@ -133,8 +133,7 @@ fn strangers_at_a_replay_server() {
         .expect_stderr("waiting up to 30 s: nothing listens on tcp/");
 
     // The strangers have not disturbed admitted processes.
-    let updates = observer.learner_status().unwrap().updates;
-    observer.wait_for_updates(updates + 100);
+    observer.wait_for_updates(observer.learner_status().unwrap().updates + 100);
     assert_eq!(observer.check_nothing_lost().chunks_retried, 0);
     actor.stop(130);
     learner.stop(130);

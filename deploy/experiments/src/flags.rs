@@ -166,8 +166,7 @@ pub(crate) fn read_settings<T: DeserializeOwned>(text: &str, flags: &ExperimentF
         let mut settings = lengths.remove("full").unwrap_or_default();
         let shorter = lengths.remove("smoke").filter(|_| flags.smoke);
         presets::merge(&mut settings, shorter.unwrap_or_default());
-        let seeds = flags.seeds.map(|seeds| ("seeds".to_owned(), seeds.into()));
-        settings.extend(seeds);
+        settings.extend(flags.seeds.map(|seeds| ("seeds".to_owned(), seeds.into())));
         settings.try_into()
     };
     read().unwrap_or_else(|e| panic!("the settings are built in, and a test reads them: {e}"))

@@ -340,8 +340,7 @@ impl Plot<'_> {
         let at = (plot.x + plot.width / 2.0, y);
         canvas.text(at, &self.x.axis.label, ink.cut_at(plot.width));
         let at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
-        let upright = ink.upright().cut_at(plot.height);
-        canvas.text(at, &self.y.axis.label, upright);
+        canvas.text(at, &self.y.axis.label, ink.upright().cut_at(plot.height));
     }
 
     fn draw_series(&self, canvas: &mut Canvas, series: &Series) {

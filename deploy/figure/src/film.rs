@@ -63,8 +63,7 @@ impl<W: Write> Film<W> {
         self.owed -= delay;
         frame.delay = delay as u16;
         self.previous = Some(pixels);
-        let written = self.encoder.write_frame(&frame);
-        written.map_err(io::Error::other)
+        self.encoder.write_frame(&frame).map_err(io::Error::other)
     }
 
     /// Completes the film, and returns the file.

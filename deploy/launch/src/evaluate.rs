@@ -120,8 +120,7 @@ impl Player {
         is_over: impl Fn() -> bool,
     ) -> anyhow::Result<Vec<f64>> {
         let world = world_with_levels(&self.config.world, levels)?;
-        let watch = &mut stop_when(is_over);
-        self.play(policy_kind, &world, episodes, seed, watch)
+        self.play(policy_kind, &world, episodes, seed, &mut stop_when(is_over))
     }
 
     /// Plays whole episodes in `world`, which is the run's world, perhaps with other levels. Returns their returns. `watch` sees every

@@ -253,8 +253,7 @@ fn read<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
 }
 
 fn read_optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
-    let value = find(table, path).cloned().map(Value::try_into);
-    let read = value.transpose();
+    let read = find(table, path).cloned().map(Value::try_into).transpose();
     read.map_err(|e| match find(table, path) {
         Some(Value::Table(_)) => usage!("in the settings' [{path}] table: {}", explain(&e)),
         _ => usage!("{path}: {}", explain(&e)),

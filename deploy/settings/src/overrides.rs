@@ -111,8 +111,7 @@ impl Override {
 /// A float without a fraction as an integer: a number of frames may be written as 1e6. Floats are exact whole numbers up to 2^53.
 fn as_whole(value: &Value) -> Option<Value> {
     let is_whole = |it: &f64| it.fract() == 0.0 && it.abs() <= WHOLE_MAX;
-    let number = value.as_float().filter(is_whole)?;
-    Some(Value::Integer(number as i64))
+    Some(Value::Integer(value.as_float().filter(is_whole)? as i64))
 }
 
 pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {

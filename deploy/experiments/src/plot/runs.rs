@@ -138,8 +138,7 @@ impl Run {
     /// Returns the columns of auxiliary losses: the columns between the C51 loss and the total loss.
     pub(super) fn auxiliary_losses(&self) -> &[String] {
         let metrics = &self.tables[0].1;
-        let ends = [C51_LOSS, TOTAL_LOSS].map(|name| metrics.column_index(name));
-        match ends {
+        match [C51_LOSS, TOTAL_LOSS].map(|name| metrics.column_index(name)) {
             [Some(first), Some(last)] if first < last => &metrics.header[first + 1..last],
             _ => &[],
         }

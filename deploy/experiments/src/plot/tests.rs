@@ -242,8 +242,7 @@ fn replays_that_hold_different_parts_of_their_runs_are_named() {
             std::fs::write(path, format!("{config}[replay]\n{replay}")).unwrap();
             read(&folder)
         });
-        let groups = groups::group_runs(&runs, true);
-        let found = groups[0].describe_replays();
+        let found = groups::group_runs(&runs, true)[0].describe_replays();
         let is_expected = |it: &str| found.as_ref().is_some_and(|found| found.contains(it));
         assert!(expected.map_or(found.is_none(), is_expected), "{found:?}");
     }

@@ -101,8 +101,7 @@ mod tests {
         assert_eq!(chosen, [(CheckpointChoice::Newest, SEED)]);
         for updates in [1, 2, 3, 4] {
             let name = format!("checkpoint-{updates:012}");
-            let path = folder.checkpoints().join(name);
-            fs::create_dir_all(path).unwrap();
+            fs::create_dir_all(folder.checkpoints().join(name)).unwrap();
         }
         let newest = [(4, 1), (3, 2), (2, 3)].map(|(it, seed)| (CheckpointChoice::After(it), seed));
         assert_eq!(choose(&folder, 3).unwrap(), newest);

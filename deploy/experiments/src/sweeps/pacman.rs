@@ -164,8 +164,7 @@ fn task_series(results: &Results, part: usize) -> Vec<Series> {
     for (index, agent) in results.settings.agents.iter().enumerate() {
         let traces = || results.traces(part, agent);
         let each: Vec<_> = traces().map(|trace| trace.points.clone()).collect();
-        let curve = combine_seeds(&each, Band::Range);
-        series.push(curve.series(agent, index));
+        series.push(combine_seeds(&each, Band::Range).series(agent, index));
         let tasks = if index == 0 { continual.tasks } else { 0 };
         for task in 0..tasks {
             let ends = traces().filter_map(|trace| trace.tasks[task as usize]);

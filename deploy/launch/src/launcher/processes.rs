@@ -182,8 +182,7 @@ impl Launch<'_> {
                 // A new process would reject its configuration again.
                 _ if status.code() == Some(EXIT_USAGE.into()) => bail!("{report}"),
                 ProcessRole::ReplayServer(_) if self.config.local.durable => {
-                    let kept = " with its replay";
-                    (&mut self.server_restarts, RESTARTS_MAX, kept)
+                    (&mut self.server_restarts, RESTARTS_MAX, " with its replay")
                 }
                 ProcessRole::Actor(_) if process.is_restartable() => {
                     (&mut self.actor_restarts, ACTOR_RESTARTS_MAX, "")

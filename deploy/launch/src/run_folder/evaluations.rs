@@ -37,8 +37,7 @@ impl EvaluationRow {
     /// Reads all evaluations in a run's folder, in the order in which they were made; none without the file.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
-        let rows = Table::read(&path)?.parse_rows(&path);
-        rows.with_context(|| {
+        Table::read(&path)?.parse_rows(&path).with_context(|| {
             usage!(
                 "{} is not a table of evaluations: move it away",
                 path.display()

@@ -159,8 +159,7 @@ fn free_disk_bytes(folder: &Path) -> Result<u64, String> {
 
 /// Whether Procgen's engine is in the cache folder and loads.
 fn engine() -> Finding {
-    let checked = Engine::locate().and_then(|engine| engine.check_loads().map(|()| engine));
-    match checked {
+    match Engine::locate().and_then(|engine| engine.check_loads().map(|()| engine)) {
         Ok(engine) => {
             let library = engine.library().display();
             State::Ok.with(format!("the engine is {library} and loads"))

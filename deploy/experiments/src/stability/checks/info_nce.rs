@@ -64,8 +64,7 @@ impl Batch {
     fn loss(&self) -> (f64, Vec<f32>) {
         let mut slopes = vec![f32::NAN; self.dots.len()];
         let clip = ScoreClip::new(64, self.bound);
-        let loss = info_nce(&self.dots, &self.valid, clip, &mut slopes);
-        (loss, slopes)
+        (info_nce(&self.dots, &self.valid, clip, &mut slopes), slopes)
     }
 
     fn bits(&self) -> (u64, Vec<u32>) {

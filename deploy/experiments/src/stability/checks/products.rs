@@ -76,8 +76,7 @@ impl Layer {
     }
 
     fn draw_dense(rng: &mut ChaCha8Rng) -> Self {
-        let sizes = [40, 200, 40].map(|most| rng.random_range(1..most));
-        Self::new(sizes, [0; 3])
+        Self::new([40, 200, 40].map(|most| rng.random_range(1..most)), [0; 3])
     }
 
     const fn is_convolution(&self) -> bool {
@@ -89,8 +88,7 @@ impl Layer {
         let places = (self.side - self.kernel).checked_div(self.stride);
         let places = places.map_or(0, |steps| steps + 1);
         let mut tensor = |shape: Vec<usize>| {
-            let values = draw(shape.iter().product(), rng);
-            Tensor::from_vec(values, shape, &Device::Cpu)
+            Tensor::from_vec(draw(shape.iter().product(), rng), shape, &Device::Cpu)
         };
         Ok([
             tensor([vec![self.rows], square(self.side), vec![self.inputs]].concat())?,
@@ -241,8 +239,7 @@ fn dense(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
         // A larger operand would round to infinity.
         Precision::Bf16 => 3.38e38,
     };
-    let layer = Layer::draw_dense(&mut cases.rng);
-    layer.record_errors(cases, precision, &mut |count, rng| {
+    Layer::draw_dense(&mut cases.rng).record_errors(cases, precision, &mut |count, rng| {
         let is_moderate = rng.random_bool(0.7);
         draw_clamped(count, if is_moderate { MODERATE } else { most }, rng)
     })

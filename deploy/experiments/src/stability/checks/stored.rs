@@ -69,8 +69,7 @@ fn turning_points(stored: WeightDtype) -> Vec<f32> {
 
 /// Saves and loads the values as weights, and counts their errors.
 fn check_stored(cases: &mut Cases<'_>, stored: WeightDtype, values: &[f32]) -> anyhow::Result<()> {
-    let atoms = values.len().div_ceil(HIDDEN).max(2);
-    let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
+    let config = small::config(values.len().div_ceil(HIDDEN).max(2), HIDDEN, (-1.0, 1.0));
     let bytes = small::parameters(&config, values)?.to_safetensors_as(stored, |_| true)?;
     let read = Parameters::load_safetensors(&config, |_| true, &bytes, &Device::Cpu)?;
     for (&x, found) in values.iter().zip(small::scalars(&config, &read)?) {

@@ -91,8 +91,7 @@ fn window_means(loss: &[f32]) -> impl Iterator<Item = (f64, f64)> + '_ {
 fn fig2(task: &Task, first: &Outcome) -> anyhow::Result<Figure> {
     let settings = &task.settings;
     let early_t = settings.from_t + 1;
-    let steps = settings.late_t.max(early_t);
-    let played = Episodes::play_measured(task, steps)?;
+    let played = Episodes::play_measured(task, settings.late_t.max(early_t))?;
     let (side, patch) = (task.world.lattice_size, task.world.patch_size);
     let shown = first.maps.len();
     let outline = |episode: usize| {

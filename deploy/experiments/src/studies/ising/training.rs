@@ -145,8 +145,7 @@ impl Episodes {
 
     /// Plays the first batch of episodes that [`measure`] uses.
     pub(super) fn play_measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
-        let seed = MEASURED_SEED;
-        Self::play(&task.world, task.settings.batch_size, steps, seed)
+        Self::play(&task.world, task.settings.batch_size, steps, MEASURED_SEED)
     }
 
     /// Draws a batch of pairs (s_t, s_{t+1}). Each row is another episode at a random t.

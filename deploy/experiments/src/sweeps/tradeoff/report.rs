@@ -199,8 +199,7 @@ const PANEL_SIZE: (f64, f64) = (330.0, 250.0);
 /// Draws return against frames per second: a panel for each dial with its base, all with the same axes. A dashed line joins the Pareto
 /// front of all dials. `returns` selects the return, and `name` is its name.
 fn pareto_figure(results: &Results, returns: Measure, name: &str) -> Figure {
-    let of_runs = results.points.values().flat_map(|it| it.values(returns));
-    let all = Spread::of(of_runs);
+    let all = Spread::of(results.points.values().flat_map(|it| it.values(returns)));
     let (least, greatest) = all.map_or((0.0, 0.0), |it| (it.min, it.max));
     // Returns the point of a result and the bar of its interval.
     let place = |point: &PointResult| {
@@ -261,8 +260,7 @@ fn wall_figure(results: &Results) -> Figure {
     let panels = results.rows_by_dial().map(|rows| {
         let series = rows.iter().enumerate().map(|(index, row)| {
             let each = row.result.uninterrupted().map(|it| it.curve.clone());
-            let curve = combine_seeds(&each.collect::<Vec<_>>(), Band::Range);
-            curve.series(row.name, index)
+            combine_seeds(&each.collect::<Vec<_>>(), Band::Range).series(row.name, index)
         });
         let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));
         Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series.collect()))
