@@ -7,12 +7,13 @@ use std::arch::x86_64::{
     _mm256_loadu_ps, _mm256_loadu_si256, _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_ps,
     _mm256_slli_epi32, _mm256_storeu_ps,
 };
+use std::marker::PhantomData;
 
 use half::bf16;
 
 use super::{
     element::Rounding,
-    simd::{LANES, Loop, RawTile, Simd},
+    simd::{Loop, RawTile, Simd},
     vector::{Sums, Vector, compute_sizes},
 };
 
@@ -46,7 +47,10 @@ macro_rules! simd {
             #[target_feature(enable = "avx2,fma")]
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
                 // SAFETY: `new` found the instructions; the caller guarantees the rest.
-                compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4 5 6;);
+                if tile.cols <= REGISTER {
+                    return compute_sizes!(Registers<$element, 1>, tile, rows, vecs; 1: 1 2 3 4 5 6;);
+                }
+                compute_sizes!(Registers<$element, 2>, tile, rows, vecs; 1: 1 2 3 4 5 6;);
             }
 
             #[inline(always)]
@@ -66,19 +70,26 @@ unsafe fn vectorized<W: Loop>(work: W) {
     work.run();
 }
 
-impl Sums for [__m256; 2] {
+/// The columns of one register.
+const REGISTER: usize = 8;
+
+/// The vectors of a tile of at most `N` times [`REGISTER`] columns.
+#[derive(Clone, Copy)]
+struct Registers<E, const N: usize>(PhantomData<E>);
+
+impl<const N: usize> Sums for [__m256; N] {
     #[inline(always)]
     unsafe fn zero() -> Self {
-        unsafe { [_mm256_setzero_ps(); 2] }
+        unsafe { [_mm256_setzero_ps(); N] }
     }
 
     #[inline(always)]
     unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
-        // SAFETY: whole registers are accessed only if `count` is 16, else only the first `count` scalars.
+        // SAFETY: whole registers are accessed only if `count` fills them, else only the first `count` scalars.
         unsafe {
-            if count == LANES {
-                for (half, sums) in self.into_iter().enumerate() {
-                    let at = at.add(half * 8);
+            if count == N * REGISTER {
+                for (register, sums) in self.into_iter().enumerate() {
+                    let at = at.add(register * REGISTER);
                     let old = if add {
                         _mm256_loadu_ps(at)
                     } else {
@@ -88,10 +99,11 @@ impl Sums for [__m256; 2] {
                 }
                 return;
             }
-            let mut values = [0f32; LANES];
-            _mm256_storeu_ps(values.as_mut_ptr(), self[0]);
-            _mm256_storeu_ps(values.as_mut_ptr().add(8), self[1]);
-            for (index, value) in values.into_iter().take(count).enumerate() {
+            let mut values = [[0f32; REGISTER]; N];
+            for (values, sums) in values.iter_mut().zip(self) {
+                _mm256_storeu_ps(values.as_mut_ptr(), sums);
+            }
+            for (index, &value) in values.as_flattened().iter().take(count).enumerate() {
                 let at = at.add(index);
                 *at = if add { *at + value } else { value };
             }
@@ -99,31 +111,40 @@ impl Sums for [__m256; 2] {
     }
 }
 
-// SAFETY for both: loads and stores use addresses that the caller guarantees. None of them needs alignment.
+// SAFETY for both: loads and stores use addresses that the caller guarantees. None of them needs alignment. No closures: they could be
+// compiled without AVX2, and each instruction would then be a call.
 
-impl Vector for F32 {
+impl<const N: usize> Vector for Registers<f32, N> {
     type Element = f32;
-    type Sums = [__m256; 2];
-    type Operand = [__m256; 2];
+    type Sums = [__m256; N];
+    type Operand = [__m256; N];
 
     #[inline(always)]
-    unsafe fn load_row(at: *const f32) -> [__m256; 2] {
-        unsafe { [_mm256_set1_ps(*at); 2] }
+    unsafe fn load_row(at: *const f32) -> [__m256; N] {
+        unsafe { [_mm256_set1_ps(*at); N] }
     }
 
     #[inline(always)]
-    unsafe fn load_columns(at: *const f32) -> [__m256; 2] {
-        unsafe { [_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))] }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_add(sums: [__m256; 2], row: [__m256; 2], columns: [__m256; 2]) -> [__m256; 2] {
+    unsafe fn load_columns(at: *const f32) -> [__m256; N] {
         unsafe {
-            [
-                _mm256_fmadd_ps(row[0], columns[0], sums[0]),
-                _mm256_fmadd_ps(row[1], columns[1], sums[1]),
-            ]
+            let mut columns = [_mm256_loadu_ps(at); N];
+            for (register, columns) in columns.iter_mut().enumerate() {
+                *columns = _mm256_loadu_ps(at.add(register * REGISTER));
+            }
+            columns
         }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(
+        mut sums: [__m256; N],
+        row: [__m256; N],
+        columns: [__m256; N],
+    ) -> [__m256; N] {
+        for (sums, (row, columns)) in sums.iter_mut().zip(row.into_iter().zip(columns)) {
+            *sums = unsafe { _mm256_fmadd_ps(row, columns, *sums) };
+        }
+        sums
     }
 }
 
@@ -153,34 +174,36 @@ unsafe fn mul_add_pairs(sums: __m256, row: __m256i, columns: __m256i) -> __m256 
     }
 }
 
-impl Vector for Bf16 {
+impl<const N: usize> Vector for Registers<bf16, N> {
     type Element = bf16;
-    type Sums = [__m256; 2];
-    type Operand = [__m256i; 2];
+    type Sums = [__m256; N];
+    type Operand = [__m256i; N];
 
     #[inline(always)]
-    unsafe fn load_row(at: *const bf16) -> [__m256i; 2] {
-        unsafe { [_mm256_set1_epi32(at.cast::<i32>().read_unaligned()); 2] }
+    unsafe fn load_row(at: *const bf16) -> [__m256i; N] {
+        unsafe { [_mm256_set1_epi32(at.cast::<i32>().read_unaligned()); N] }
     }
 
     #[inline(always)]
-    unsafe fn load_columns(at: *const bf16) -> [__m256i; 2] {
+    unsafe fn load_columns(at: *const bf16) -> [__m256i; N] {
         unsafe {
-            [
-                _mm256_loadu_si256(at.cast()),
-                _mm256_loadu_si256(at.add(LANES).cast()),
-            ]
+            let mut columns = [_mm256_loadu_si256(at.cast()); N];
+            for (register, columns) in columns.iter_mut().enumerate() {
+                *columns = _mm256_loadu_si256(at.add(register * 2 * REGISTER).cast());
+            }
+            columns
         }
     }
 
     #[inline(always)]
-    unsafe fn mul_add(sums: [__m256; 2], row: [__m256i; 2], columns: [__m256i; 2]) -> [__m256; 2] {
-        // No closure: it could be compiled without AVX2, and each instruction would then be a call.
-        unsafe {
-            [
-                mul_add_pairs(sums[0], row[0], columns[0]),
-                mul_add_pairs(sums[1], row[1], columns[1]),
-            ]
+    unsafe fn mul_add(
+        mut sums: [__m256; N],
+        row: [__m256i; N],
+        columns: [__m256i; N],
+    ) -> [__m256; N] {
+        for (sums, (row, columns)) in sums.iter_mut().zip(row.into_iter().zip(columns)) {
+            *sums = unsafe { mul_add_pairs(*sums, row, columns) };
         }
+        sums
     }
 }
