@@ -17,7 +17,6 @@ const RECIPES: [(&str, &str); 6] = [
     ("systemd/driml-actor@.service", "actor"),
 ];
 
-/// The values of the placeholders in the recipes.
 const PLACEHOLDERS: [(&str, &str); 10] = [
     ("${DRIML_ENV:-procgen:coinrun}", "procgen:coinrun"),
     ("${DRIML_AGENT:-driml-ada}", "driml-ada"),

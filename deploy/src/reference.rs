@@ -109,7 +109,6 @@ pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// Returns the names of the files in a folder of presets, sorted.
 fn preset_names(folder: &str) -> Vec<String> {
     let folder = root().join("deploy/settings/presets").join(folder);
     let files = fs::read_dir(folder).unwrap().map(|it| it.unwrap().path());

@@ -11,10 +11,10 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_550),
-    ("actor", 10_520),
-    ("replay-server", 11_180),
-    ("learner", 22_020),
+    ("protocol", 7_540),
+    ("actor", 10_490),
+    ("replay-server", 11_175),
+    ("learner", 21_750),
     ("deploy", 31_240),
     ("tests", 10_410),
 ];

@@ -22,7 +22,6 @@ pub enum Ink {
 
 /// Pixels on a light card. Positions are in pixels from the upper left corner.
 pub struct Picture {
-    /// The card and the images.
     images: Pixmap,
     /// The shapes drawn above the images.
     shapes: Canvas,

@@ -117,7 +117,6 @@ impl Run {
         found.unwrap_or(&self.tables[0])
     }
 
-    /// Returns the index of a numeric column.
     fn column_index(&self, table: &Table, column: &str) -> Result<usize, Usage> {
         let place = table.column_index(column);
         place.filter(|_| !TEXTS.contains(&column)).ok_or_else(|| {

@@ -73,7 +73,6 @@ impl TrainCall {
 /// A run to be made. Plans are ordered by seed, so that a stopped sweep has one seed of every point before two of any.
 #[derive(Clone, Debug)]
 pub(crate) struct PlannedRun {
-    /// The name of its folder.
     pub(crate) name: String,
     pub(crate) call: TrainCall,
     pub(crate) frames: u64,

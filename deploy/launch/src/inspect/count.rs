@@ -20,9 +20,7 @@ pub(super) const BATCH_NAME: &str = "a batch";
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Line {
     pub(crate) what: String,
-    /// The count for the configuration.
     pub(crate) is: u64,
-    /// The count with everything on.
     pub(crate) everything: u64,
 }
 

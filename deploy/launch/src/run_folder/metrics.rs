@@ -38,7 +38,6 @@ pub(crate) struct BeforeReplay {
     pub(crate) after_updates: u64,
     pub(crate) rows: u64,
     pub(crate) episodes: u64,
-    /// k of those rows.
     pub(crate) k: Option<Spread>,
     /// Seconds that the run took up to its last resume, with or without its replay. Rows of metrics that were set aside do not show it.
     pub(crate) seconds: f64,

@@ -72,7 +72,6 @@ impl PrometheusFlag {
         found
     }
 
-    /// Writes the metrics of `view`.
     pub(crate) fn write(&self, view: &RunView) -> Result<(), Usage> {
         self.write_text(&prometheus_text(view))
     }

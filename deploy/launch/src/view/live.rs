@@ -57,7 +57,6 @@ pub(crate) struct Display {
 }
 
 impl Display {
-    /// The display of a run of `frames` frames that began at `began`.
     pub(crate) fn new(frames: u64, began: Instant) -> Self {
         Self {
             screen: Screen::new(frames, PROGRESS_TEMPLATE),

@@ -34,7 +34,6 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
     ]
 }
 
-/// The settings of the preset.
 const LEARNED: LearnedSettings = LearnedSettings {
     hidden: 32,
     lr: 2e-3,

@@ -77,7 +77,6 @@ impl Batch {
         rows.filter(|&row| self.valid[row] != 0).collect()
     }
 
-    /// Returns the errors of the loss and of its slopes.
     fn errors(&self) -> [f64; 2] {
         let (rows, bound, valid) = (self.valid.len(), self.bound, self.valid_rows());
         let (loss, slopes) = self.loss();

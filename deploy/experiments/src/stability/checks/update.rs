@@ -40,7 +40,6 @@ struct Setting {
     scale: f32,
     support: (f32, f32),
     tanh_clip: f64,
-    /// The size of returns.
     returns: f32,
     /// The largest number of different states.
     distinct: usize,

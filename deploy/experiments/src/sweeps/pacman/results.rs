@@ -21,9 +21,7 @@ pub(super) type Points = Vec<(f64, f64)>;
 
 pub(super) struct Results {
     pub(super) settings: Settings,
-    /// The losses of part (a).
     pub(super) losses: Vec<Loss>,
-    /// The returns of parts (b) and (c).
     pub(super) traces: [Vec<Trace>; PARTS],
 }
 

@@ -98,9 +98,7 @@ struct EqualTime {
     base: String,
     /// The mean seconds after which the runs of the faster of the two end.
     seconds: f64,
-    /// The returns at the end of each run.
     end: [Vec<f64>; 2],
-    /// The returns at `seconds`.
     then: [Vec<f64>; 2],
 }
 

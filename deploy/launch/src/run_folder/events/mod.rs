@@ -32,7 +32,6 @@ pub(super) struct Events {
     pub(super) file: AppendLog,
     folder: RunFolder,
     slow_at: Option<Instant>,
-    /// The counts of the last histograms.
     k_counts: Vec<u64>,
     action_counts: Vec<u64>,
     drawn_updates: Option<u64>,
