@@ -27,7 +27,7 @@ const FURTHER_SETTINGS: &str = "
 off in every preset
 --actors 4 --set 'actor.epsilon_ladder={base=0.4,alpha=7}'  a fixed epsilon per actor, each smaller than the one before, as in Ape-X
 
-tuned uses it on bigfish, fruitbot and starpilot; works on any game
+tuned uses it on most games of Procgen; works on any game
 --set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4
 
 rainbow uses it; works with any agent
