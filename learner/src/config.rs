@@ -98,8 +98,8 @@ impl AffinityConfig {
             let why = "the chosen estimator needs it: start from a preset";
             ConfigError::new(&format!("learner.affinity.{key}"), "(missing)", why)
         };
-        let name = format!("{:?}", self.estimator);
-        let bad = |e: UpdateError| ConfigError::new("learner.affinity", &name, e);
+        let name = format!("{:?}", self.estimator).to_lowercase();
+        let bad = |e: UpdateError| ConfigError::new("learner.affinity.estimator", &name, e);
         // Tables that the chosen estimator does not use are checked too.
         let learned = self.learned.map_or(Ok(()), |it| it.check_valid());
         let exact = self.exact.map_or(Ok(()), |it| it.check_valid());

@@ -61,7 +61,7 @@ impl Curve {
     }
 }
 
-/// Groups the runs in the order in which they are named. If `merge_seeds`, runs that differ only in their seed form one group.
+/// Groups the runs in the order in which they are named. If `merge_seeds`, runs that differ at most in their seed form one group.
 ///
 /// Settings that depend on the machine (threads, sizes, the replay's capacity) do not separate runs; the number of actors does.
 pub(super) fn group_runs(runs: &[Run], merge_seeds: bool) -> Vec<Group<'_>> {
