@@ -359,6 +359,18 @@ impl RunningProcess {
     pub fn signal(&self, signal: Signal) {
         let _ = kill(Pid::from_raw(self.pid), signal);
     }
+
+    /// Suspends the process. Waits until each thread has stopped, as threads run on for a moment after the signal.
+    pub fn suspend(&self) {
+        self.signal(Signal::SIGSTOP);
+        wait_until("a suspended process", || {
+            let mut threads = fs::read_dir(format!("/proc/{}/task", self.pid)).unwrap();
+            threads.all(|it| {
+                let status = fs::read_to_string(it.unwrap().path().join("status"));
+                status.unwrap().contains("State:\tT")
+            })
+        });
+    }
 }
 
 impl Drop for TestSystem {

@@ -16,7 +16,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("replay-server", 11_175),
     ("learner", 21_750),
     ("deploy", 31_240),
-    ("tests", 10_410),
+    ("tests", 10_415),
 ];
 const FILE_LINES_MAX: usize = 450;
 

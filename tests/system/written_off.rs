@@ -115,14 +115,10 @@ fn a_chunk_whose_shared_memory_is_written_off_is_stored_without_a_time_out() {
         let chunk = Chunk::with_buffer(header(actor), payload);
         if is_sent_before {
             // The server reads the message after the memory has been written off.
-            server.signal(Signal::SIGSTOP);
+            server.suspend();
             assert!(delivery.send(chunk));
-            wait_until("a chunk is on its way", || {
-                headers
-                    .pieces()
-                    .iter()
-                    .any(|&(_, references)| references > 1)
-            });
+            let is_sent = || headers.pieces().iter().any(|it| it.1 > 1);
+            wait_until("a chunk is on its way", is_sent);
             headers.write_off();
             server.signal(Signal::SIGCONT);
         } else {
