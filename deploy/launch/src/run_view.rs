@@ -368,7 +368,8 @@ mod tests {
         assert_eq!(view.rates.speed().updates, 0.0);
         assert_eq!(view.speed, None, "counts arrive in lumps");
         let begun = Instant::now().checked_sub(RATE_WINDOW).unwrap();
-        view.rates = Rates([begun, begun + RATE_WINDOW / 2].map(|at| (at, 0, 5_000)).into());
+        let sample = |at| (at, 0, 5_000);
+        view.rates = Rates([begun, begun + RATE_WINDOW / 2].map(sample).into());
         view.set_replay(vec![ReplayStatus::default()]);
         assert_eq!(view.speed, Some(Speed::default()));
 
