@@ -133,7 +133,7 @@ impl Config {
         Ok(())
     }
 
-    /// Checks that `disk_bytes_max` is no less than the replay needs, for a replay that is kept on disk.
+    /// Checks that `disk_bytes_max` is at least what the replay needs, for a replay that is kept on disk.
     pub fn check_disk_budget(&self, spec: &RunSpec) -> Result<(), ConfigError> {
         let least = disk_bytes_min(spec, self);
         let max = self.disk_bytes_max.unwrap_or(least);

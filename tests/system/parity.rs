@@ -24,7 +24,7 @@ fn a_case_with_another_expectation_fails() {
         call += &format!(" {tensor}");
     }
     let ended = system.fails(&call, "error: files out of tolerance: 5 of 6");
-    // A sound case whose update overflows is no wrong call.
+    // A sound case whose update overflows is not a wrong call.
     let overflow = changed("all_four", "target.torso.conv1.weight");
     fs::write(system.path("overflow"), overflow).unwrap();
     system.fails("parity overflow", "is not finite");
