@@ -8,7 +8,7 @@
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::images::Images;
-use crate::kernels::isa::{Element, LANES, LeftOperand, Mode, Simd, row_tiles, vectorized};
+use crate::kernels::isa::{Element, LeftOperand, Mode, Simd, each_block, row_tiles, vectorized};
 use crate::kernels::linear::{relu_gradient, relu_scalar};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::rounding::write_rows;
@@ -215,23 +215,16 @@ vectorized! {
 
     /// Adds each location of `map` [locations, out] to `sums` [out].
     pub(crate) fn add_locations<S>(simd, map: &'a [f32], sums: &'a mut [f32]) {
-        let out = sums.len();
-        let whole = out - out % LANES;
-        for first in (0..whole).step_by(LANES) {
-            add_channels::<LANES>(map, first, out, sums);
-        }
-        for first in whole..out {
-            add_channels::<1>(map, first, out, sums);
-        }
+        each_block!(sums.len(), add_channels(map, sums));
     }
 }
 
 /// [`add_locations`] of `N` channels, whose sums stay in a register.
 #[inline(always)]
-fn add_channels<const N: usize>(map: &[f32], first: usize, out: usize, sums: &mut [f32]) {
+fn add_channels<const N: usize>(first: usize, map: &[f32], sums: &mut [f32]) {
     let mut each = [0.0; N];
     each.copy_from_slice(&sums[first..][..N]);
-    for location in map.chunks_exact(out) {
+    for location in map.chunks_exact(sums.len()) {
         for (sum, value) in each.iter_mut().zip(&location[first..][..N]) {
             *sum += value;
         }

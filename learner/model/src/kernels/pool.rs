@@ -4,7 +4,7 @@
 //! The padding is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
 
 use crate::geometry::pooled_size;
-use crate::kernels::isa::{LANES, vectorized};
+use crate::kernels::isa::{each_block, vectorized};
 
 /// Height, width and channels of maps.
 pub(crate) type Size = (usize, usize, usize);
@@ -59,19 +59,10 @@ vectorized! {
         largest: &'a mut [f32],
         argmax: &'a mut [u8],
     ) {
-        let [whole, half] = [LANES, LANES / 2].map(|len| size.2 - size.2 % len);
         for window in windows(size) {
             let to = window.start..window.start + size.2;
             let (largest, argmax) = (&mut largest[to.clone()], &mut argmax[to]);
-            for first in (0..whole).step_by(LANES) {
-                pool_block::<LANES>(maps, window, first, largest, argmax);
-            }
-            for first in (whole..half).step_by(LANES / 2) {
-                pool_block::<{ LANES / 2 }>(maps, window, first, largest, argmax);
-            }
-            for first in half..size.2 {
-                pool_block::<1>(maps, window, first, largest, argmax);
-            }
+            each_block!(size.2, pool_block(maps, window, largest, argmax));
         }
     }
 }
@@ -79,9 +70,9 @@ vectorized! {
 /// [`pool`] of one window's channels from `first` on. Values and pixels stay in registers of the same width.
 #[inline(always)]
 fn pool_block<const N: usize>(
+    first: usize,
     maps: &[f32],
     window: Window,
-    first: usize,
     largest: &mut [f32],
     argmax: &mut [u8],
 ) {
@@ -109,19 +100,10 @@ vectorized! {
         argmax: &'a [u8],
         grad_maps: &'a mut [f32],
     ) {
-        let [whole, half] = [LANES, LANES / 2].map(|len| size.2 - size.2 % len);
         for window in windows(size) {
             let from = window.start..window.start + size.2;
             let (grads, argmax) = (&grads[from.clone()], &argmax[from]);
-            for first in (0..whole).step_by(LANES) {
-                unpool_block::<LANES>(grads, window, first, argmax, grad_maps);
-            }
-            for first in (whole..half).step_by(LANES / 2) {
-                unpool_block::<{ LANES / 2 }>(grads, window, first, argmax, grad_maps);
-            }
-            for first in half..size.2 {
-                unpool_block::<1>(grads, window, first, argmax, grad_maps);
-            }
+            each_block!(size.2, unpool_block(grads, window, argmax, grad_maps));
         }
     }
 }
@@ -129,9 +111,9 @@ vectorized! {
 /// [`unpool`] of one window's channels from `first` on.
 #[inline(always)]
 fn unpool_block<const N: usize>(
+    first: usize,
     grads: &[f32],
     window: Window,
-    first: usize,
     argmax: &[u8],
     grad_maps: &mut [f32],
 ) {

@@ -19,5 +19,5 @@ pub(crate) use dispatch::{AnySimd, with_simd};
 pub use dispatch::{describe_kernels, is_bf16_fast};
 pub(crate) use element::Element;
 pub use peak::multiply_in_first_cache;
-pub(crate) use simd::{LANES, Mode, Simd, vectorized};
+pub(crate) use simd::{LANES, Mode, Simd, each_block, vectorized};
 pub(crate) use tile::{LeftOperand, OutputTile, multiply_tile, row_tiles, tile_vecs};

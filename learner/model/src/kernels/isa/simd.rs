@@ -119,3 +119,22 @@ macro_rules! vectorized {
     )+};
 }
 pub(crate) use vectorized;
+
+/// Calls `function::<N>(first, ..)` for blocks of `N` channels: whole registers, then half a register, then single channels.
+macro_rules! each_block {
+    ($channels:expr, $function:ident($($argument:expr),*)) => {{
+        const HALF: usize = $crate::kernels::isa::LANES / 2;
+        let channels: usize = $channels;
+        let [whole, half] = [2 * HALF, HALF].map(|len| channels - channels % len);
+        for first in (0..whole).step_by(2 * HALF) {
+            $function::<{ 2 * HALF }>(first, $($argument),*);
+        }
+        for first in (whole..half).step_by(HALF) {
+            $function::<HALF>(first, $($argument),*);
+        }
+        for first in half..channels {
+            $function::<1>(first, $($argument),*);
+        }
+    }};
+}
+pub(crate) use each_block;
