@@ -9,9 +9,14 @@ import sys
 import torch
 
 import measure
-from torch_update import CONFIG, FORMATS, IMPALA, NATURE, of
+from torch_update import CONFIG, FORMATS, IMPALA, NARROW, NATURE, of
 
-NETWORKS = {"64x64x3": ((64, 64), NATURE), "104x80x3": ((104, 80), NATURE), "64x64x3, impala": ((64, 64), IMPALA)}
+NETWORKS = {
+    "64x64x3": ((64, 64), NATURE),
+    "104x80x3": ((104, 80), NATURE),
+    "64x64x3, impala": ((64, 64), IMPALA),
+    "64x64x3, impala, half width": ((64, 64), NARROW),
+}
 BATCHES = (32, 256)
 
 

@@ -32,6 +32,7 @@ CONFIG = {
 }
 NATURE = {"torso": "nature", "conv": [[32, 8, 4], [64, 4, 2], [64, 3, 1]]}
 IMPALA = {"torso": "impala", "channels": [16, 32, 32]}
+NARROW = {"torso": "impala", "channels": [8, 16, 16]}
 # Rows, height and width, DIM pairs, torso.
 CASES = {
     "C51, 64x64x3": (256, (64, 64), [], NATURE),
@@ -40,6 +41,7 @@ CASES = {
     "C51 + global-global DIM, 104x80x3": (256, (104, 80), ["4t4"], NATURE),
     "C51, impala, 64x64x3": (256, (64, 64), [], IMPALA),
     "C51, impala, 64x64x3, 64 rows": (64, (64, 64), [], IMPALA),
+    "C51, impala, half width, 64x64x3": (256, (64, 64), [], NARROW),
     "C51 + global-global DIM, impala, 64x64x3": (256, (64, 64), ["4t4"], IMPALA),
 }
 GAMMA, N_STEP = 0.99, 7

@@ -24,6 +24,7 @@ C51 + local-local + global-global DIM, 64x64x3|driml-ada|paper|learner.update.la
 C51 + global-global DIM, 104x80x3|driml-ada|paper-observation
 C51, impala, 64x64x3|c51|paper|model.torso=impala
 C51, impala, 64x64x3, 64 rows|c51|paper|model.torso=impala|learner.batch_size=64
+C51, impala, half width, 64x64x3|c51|paper|model.torso=impala|model.channels=[8,16,16]
 C51 + global-global DIM, impala, 64x64x3|driml-ada|paper|model.torso=impala";
 /// The update that is also computed with candle's own operations, as on a GPU, instead of our kernels.
 pub(super) const GLOBAL_DIM_CASE: &str = "C51 + global-global DIM, 64x64x3";

@@ -10,10 +10,15 @@ use crate::{report::Bench, settings};
 
 const BATCHES: [usize; 2] = [32, 256];
 /// The name of each network in figures, its preset, and further settings.
-const NETWORKS: [(&str, &str, &[&str]); 3] = [
+const NETWORKS: [(&str, &str, &[&str]); 4] = [
     ("64x64x3", "paper", &[]),
     ("104x80x3", "paper-observation", &[]),
     ("64x64x3, impala", "paper", &["model.torso=impala"]),
+    (
+        "64x64x3, impala, half width",
+        "paper",
+        &["model.torso=impala", "model.channels=[8,16,16]"],
+    ),
 ];
 
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {

@@ -44,6 +44,7 @@ pub(super) fn pairs() -> Vec<Pair> {
         ("C51 + global-global DIM, 104x80x3", Some(1.2), None),
         ("C51, impala", Some(1.5), Some(1.8)),
         ("C51, impala, 64x64x3, 64 rows", Some(1.5), Some(1.8)),
+        ("C51, impala, half width", Some(1.5), Some(1.8)),
         ("C51 + global-global DIM, impala", Some(1.5), Some(1.8)),
     ] {
         let size = if case.contains("x3") { "" } else { ", 64x64x3" };
@@ -58,6 +59,7 @@ pub(super) fn pairs() -> Vec<Pair> {
         ("64x64x3", 1.3, None),
         ("104x80x3", 1.3, None),
         ("64x64x3, impala", 1.5, Some(1.8)),
+        ("64x64x3, impala, half width", 1.5, Some(1.8)),
     ] {
         for frames in [32, 256] {
             let name = format!("{frames} frames of {network}");
