@@ -80,14 +80,20 @@ pub(super) fn group_runs(runs: &[Run], merge_seeds: bool) -> Vec<Group<'_>> {
 }
 
 impl Group<'_> {
-    /// Describes replays that hold different parts of their runs. They do not separate runs, as the free memory decides their default.
-    pub(super) fn describe_replays(&self) -> Option<String> {
+    /// Warns of replays that hold different parts of their runs, which do not separate runs, as the free memory decides their default;
+    /// and of repeated seeds, whose runs a band takes for independent ones.
+    pub(super) fn warnings(&self) -> impl Iterator<Item = String> {
         let held: BTreeSet<_> = self.runs.iter().filter_map(|run| run.replay_held).collect();
-        let (least, most) = held.first().zip(held.last()).filter(|(a, b)| a != b)?;
-        Some(format!(
-            "{}: the replays of its runs hold {least} to {most} transitions (replay.capacity_transitions); --separate draws each",
-            self.name
-        ))
+        let ends = held.first().zip(held.last()).filter(|(a, b)| a != b);
+        let replays = ends.map(|(least, most)| {
+            format!("the replays of its runs hold {least} to {most} transitions (replay.capacity_transitions)")
+        });
+        let mut seeds = BTreeSet::new();
+        let mut each = self.runs.iter().filter_map(|run| run.seed);
+        let repeated = each.find(|&seed| !seeds.insert(seed));
+        let repeated = repeated.map(|seed| format!("several of its runs have the seed {seed}"));
+        let found = [replays, repeated].into_iter().flatten();
+        found.map(|what| format!("{}: {what}; --separate draws each", self.name))
     }
 
     pub(super) fn curve(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {

@@ -122,8 +122,8 @@ fn charts_figure(args: &PlotArgs) -> anyhow::Result<Figure> {
         columns => columns.iter().map(named).collect(),
     };
     let groups = groups::group_runs(&runs, !args.separate);
-    let replays = groups.iter().filter_map(Group::describe_replays);
-    replays.for_each(|line| console::eprintln(&line));
+    let warnings = groups.iter().flat_map(Group::warnings);
+    warnings.for_each(|line| console::eprintln(&line));
     let is_return = |column: &String| column == RETURN || column == EVALUATED;
     if args.random.is_some() && !columns.iter().any(is_return) {
         return Err(usage!("--random draws a line over {RETURN:?}: add --column return").into());
