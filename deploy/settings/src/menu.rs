@@ -74,17 +74,24 @@ fn lambdas(table: &Table) -> String {
 }
 
 /// Returns the resolved settings, each with its source.
-pub fn settings_with_sources(choice: Choice) -> Result<String, Usage> {
+pub fn settings_with_sources(choice: Choice, sets: &[String]) -> Result<String, Usage> {
     // Shows what the preset asks for on any machine, whatever memory is free at this moment.
     let machine = Machine {
         memory_bytes: u64::MAX,
         ..Machine::detect()
     };
-    let config = Source::Presets(choice).resolve(&Flags::default(), &machine)?;
+    let flags = Flags {
+        sets: sets.to_vec(),
+        ..Flags::default()
+    };
+    let config = Source::Presets(choice).resolve(&flags, &machine)?;
     let world = choice.world;
     let mut sources = BTreeMap::new();
     for layer in choice.layers() {
         record_sources(&layer, &world.without_library().to_string(), &mut sources);
+    }
+    for (path, _) in sets.iter().filter_map(|it| it.split_once('=')) {
+        sources.insert(path.trim().to_owned(), "--set".to_owned());
     }
     let mut text = format!(
         "# {} in {world}, preset {}: every setting and its source. `driml train --config` takes this file.\n",
@@ -190,7 +197,7 @@ mod tests {
         for world in WorldName::all() {
             for agent in AGENTS {
                 let choice = Choice::new(Some("paper"), Some(&world.to_string()), Some(agent.name));
-                let text = settings_with_sources(choice.unwrap()).unwrap();
+                let text = settings_with_sources(choice.unwrap(), &[]).unwrap();
                 assert!(!text.contains("not said"), "{text}");
                 RunConfig::parse("printed", &text).unwrap();
             }
@@ -199,8 +206,8 @@ mod tests {
 
     #[test]
     fn a_game_s_own_choice_is_named_as_such() {
-        let choice = Choice::new(Some("paper"), Some("bigfish"), Some("driml-fix"));
-        let text = settings_with_sources(choice.unwrap()).unwrap();
+        let choice = Choice::new(Some("paper"), Some("bigfish"), Some("driml-fix")).unwrap();
+        let text = settings_with_sources(choice, &[]).unwrap();
         let mut lines = text.lines();
         let horizon = lines.find(|line| line.starts_with("horizon")).unwrap();
         assert!(
@@ -210,6 +217,13 @@ mod tests {
         assert!(text.contains("augment = "), "{text}");
         let again: Table = text.parse().unwrap();
         assert_eq!(k(&again), "5");
+        let set = "run.horizon={ rule = \"fixed\", k = 3 }".to_owned();
+        let text = settings_with_sources(choice, &[set]).unwrap();
+        assert!(
+            text.lines()
+                .any(|line| line.contains("k = 3") && line.ends_with("# --set")),
+            "{text}"
+        );
     }
 
     #[test]

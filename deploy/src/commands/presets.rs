@@ -15,15 +15,18 @@ pub(crate) struct PresetsArgs {
     /// Print the settings of this preset
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
+    /// Change one of these settings, as `driml train` does; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) sets: Vec<String>,
 }
 
 /// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` accepts.
 pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
-    if args.env.is_none() && args.agent.is_none() && args.preset.is_none() {
+    let names = [&args.preset, &args.env, &args.agent];
+    if names.iter().all(|it| it.is_none()) && args.sets.is_empty() {
         return print_wrapped(&menu::menu()?, 4);
     }
-    let names = [&args.preset, &args.env, &args.agent];
     let [preset, env, agent] = names.map(Option::as_deref);
     let choice = Choice::new(preset, env, agent)?;
-    print(&menu::settings_with_sources(choice)?)
+    print(&menu::settings_with_sources(choice, &args.sets)?)
 }
