@@ -91,7 +91,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             let path = if path.is_dir() { &in_folder } else { path };
             let name = path.display().to_string();
             let text = std::fs::read_to_string(path);
-            let text = text.map_err(|e| usage!("reading the settings {name}: {e}"))?;
+            let text = text.map_err(|e| usage!("reading the settings {name}: {e}; --config takes a TOML file or the folder of a run"))?;
             (Source::of_another_run(&name, &text)?, name)
         }
         None => {

@@ -241,7 +241,9 @@ fn fetch_settings(
             ));
         }
         Err(other) => {
-            let what = format!("the replay server on {endpoint} does not answer");
+            let what = format!(
+                "the replay server on {endpoint} does not answer: its process may be suspended, or its machine unreachable"
+            );
             return Err(anyhow::Error::new(other).context(what));
         }
     };
