@@ -17,6 +17,15 @@ pub(crate) fn small_replay(config: &Config) -> Replay {
     Replay::new(&small_spec(), config, 8).unwrap()
 }
 
+/// Returns settings with 4 rows for each transition, and actors that are at most `slack_transitions` ahead.
+pub(crate) fn limited(slack_transitions: u64) -> Config {
+    Config {
+        replay_ratio: 4.0,
+        slack_transitions,
+        ..Config::unlimited(1000)
+    }
+}
+
 /// Returns settings with priorities, and with limits at which neither side ever waits.
 pub(crate) fn prioritised(capacity: u64, alpha: f64) -> Config {
     Config {

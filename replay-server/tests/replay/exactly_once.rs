@@ -11,7 +11,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{affinity, header, insert, is_refused, join, learned, learner, small_replay, stored},
+    calls::{
+        affinity, header, insert, is_refused, join, learned, learner, limited, small_replay, stored,
+    },
     history::spec,
 };
 
@@ -234,10 +236,8 @@ fn a_poll_says_what_became_of_a_chunk() {
 /// Returns a replay of ratio 4 after three chunks.
 fn with_three_chunks(transitions_max: Option<u64>) -> Replay {
     let mut replay = small_replay(&Config {
-        replay_ratio: 4.0,
-        slack_transitions: 100,
         transitions_max,
-        ..Config::unlimited(1000)
+        ..limited(100)
     });
     for sequence in 0..3 {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));

@@ -14,8 +14,8 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::check_rows,
     calls::{
-        Actor, affinity, header, insert, is_refused, is_stored, join, small_replay, small_spec,
-        stored, wait,
+        Actor, affinity, header, insert, is_refused, is_stored, join, limited, small_replay,
+        small_spec, stored, wait,
     },
     history::{History, spec},
 };
@@ -100,11 +100,9 @@ fn actors_and_streams_are_bounded() {
 #[test]
 fn the_run_ends_when_all_is_in_and_sampled() {
     let mut replay = small_replay(&Config {
-        replay_ratio: 4.0,
-        slack_transitions: 6,
         warmup_transitions: 6,
         transitions_max: Some(18),
-        ..Config::unlimited(1000)
+        ..limited(6)
     });
     let warm_up = Waiting::WarmUp { have: 0, need: 6 };
     assert_eq!(replay.waiting(), warm_up);
@@ -134,11 +132,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
 
 #[test]
 fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
-    let mut replay = small_replay(&Config {
-        replay_ratio: 4.0,
-        slack_transitions: 2,
-        ..Config::unlimited(1000)
-    });
+    let mut replay = small_replay(&limited(2));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(6));
     let early = insert(&mut replay, header(0, 1, 2, 12));
@@ -166,11 +160,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
 
 #[test]
 fn an_actor_that_leaves_and_does_not_stop_waits_like_the_others() {
-    let mut replay = small_replay(&Config {
-        replay_ratio: 4.0,
-        slack_transitions: 2,
-        ..Config::unlimited(1000)
-    });
+    let mut replay = small_replay(&limited(2));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     for incarnation in [1, 2] {
         join(&mut replay, 1, incarnation);
@@ -224,10 +214,8 @@ fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
 fn what_other_shards_are_said_to_have_counted_is_bounded() {
     let config = Config {
         shards: 2,
-        replay_ratio: 4.0,
-        slack_transitions: 100,
         transitions_max: Some(5000),
-        ..Config::unlimited(1000)
+        ..limited(100)
     };
     let mut replay = small_replay(&config);
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));

@@ -4,15 +4,13 @@
 use driml_protocol::{LearnerJoin, ShardCounts};
 use driml_replay_server::{Config, NotReady, RatioStart, Replay};
 
-use crate::calls::{header, insert, is_stored, learner, small_spec, stored};
+use crate::calls::{header, insert, is_stored, learner, limited, small_spec, stored};
 
 fn config() -> Config {
     Config {
-        replay_ratio: 4.0,
         warmup_transitions: 60,
-        slack_transitions: 12,
         transitions_max: Some(180),
-        ..Config::unlimited(1000)
+        ..limited(12)
     }
 }
 
