@@ -4,7 +4,7 @@
 use driml_protocol::{LearnerJoin, ShardCounts};
 use driml_replay_server::{Config, NotReady, RatioStart, Replay};
 
-use crate::calls::{header, insert, is_stored, learner, limited, small_spec, stored};
+use crate::calls::{header, insert, is_stored, learner, limited, small_spec};
 
 fn config() -> Config {
     Config {
@@ -55,7 +55,14 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         ..config()
     };
     let (fuller, full) = (refills(1 << 40, 1000), refills(1 << 40, 96));
+    let of_updates = |updates: u64| Config {
+        transitions_max: Some(2 * updates + 180),
+        ..config()
+    };
+    let [long, longest] = [1 << 32, 1 << 48].map(of_updates);
     let at = |updates, inserted| learner(1, updates, 8 * updates, inserted);
+    // Two transitions allow an update.
+    let after = |updates| at(updates, 2 * updates + 60);
     let cases = [
         ("from the start", &unchanged, at(0, 0), 8, (30, 60), 0),
         ("same settings", &unchanged, at(29, 120), 8, (20, 31), 60),
@@ -64,6 +71,8 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         ("all frames", &unchanged, at(55, 180), 8, (10, 5), 60),
         ("nothing left", &unchanged, at(60, 180), 8, (0, 0), 0),
         ("fewer frames", &shorter, at(30, 120), 8, (0, 0), 0),
+        ("2^32 updates", &long, after(1 << 32), 8, (30, 60), 60),
+        ("2^48 updates", &longest, after(1 << 48), 8, (30, 60), 60),
         // 60 transitions allow 120 rows.
         ("another ratio", &other_ratio, at(29, 120), 8, (20, 15), 60),
         // 240 rows.
@@ -83,25 +92,6 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         let held = stored.min(config.capacity_transitions);
         assert_eq!(status.transitions_held, held, "{what}");
         assert_eq!(replay.resumed_after_updates(), join.updates, "{what}");
-    }
-}
-
-#[test]
-fn a_run_of_more_than_2_to_the_32_updates_counts_on() {
-    let config = Config {
-        replay_ratio: 8.0,
-        ..Config::unlimited(1000)
-    };
-    for updates in [1 << 32, 10_000_000_000, 1 << 48] {
-        let before = 4 * updates;
-        let mut replay = Replay::new(&small_spec(), &config, 32).unwrap();
-        let join = learner(1, updates, 32 * updates, before);
-        replay.join_learner(join).unwrap();
-        let reply = insert(&mut replay, header(0, 1, 0, 0));
-        assert_eq!(reply, stored(before + 6), "{updates} updates");
-        replay.sample(32).expect("8 rows each of 6 transitions");
-        let drawn = replay.sample(32);
-        assert!(matches!(drawn, Err(NotReady::Wait(_))), "{drawn:?}");
     }
 }
 
