@@ -2,25 +2,20 @@
 
 use std::{fs::File, path::Path, sync::Arc};
 
-use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, InsertReply, LearnerJoin, LearnerProgress, Leave, RunSpec,
-};
+use driml_protocol::{ActorJoin, LearnerJoin, LearnerProgress, Leave, RunSpec};
 use tempfile::TempDir;
 
-use super::{PersistArgs, PersistError, RecoveryReport};
+use super::PersistArgs;
 use crate::{Config, Replay, ledger::actors::ACTORS_MAX};
 
-fn try_open(dir: &Path, capacity: u64) -> Result<(Replay, RecoveryReport), PersistError> {
+fn open(dir: &Path) -> Replay {
     let args = PersistArgs {
         dir: dir.to_owned(),
         segment_bytes: Some(4_000),
         ..PersistArgs::default()
     };
-    Replay::open(&args, &RunSpec::smallest(), &Config::unlimited(capacity), 4)
-}
-
-fn open(dir: &Path) -> Replay {
-    let (replay, recovery) = try_open(dir, 2_000).unwrap();
+    let config = Config::unlimited(2_000);
+    let (replay, recovery) = Replay::open(&args, &RunSpec::smallest(), &config, 4).unwrap();
     assert_eq!(recovery.warnings, [""; 0]);
     replay
 }
@@ -101,23 +96,4 @@ fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
     assert_eq!(forgotten, [vec![], vec![0]], "a known actor needs no room");
     replay.join_actor(ActorJoin::new(9_999, 1)).unwrap();
     check_comes_back(replay, folder.path());
-}
-
-#[test]
-fn a_replay_too_small_for_a_chunk_of_the_log_leaves_the_log_as_it_is() {
-    let (folder, mut replay) = begin();
-    let header = ChunkHeader {
-        steps: 8,
-        streams: 1,
-        frame_bytes: replay.spec.frame_bytes() as u32,
-        incarnation: 1,
-        ..ChunkHeader::default()
-    };
-    let reply = replay.insert(&Chunk::zeroed(header));
-    assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
-    let stored = replay.stored_bytes().unwrap();
-    drop(replay);
-    let error = try_open(folder.path(), 7).err().unwrap().to_string();
-    assert!(error.contains("8 transitions in one chunk"), "{error}");
-    assert!(open(folder.path()).stored_bytes().unwrap() == stored);
 }

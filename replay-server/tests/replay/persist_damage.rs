@@ -429,4 +429,11 @@ fn a_run_may_go_on_with_another_capacity() {
     replay.check_valid();
     let status = replay.status();
     assert_eq!(status.transitions_inserted, kept.history.inserted);
+    // A ring without room for a chunk of the log leaves the log as it is.
+    let kept = SavedLog::new(10_000);
+    let too_small = open(&kept.args, &Config::unlimited(7)).map(drop);
+    let error = too_small.unwrap_err().to_string();
+    let why = "transitions in one chunk; the replay holds 7";
+    assert!(error.contains(why), "{error}");
+    assert_eq!(stored(&kept.open_with_warnings(&[])), kept.stored);
 }
