@@ -1,7 +1,7 @@
 //! A compressed replay gives the same batches as a plain one, bit for bit, and respects its memory limit.
 //! It does not test what the batches hold: `batches` does, with and without compression.
 
-use driml_protocol::{Buffer, Chunk, Horizon, RunSpec};
+use driml_protocol::{Buffer, Chunk, ChunkHeader, Horizon, RunSpec};
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -35,34 +35,19 @@ impl Content {
     }
 }
 
-/// An actor of two environments that generates frames. Every frame begins with the number of its transition.
-struct Player {
-    actor: Actor,
-    rng: ChaCha8Rng,
-}
-
-impl Player {
-    fn new(spec: &RunSpec) -> Self {
-        let mut actor = Actor::new(0, 1);
-        actor.next.frame_bytes = spec.frame_bytes() as u32;
-        let rng = ChaCha8Rng::seed_from_u64(1);
-        Self { actor, rng }
+/// Makes a chunk of two environments. Every frame begins with the number of its transition.
+fn chunk(header: ChunkHeader, content: Content, rng: &mut ChaCha8Rng) -> Chunk {
+    let mut chunk = Chunk::zeroed(header);
+    for row in 0..header.transitions() {
+        let number = header.first_transition + row as u64;
+        let frame = chunk.frame_mut(row);
+        content.fill(rng, frame, number);
+        frame[..8].copy_from_slice(&number.to_le_bytes());
+        let end = random_end(rng);
+        let action = rng.random_range(0..5);
+        chunk.set(row, action, rng.random_range(-1.0..1.0), end);
     }
-
-    fn chunk(&mut self, steps: u32, content: Content) -> Chunk {
-        let header = self.actor.send(2, steps);
-        let mut chunk = Chunk::zeroed(header);
-        for row in 0..header.transitions() {
-            let number = header.first_transition + row as u64;
-            let frame = chunk.frame_mut(row);
-            content.fill(&mut self.rng, frame, number);
-            frame[..8].copy_from_slice(&number.to_le_bytes());
-            let end = random_end(&mut self.rng);
-            let action = self.rng.random_range(0..5);
-            chunk.set(row, action, self.rng.random_range(-1.0..1.0), end);
-        }
-        chunk
-    }
+    chunk
 }
 
 /// A compressed replay without a limit in bytes holds what a plain one does, so both give the same batches. Noise takes little more memory
@@ -96,7 +81,9 @@ fn batches_are_the_same_bit_for_bit_and_memory_follows_what_is_held() {
         replays.iter_mut().for_each(|it| join(it, 0, 1));
         let held = |packed: &Replay| packed.status().frame_bytes_held;
         assert_eq!(held(&replays[1]), 0, "taken only as transitions come");
-        let mut player = Player::new(&spec);
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut actor = Actor::new(0, 1);
+        actor.next.frame_bytes = spec.frame_bytes() as u32;
         for content in [
             Content::Noise,
             Content::Alternating,
@@ -106,7 +93,7 @@ fn batches_are_the_same_bit_for_bit_and_memory_follows_what_is_held() {
             for _ in 0..capacity / 20 {
                 // Drafts that are unpacked after the next chunk was stored.
                 let late = replays.each_mut().map(|it| it.draw(16, Buffer::zeroed));
-                let chunk = player.chunk(21, content);
+                let chunk = chunk(actor.send(2, 21), content, &mut rng);
                 let replies = replays.each_mut().map(|it| it.insert(&chunk));
                 assert!(replies.iter().all(is_stored), "{replies:?}");
                 let late = late.map(|it| it.map(|draft| draft.unpack()));
@@ -115,7 +102,7 @@ fn batches_are_the_same_bit_for_bit_and_memory_follows_what_is_held() {
                     assert!(late[0] == late[1] && batches[0] == batches[1]);
                 }
                 assert!(held(&replays[1]) <= most);
-                let number = player.actor.next.first_transition;
+                let number = actor.next.first_transition;
                 let oldest = number - replays[1].status().transitions_held;
                 let states = batches[1].states_t();
                 for frame in states.chunks(spec.frame_bytes()).filter(|_| stack == 1) {
@@ -139,7 +126,8 @@ fn batches_are_the_same_bit_for_bit_and_memory_follows_what_is_held() {
                 Content::Scrolling => {}
             }
         }
-        let chunk = player.chunk(7 * capacity as u32 / 20, Content::Alternating);
+        let header = actor.send(2, 7 * capacity as u32 / 20);
+        let chunk = chunk(header, Content::Alternating, &mut rng);
         let reply = replays[1].insert(&chunk);
         assert_eq!(is_refused(&reply), allowed.is_some(), "{reply:?}");
     }
