@@ -229,8 +229,7 @@ mod tests {
         participants.mark_seen(actor(1), Some(7), at(6));
         participants.mark_seen(actor(9), Some(8), at(7));
         let report = |incarnation| {
-            let actor = 3;
-            let who = Participant::Actor(ActorJoin { actor, incarnation });
+            let who = Participant::Actor(ActorJoin::new(3, incarnation));
             Report::new(who, "plays", 2.0, Some(Warning::new("late", 1.0)))
         };
         assert!(participants.store_report(report(1), at(8)));
@@ -303,8 +302,7 @@ mod tests {
         let now = Instant::now();
         let mut participants = Participants::new(now);
         for actor in 0..200 {
-            let incarnation = 1;
-            let who = Participant::Actor(ActorJoin { actor, incarnation });
+            let who = Participant::Actor(ActorJoin::new(actor, 1));
             participants.add_joined(who.peer(), now);
             // Warnings of actors with higher numbers are newer, and many have the same age.
             let age = f64::from((200 - actor) / 50);

@@ -183,11 +183,10 @@ mod tests {
     fn the_time_in_which_the_process_was_stopped_is_no_waiting() {
         let (begin, second, stop) = (Instant::now(), Duration::from_secs(1), 240 * STOP_MIN);
         let mut replay = Replay::new(&RunSpec::smallest(), &Config::unlimited(9), 1).unwrap();
-        let (actor, incarnation) = (0, 9);
-        replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+        replay.join_actor(ActorJoin::new(0, 9)).unwrap();
         let mut state = State::new(replay, begin);
         state.chunks.queue.push_back(ParkedChunk {
-            packed: chunk(actor, 0, 1),
+            packed: chunk(0, 0, 1),
             query: None,
             arrived: begin,
             queried_at: begin,

@@ -173,6 +173,8 @@ fn write_to_disk(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Resu
 
 #[cfg(test)]
 mod tests {
+    use WeightsRequest::NewerThan;
+
     use super::*;
 
     fn header(version: u64) -> WeightsHeader {
@@ -182,10 +184,6 @@ mod tests {
     fn piece(version: u64, offset: usize) -> WeightsRequest {
         let offset = offset as u64;
         WeightsRequest::Piece { version, offset }
-    }
-
-    const fn newer(version: u64) -> WeightsRequest {
-        WeightsRequest::NewerThan(version)
     }
 
     impl WeightsStore {
@@ -223,16 +221,16 @@ mod tests {
         let at = |seconds| start + Duration::from_secs(seconds);
         let file = vec![7; 3 * PIECE_BYTES];
         let none = Err(WeightsReply::NoneNewer);
-        assert_eq!(store.found(newer(0), start), none);
+        assert_eq!(store.found(NewerThan(0), start), none);
         for version in 1..20 {
             let now = at(version);
             store.update(header(version), &file).unwrap();
-            assert_eq!(store.found(newer(version - 1), now), Ok((version, 0)));
+            assert_eq!(store.found(NewerThan(version - 1), now), Ok((version, 0)));
             let slow = store.found(piece(1, PIECE_BYTES), now);
             assert_eq!(slow, Ok((1, PIECE_BYTES)));
             assert!(store.pulled.len() <= PULLED_VERSIONS_MAX);
         }
-        assert_eq!(store.found(newer(19), at(20)), none);
+        assert_eq!(store.found(NewerThan(19), at(20)), none);
         // A version that was dropped, one that never existed, and offsets at which no piece begins.
         for (version, offset) in [(2, 0), (99, 0), (19, 1), (19, 3 * PIECE_BYTES)] {
             let gone = store.found(piece(version, offset), at(20));
@@ -246,7 +244,7 @@ mod tests {
         let last = PULLED_VERSIONS_MAX as u64;
         for version in 1..=last + 5 {
             store.update(header(version), &[7]).unwrap();
-            let begun = store.found(newer(0), now);
+            let begun = store.found(NewerThan(0), now);
             let newest_pulled = version.min(last);
             assert_eq!(begun, Ok((newest_pulled, 0)));
         }
@@ -256,7 +254,7 @@ mod tests {
             let pulled = store.found(piece(version, 0), later);
             assert_eq!(pulled, Ok((version, 0)));
         }
-        assert_eq!(store.found(newer(last), later), Ok((last + 5, 0)));
+        assert_eq!(store.found(NewerThan(last), later), Ok((last + 5, 0)));
         let gone = store.found(piece(1, 0), later);
         assert_eq!(gone, Err(WeightsReply::Gone));
     }
