@@ -5,17 +5,9 @@ use driml_protocol::{
 };
 
 use crate::samples::{
-    ORIGIN, SPEC, STACKED, STACKS, batch, batch_from, encoded, prioritised_batch, refusal, rows,
-    stacked_batch, used_memory,
+    ORIGIN, STACKED, STACKS, batch, batch_from, encoded, prioritised_batch, receive_batch, refusal,
+    rows, stacked_batch, used_memory,
 };
-
-fn received(bytes: &[u8]) -> Batch {
-    let (reply, payload) = codec::decode::<BatchReply>(bytes, Some(SPEC)).unwrap();
-    let BatchReply::Batch(header) = reply else {
-        panic!("{reply:?}")
-    };
-    Batch::from_payload(header, payload.to_vec().into()).unwrap()
-}
 
 /// A batch of a uniform run has 12 bytes less per row, and no origin.
 #[test]
@@ -31,10 +23,10 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     // The origin takes one byte for the shard and nine for the incarnation.
     assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
     assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
-    assert_eq!(received(&encoded(plain.clone())), plain);
+    assert_eq!(receive_batch(&encoded(plain.clone())).unwrap(), plain);
 
     let bytes = encoded(prioritised.clone());
-    let mut back = received(&bytes);
+    let mut back = receive_batch(&bytes).unwrap();
     assert_eq!(back, prioritised);
     assert_eq!(back.probabilities().unwrap(), [0.5, 1.0, 1e-30]);
     assert_eq!(back.actions(), [0, 1, 2]);
@@ -80,7 +72,7 @@ fn stacks_come_back_as_whole_states() {
         // Five frames of two bytes. Each of six states has two frame numbers of four bytes in place of four bytes of pixels.
         assert_eq!(more, 5 * 2 + 6 * 8 - 6 * 4);
         let bytes = encoded(sent.clone());
-        let back = received(&bytes);
+        let back = receive_batch(&bytes).unwrap();
         assert_eq!(back, sent);
         assert_eq!(back.probabilities().is_some(), origin.is_some());
         // The oldest channels of a pixel come first.

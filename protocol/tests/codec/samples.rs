@@ -47,7 +47,7 @@ impl Sample {
     fn batch(batch: Batch) -> Self {
         let (header, payload) = batch.into_payload();
         Self {
-            read: read_batch,
+            read: |bytes| receive_batch(bytes).map(drop),
             ..Self::with_payload(&BatchReply::Batch(header), &payload)
         }
     }
@@ -57,11 +57,12 @@ pub(crate) fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
     Chunk::decode(bytes, SPEC).map(|_| ())
 }
 
-pub(crate) fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
-    let (reply, payload) = codec::decode::<BatchReply>(bytes, Some(SPEC))?;
-    match reply {
-        BatchReply::Batch(header) => Batch::from_payload(header, payload.to_vec().into()).map(drop),
-        BatchReply::NotReady(_) => Ok(()),
+pub(crate) fn receive_batch(bytes: &[u8]) -> Result<Batch, CodecError> {
+    match codec::decode(bytes, Some(SPEC))? {
+        (BatchReply::Batch(header), payload) => {
+            Batch::from_payload(header, payload.to_vec().into())
+        }
+        (reply, _) => panic!("{reply:?}"),
     }
 }
 
