@@ -3,14 +3,14 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
-    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Participant, Recovering, RecoveryProgress,
-    Report, RunInfo, Totals, Warning, WeightsHeader, WeightsUpload, WeightsVersion,
+    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Participant, PriorityUpdate, Recovering,
+    RecoveryProgress, Report, RunInfo, Totals, Warning, WeightsHeader, WeightsUpload,
+    WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 
 use crate::samples::{
-    SPEC, Sample, batch, chunk, episodes, prioritised_batch, priority_update, read_chunk, refusal,
-    samples,
+    SPEC, Sample, batch, chunk, messages, prioritised_batch, read_chunk, refusal, samples,
 };
 
 #[test]
@@ -223,7 +223,7 @@ fn counts_that_do_not_fit_their_payload_are_refused() {
 fn what_no_process_says_is_refused() {
     let episodes = EpisodesReply {
         ended: 8,
-        ..episodes()
+        ..messages().remove(0)
     };
     let upload = WeightsUpload {
         learner: 5,
@@ -248,7 +248,7 @@ fn what_no_process_says_is_refused() {
         },
         ..Recovering::default()
     };
-    let mut fewer = priority_update();
+    let mut fewer: PriorityUpdate = messages().remove(0);
     fewer.parts[0].priorities.pop();
     let mut refused = vec![
         (refusal(&episodes, &[]), "2 episodes after 7, but only 8"),
@@ -278,7 +278,7 @@ fn what_no_process_says_is_refused() {
         refused.push((refusal(&recovering(time), &[]), "the recovery began"));
     }
     for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let mut update = priority_update();
+        let mut update: PriorityUpdate = messages().remove(0);
         update.parts[0].priorities[1] = priority;
         refused.push((refusal(&update, &[]), "not a number of at least 0"));
     }

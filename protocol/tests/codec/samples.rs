@@ -5,13 +5,11 @@ use std::fmt::Debug;
 
 use driml_protocol::{
     Ack, ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
-    ChunkHeader, ChunkPoll, CodecError, End, EndedEpisode, EpisodesReply, EpisodesRequest,
-    InsertReply, JoinReply, LearnerJoin, LearnerProgress, LearnerStatus, Leave, LogStatus, Message,
-    NO_ACTION, NotReady, Origin, Participant, PriorityPart, PriorityUpdate, ProcessName,
-    ProcessStatus, ProcessesStatus, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
-    Returns, RowScalars, RunInfo, ShardCounts, StackedFrames, Totals, Waiting, Warning,
-    WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, Welcome,
-    codec::{self},
+    ChunkHeader, ChunkPoll, CodecError, End, EpisodesReply, EpisodesRequest, InsertReply,
+    JoinReply, LearnerJoin, LearnerStatus, Leave, Message, NO_ACTION, Origin, PriorityUpdate,
+    ProcessesStatus, Recovering, ReplayStatus, Report, RowScalars, RunInfo, ShardCounts,
+    StackedFrames, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    codec,
 };
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
@@ -194,218 +192,103 @@ pub(crate) fn weights() -> (WeightsUpload, Vec<u8>) {
     (upload, payload)
 }
 
-pub(crate) fn processes_status() -> ProcessesStatus {
-    ProcessesStatus {
-        up_s: 60.0,
-        waiting: Waiting::ActorsWaitForLearner,
-        waiting_s: 2.5,
-        requests_waiting: 1,
-        chunks_waiting: 2,
-        chunk_bytes_waiting: 1 << 20,
-        weights_version: 4,
-        weights_age_s: Some(1.0),
-        log: Some(LogStatus {
-            folder: "replay".into(),
-            bytes: 1 << 20,
-            bytes_max: Some(1 << 30),
-            flushed_s: 0.5,
-            refused: Some((2.0, "full".into())),
-            unwritten_bytes: 40,
-        }),
-        last_warning: None,
-        processes: vec![ProcessStatus {
-            who: ProcessName::Actor(3),
-            connected: true,
-            since_s: 50.0,
-            lives: 2,
-            last_seen_s: Some(0.5),
-            held_s: None,
-            weights_version: Some(3),
-            doing: Some(("plays".into(), 5.0, 1.0)),
-            last_warning: Some(Warning::new("late", 9.0)),
-        }],
-    }
+/// Messages without payload: the name of each kind, and its fields as JSON. An entry ends with a semicolon at the end of a line.
+const MESSAGES: &str = r#"
+InsertReply {"Stored": {"inserted_total": 1099511627776, "actors": 64, "waited": true}};
+InsertReply {"Wait": {"inserted_total": 0, "kept": true}};
+InsertReply {"OutOfOrder": {"expected": 3}};
+InsertReply {"Finished": {"inserted_total": 7}};
+InsertReply {"Refused": {"why": "frames of 7 bytes"}};
+JoinReply {"Welcome": {"inserted_total": 3, "weights_version": 4, "earlier_incarnations": 5}};
+JoinReply {"Taken": {"why": "a"}};
+JoinReply {"Refused": {"why": "b"}};
+JoinReply {"Wait": {"why": "c"}};
+BatchReply {"NotReady": {"Wait": "Neither"}};
+BatchReply {"NotReady": {"Wait": {"WarmUp": {"have": 3, "need": 1000}}}};
+BatchReply {"NotReady": {"Wait": "LearnerWaitsForActors"}};
+BatchReply {"NotReady": {"Wait": "ActorsWaitForLearner"}};
+BatchReply {"NotReady": {"Wait": "Finished"}};
+BatchReply {"NotReady": "Finished"};
+BatchReply {"NotReady": {"Refused": {"why": ""}}};
+BatchRequest {"learner": 5, "id": {"client_id": 18446744073709551615, "number": 0, "attempt": 1}, "rows": 256, "shared_memory": true,
+    "learned": {"updates": 4, "saved_updates": 2, "rows_received": 64}, "other_shards": {"inserted": 0, "rows_sampled": 0}};
+Affinity {"learner": 5, "version": 2, "matrix": [0.25, 0.5, 0.25, 0.25, 0.5, 0.25, 0.25, 0.5, 0.25]};
+Priorities {"learner": 5, "number": 9, "parts": [{"origin": {"shard": 2, "incarnation": 18446744073709551615},
+    "transitions": [0, 18446744073709551615], "priorities": [0.0, 2.5]}]};
+WeightsVersion {"version": 9};
+Leave {"actor": 1, "incarnation": 2, "produced": 3};
+ReplayStatus {};
+ReplayStatus {"transitions_inserted": 5, "returns": {"known": 120, "newest": [-1.25, 3.0]}, "k_histogram": [1, 2, 3],
+    "action_histogram": [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], "waiting": {"WarmUp": {"have": 5, "need": 9}}};
+LearnerStatus {"updates": 3, "c51_kl": 0, "losses": [["dim_3t3", 0.5], ["dim_4t4", 1.5]], "total": 0, "grad_norm": 0, "q_mean": 0,
+    "weights_version": 0, "weights_sha256": "", "computing_s": 0, "waiting_s": 0, "finished": false};
+RunInfo {"config_toml": "[run]\nseed = 1\n", "inserted_total": 12, "has_learner": true, "after_updates": 3, "shard": [1, 2],
+    "shared_memory": true};
+Recovering {"progress": {"bytes_read": 1, "bytes": 2, "since_s": 3.5}, "config_toml": "[run]\nseed = 1\n"};
+ActorJoin {"actor": 1, "incarnation": 2};
+LearnerJoin {"learner": 5, "run": 1152921504606846976, "updates": 9, "counts": {"inserted": 7, "rows_sampled": 8},
+    "other_shards": {"inserted": 0, "rows_sampled": 0}, "restart": true};
+ChunkPoll {"actor": 1, "incarnation": 2, "sequence": 3, "leaving": true};
+WeightsRequest {"NewerThan": 7};
+WeightsRequest {"Piece": {"version": 8, "offset": 262144}};
+Weights "NoneNewer";
+Weights "Gone";
+Weights {"Piece": {"weights": {"version": 8, "updates": 9, "sha256": [
+    184, 8, 225, 86, 209, 141, 28, 236, 220, 193, 69, 99, 117, 248, 202, 233, 148, 195, 101, 73, 160, 124, 140, 35,
+    21, 180, 115, 221, 157, 127, 64, 79]}, "bytes": 5, "offset": 0}};
+Ack null;
+Report {"who": {"Learner": 5}, "doing": "learns", "since_s": 1.5, "last_warning": {"text": "a chunk was refused", "age_s": 3.0}};
+ProcessesStatus {"up_s": 60.0, "waiting": "ActorsWaitForLearner", "waiting_s": 2.5, "requests_waiting": 1, "chunks_waiting": 2,
+    "chunk_bytes_waiting": 1048576, "weights_version": 4, "weights_age_s": 1.0,
+    "log": {"folder": "replay", "bytes": 1048576, "bytes_max": 1073741824, "flushed_s": 0.5, "refused": [2.0, "full"],
+        "unwritten_bytes": 40},
+    "processes": [{"who": {"Actor": 3}, "connected": true, "since_s": 50.0, "lives": 2, "last_seen_s": 0.5, "weights_version": 3,
+        "doing": ["plays", 5.0, 1.0], "last_warning": {"text": "late", "age_s": 9.0}}]};
+EpisodesRequest {"since": 7, "is_launcher": true};
+EpisodesReply {"ended": 9, "before": 7, "episodes": [
+    {"frames": 1048576, "actor": 3, "env": 15, "totals": {"episode_return": 2.5, "steps": 99}},
+    {"frames": 1048576, "actor": 3, "env": 15}]};
+"#;
+
+/// Returns the messages of type `M` in [`MESSAGES`].
+pub(crate) fn messages<M: Message>() -> Vec<M> {
+    let entries = MESSAGES.split(";\n").map(str::trim_start);
+    let own = entries.filter_map(|entry| entry.strip_prefix(M::NAME)?.strip_prefix(' '));
+    own.map(|json| serde_json::from_str(json).unwrap())
+        .collect()
 }
 
-/// An episode that was received whole, and one of which a part was lost.
-pub(crate) fn episodes() -> EpisodesReply {
-    let whole = EndedEpisode {
-        frames: 1 << 20,
-        actor: 3,
-        env: 15,
-        totals: Some(Totals {
-            episode_return: 2.5,
-            steps: 99,
-        }),
-    };
-    EpisodesReply {
-        ended: 9,
-        before: 7,
-        episodes: vec![
-            whole,
-            EndedEpisode {
-                totals: None,
-                ..whole
-            },
-        ],
-    }
-}
-
-pub(crate) fn priority_update() -> PriorityUpdate {
-    PriorityUpdate {
-        learner: 5,
-        number: 9,
-        parts: vec![PriorityPart {
-            origin: ORIGIN,
-            transitions: vec![0, u64::MAX],
-            priorities: vec![0.0, 2.5],
-        }],
-    }
+fn encoded_messages<M: Message + PartialEq + Debug>() -> Vec<Sample> {
+    messages::<M>().iter().map(Sample::new).collect()
 }
 
 /// One or more messages of every kind.
 pub(crate) fn samples() -> Vec<Sample> {
-    let replies = [
-        InsertReply::Stored {
-            inserted_total: 1 << 40,
-            actors: 64,
-            waited: true,
-        },
-        InsertReply::Wait {
-            inserted_total: 0,
-            kept: true,
-        },
-        InsertReply::OutOfOrder { expected: 3 },
-        InsertReply::Finished { inserted_total: 7 },
-        InsertReply::Refused {
-            why: "frames of 7 bytes".into(),
-        },
+    let without_payload = [
+        encoded_messages::<InsertReply>,
+        encoded_messages::<JoinReply>,
+        encoded_messages::<BatchReply>,
+        encoded_messages::<BatchRequest>,
+        encoded_messages::<AffinityUpdate>,
+        encoded_messages::<PriorityUpdate>,
+        encoded_messages::<WeightsVersion>,
+        encoded_messages::<Leave>,
+        encoded_messages::<ReplayStatus>,
+        encoded_messages::<LearnerStatus>,
+        encoded_messages::<RunInfo>,
+        encoded_messages::<Recovering>,
+        encoded_messages::<ActorJoin>,
+        encoded_messages::<LearnerJoin>,
+        encoded_messages::<ChunkPoll>,
+        encoded_messages::<WeightsRequest>,
+        encoded_messages::<WeightsReply>,
+        encoded_messages::<Ack>,
+        encoded_messages::<Report>,
+        encoded_messages::<ProcessesStatus>,
+        encoded_messages::<EpisodesRequest>,
+        encoded_messages::<EpisodesReply>,
     ];
-    let waits = [
-        Waiting::Neither,
-        Waiting::WarmUp {
-            have: 3,
-            need: 1000,
-        },
-        Waiting::LearnerWaitsForActors,
-        Waiting::ActorsWaitForLearner,
-        Waiting::Finished,
-    ];
-    let replay = ReplayStatus {
-        transitions_inserted: 5,
-        returns: Returns {
-            known: 120,
-            newest: vec![-1.25, 3.0],
-        },
-        k_histogram: vec![1, 2, 3],
-        action_histogram: vec![0; 15],
-        waiting: Waiting::WarmUp { have: 5, need: 9 },
-        ..ReplayStatus::default()
-    };
-    let learner = LearnerStatus {
-        updates: 3,
-        losses: vec![("dim_3t3".into(), 0.5), ("dim_4t4".into(), 1.5)],
-        ..LearnerStatus::default()
-    };
-    let affinity = AffinityUpdate {
-        learner: 5,
-        version: 2,
-        matrix: [0.25, 0.5, 0.25].repeat(3),
-    };
-    let run_info = RunInfo {
-        config_toml: "[run]\nseed = 1\n".into(),
-        inserted_total: 12,
-        has_learner: true,
-        after_updates: 3,
-        shard: (1, 2),
-        shared_memory: true,
-    };
-    let recovering = Recovering {
-        progress: RecoveryProgress {
-            bytes_read: 1,
-            bytes: 2,
-            since_s: 3.5,
-        },
-        config_toml: "[run]\nseed = 1\n".into(),
-    };
-    let mut samples: Vec<Sample> = replies.iter().map(Sample::new).collect();
-    let joined = [
-        JoinReply::Welcome(Welcome {
-            inserted_total: 3,
-            weights_version: 4,
-            earlier_incarnations: 5,
-        }),
-        JoinReply::Taken { why: "a".into() },
-        JoinReply::Refused { why: "b".into() },
-        JoinReply::Wait { why: "c".into() },
-    ];
-    samples.extend(joined.map(|reply| Sample::new(&reply)));
-    samples.extend(waits.map(|wait| Sample::new(&BatchReply::NotReady(NotReady::Wait(wait)))));
-    samples.extend([
-        Sample::new(&BatchReply::NotReady(NotReady::Finished)),
-        Sample::new(&BatchReply::NotReady(NotReady::Refused {
-            why: String::new(),
-        })),
-        Sample::new(&BatchRequest {
-            learner: 5,
-            id: RequestId::first(u64::MAX).retry(),
-            rows: 256,
-            shared_memory: true,
-            learned: LearnerProgress {
-                updates: 4,
-                saved_updates: 2,
-                rows_received: 64,
-            },
-            other_shards: Some(ShardCounts::default()),
-        }),
-        Sample::new(&affinity),
-        Sample::new(&priority_update()),
-        Sample::new(&WeightsVersion { version: 9 }),
-        Sample::new(&Leave::new(1, 2, 3)),
-        Sample::new(&ReplayStatus::default()),
-        Sample::new(&replay),
-        Sample::new(&learner),
-        Sample::new(&run_info),
-        Sample::new(&recovering),
-        Sample::new(&ActorJoin::new(1, 2)),
-        Sample::new(&LearnerJoin {
-            learner: 5,
-            run: 1 << 60,
-            updates: 9,
-            counts: ShardCounts::new(7, 8),
-            other_shards: ShardCounts::default(),
-            restart: true,
-        }),
-        Sample::new(&ChunkPoll {
-            leaving: true,
-            ..ChunkPoll::new(1, 2, 3)
-        }),
-        Sample::new(&WeightsRequest::NewerThan(7)),
-        Sample::new(&WeightsRequest::Piece {
-            version: 8,
-            offset: 1 << 18,
-        }),
-        Sample::new(&WeightsReply::NoneNewer),
-        Sample::new(&WeightsReply::Gone),
-        Sample::new(&WeightsReply::Piece {
-            weights: WeightsHeader::new(8, 9, b"these"),
-            bytes: 5,
-            offset: 0,
-        }),
-        Sample::new(&Ack),
-        Sample::new(&Report::new(
-            Participant::Learner(5),
-            "learns",
-            1.5,
-            Some(Warning::new("a chunk was refused", 3.0)),
-        )),
-        Sample::new(&processes_status()),
-        Sample::new(&EpisodesRequest {
-            since: 7,
-            is_launcher: true,
-        }),
-        Sample::new(&episodes()),
-    ]);
+    let mut samples: Vec<Sample> = without_payload.iter().flat_map(|read| read()).collect();
     let (upload, payload) = weights();
     samples.extend([
         Sample {
