@@ -9,6 +9,7 @@ use driml_experiments::{
     flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
+use driml_launch::watch::{StatusFlags, WatchFlags};
 
 use crate::commands::{
     actor, completions, doctor, evaluate, inspect, learner, parity, presets, procgen,
@@ -46,9 +47,9 @@ pub(crate) enum Command {
     /// Run the learner of a run whose replay server is at ENDPOINT
     Learner(learner::LearnerArgs),
     /// Show a run's processes, which one waits, and how to unblock it
-    Status(watch::StatusArgs),
+    Status(watch::ObserverArgs<StatusFlags>),
     /// Monitor a run, local or remote, and record it in a folder
-    Watch(watch::WatchArgs),
+    Watch(watch::ObserverArgs<WatchFlags>),
     /// Play episodes with the weights of a run or a pretrained network, beside a random policy
     Evaluate(evaluate::EvaluateArgs),
     /// Count the parameters, FLOPs and bytes of a configuration, without training

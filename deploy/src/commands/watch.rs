@@ -32,29 +32,22 @@ pub(crate) struct RunSelection {
     tls: TlsFlags,
 }
 
+/// A run, and the flags of what to do with it.
 #[derive(Debug, Args)]
-pub(crate) struct WatchArgs {
+pub(crate) struct ObserverArgs<F: Args> {
     #[command(flatten)]
     selection: RunSelection,
     #[command(flatten)]
-    flags: WatchFlags,
+    flags: F,
 }
 
-#[derive(Debug, Args)]
-pub(crate) struct StatusArgs {
-    #[command(flatten)]
-    selection: RunSelection,
-    #[command(flatten)]
-    flags: StatusFlags,
+pub(crate) fn run(args: &ObserverArgs<WatchFlags>) -> anyhow::Result<()> {
+    let ObserverArgs { selection, flags } = args;
+    watch::run(selection.open(), selection.folder().as_ref(), flags)
 }
 
-pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    let selection = &args.selection;
-    watch::run(selection.open(), selection.folder().as_ref(), &args.flags)
-}
-
-pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    let StatusArgs { selection, flags } = args;
+pub(crate) fn status(args: &ObserverArgs<StatusFlags>) -> anyhow::Result<()> {
+    let ObserverArgs { selection, flags } = args;
     watch::status(|| selection.open(), selection.folder().as_ref(), flags)
 }
 
