@@ -7,6 +7,7 @@ use expect_test::{expect, expect_file};
 
 use super::*;
 use crate::{
+    menu::settings_with_sources,
     overrides::find,
     presets::{AGENTS, PRESETS},
 };
@@ -63,18 +64,24 @@ fn what_follows_from_the_settings_of_a_file_follows_from_changed_ones_too() {
     }
 }
 
+/// What `driml presets` prints reads back too, and has a source for each setting.
 #[test]
 fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     let mut resolved = 0;
     for preset in PRESETS {
         for world in WorldName::all() {
             for agent in AGENTS {
-                let source = source(preset.name, &world.to_string(), agent.name);
+                let (preset, agent, name) = (preset.name, agent.name, world.to_string());
+                let choice = Choice::new(Some(preset), Some(&name), Some(agent)).unwrap();
+                let source = Source::Presets(choice);
                 let config = match source.resolve(&Flags::default(), &MACHINE) {
                     Ok(config) => config,
                     Err(e) if e.0.contains("take --preset paper") => continue,
-                    Err(e) => panic!("{} {world} {}: {e}", preset.name, agent.name),
+                    Err(e) => panic!("{preset} {world} {agent}: {e}"),
                 };
+                let printed = settings_with_sources(choice, &[]).unwrap();
+                assert!(!printed.contains("not said"), "{printed}");
+                RunConfig::parse("printed", &printed).unwrap();
                 let text = config.to_toml();
                 let again = resolve_file("config.toml", text.clone(), &[]).unwrap();
                 assert_eq!(again.to_toml(), text);
