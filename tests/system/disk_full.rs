@@ -114,6 +114,7 @@ fn the_last_checkpoint_is_saved_once_there_is_room() {
     with_full_disk(PERIOD_NEVER, "No space left", |system, mut run, filler| {
         run.signal(Signal::SIGINT);
         run.wait_for_stderr("(no storage space): make room or make it writable");
+        wait_until("a save", || status_text(system).contains("saves its last"));
         fs::remove_file(filler).unwrap();
         run.wait().expect_code(130);
         assert!(system.run_folder("disk/run").saved_updates() >= 100);

@@ -126,7 +126,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<bool> {
         clients.clone(),
         Participant::Learner(learner_id),
         activity.clone(),
-        shutdown.clone(),
+        // Until the sessions close: after a signal, the last save may retry for minutes.
+        Shutdown::default(),
     )?;
     let counters = Counters::new(updates, learner.run_counts());
     let mut batches = BatchSource::start(&clients, requests, &counters, shutdown)?;
