@@ -43,6 +43,8 @@ fn missing_processes_are_named_with_what_to_do() {
     let twice = format!("status --connect {endpoint}");
     let words = "are both shard 0: give each endpoint once";
     system.rejects(&system.connect_args(&twice), words);
+    let second = format!("replay-server {SHORT} --listen {endpoint}-2");
+    system.rejects(&system.connect_args(&second), "another replay server of");
 
     let mut learner = system.start_learner("run");
     wait_for_status(&system, &["learner up ", "warm-up 0/", &act]);

@@ -7,6 +7,7 @@ use driml_launch::{
     endpoint::{check_connect_endpoints, check_listen_endpoints, check_unused},
     open_files,
     output::check_folder,
+    view::Poller,
 };
 use driml_machine::{error::usage, resources::Machine, units::count};
 use driml_protocol::{GracefulShutdown, tls::Role};
@@ -48,6 +49,10 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     check_connect_endpoints(&args.connect, args.tls.is_set())?;
     let (role, namespace) = (Role::ReplayServer, &args.join.namespace);
     let mut connection = args.tls.connection(role, namespace, args.connect.clone())?;
+    if Poller::open(&connection).is_ok() {
+        let why = "another replay server of this --namespace answers there, and each message would go to both: stop it, or choose another";
+        return Err(usage!("--connect {}: {why}", args.connect.join(" ")).into());
+    }
     connection.endpoints.listen.clone_from(&args.listen);
     args.run.flags.server_alone = true;
     let machine = Machine::detect();
@@ -84,13 +89,13 @@ pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
         return Err(usage!("{why}").into());
     }
     let checked = match &args.replay_dir {
-        Some(_) => config.replay.check_disk_budget(&config.run),
+        Some(dir) => {
+            check_folder("--replay-dir", dir)?;
+            config.replay.check_disk_budget(&config.run)
+        }
         None => config.replay.check_in_memory("--replay-dir DIR"),
     };
     checked.map_err(|e| usage!("{e}"))?;
-    if let Some(dir) = &args.replay_dir {
-        check_folder("--replay-dir", dir)?;
-    }
     let shutdown = prepare_join(&args.join, GracefulShutdown::on_signals)?;
     let notes = config.notes.iter().chain(&config.accuracy_note);
     notes.for_each(|it| tracing::warn!("{it}"));

@@ -9,8 +9,8 @@ use std::{
 use anyhow::{Context, bail};
 use driml_machine::error::{Usage, usage};
 use driml_protocol::{
-    CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, ReplayStatus,
-    RunClient, RunInfo, Waiting, join, reach,
+    CodecError, EpisodesReply, EpisodesRequest, Keys, ReplayStatus, RunClient, RunInfo, Waiting,
+    join, reach,
     session::{self, Connection, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
 };
 use driml_settings::config::RunConfig;
@@ -137,17 +137,14 @@ impl Poller {
     /// Asks only the replay servers, for their counts.
     pub fn poll_replay(&mut self) -> anyhow::Result<()> {
         let answers = self.servers.iter().map(|it| it.client.fetch(ANSWER_MAX));
-        let shards = answers.collect::<Result<Vec<ReplayStatus>, _>>()?;
-        self.view.set_replay(shards);
+        self.view.set_replay(answers.collect::<Result<_, _>>()?);
         Ok(())
     }
 
     /// Asks only the learner.
     pub fn poll_learner(&mut self) -> anyhow::Result<()> {
-        let first = self.servers.first();
-        let first = first.context("no replay server is connected")?;
-        let learner: LearnerStatus = first.client.fetch(ANSWER_MAX)?;
-        self.view.set_learner(Some(learner));
+        let first = self.servers.first().context("no connected replay server")?;
+        self.view.set_learner(Some(first.client.fetch(ANSWER_MAX)?));
         Ok(())
     }
 
@@ -189,8 +186,7 @@ impl ServerConnection {
 
     fn poll(&self) -> ServerAnswer {
         let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
-        let answers =
-            replay.and_then(|it| Ok((it, self.client.fetch::<ProcessesStatus>(ANSWER_MAX)?)));
+        let answers = replay.and_then(|it| Ok((it, self.client.fetch(ANSWER_MAX)?)));
         let mut answer = ServerAnswer {
             name: self.name.clone(),
             endpoint: self.endpoint.clone(),
@@ -230,9 +226,8 @@ fn fetch_settings(
         Ok(run_info) => (run_info.config_toml, Some(run_info.shard.0)),
         Err(SessionError::Recovering(recovering)) => (recovering.config_toml, None),
         Err(SessionError::Unreadable { why, .. }) => {
-            return Err(why).context(format!(
-                "reading the run info of the replay server on {endpoint}"
-            ));
+            let what = format!("reading the run info of the replay server on {endpoint}");
+            return Err(why).context(what);
         }
         Err(SessionError::NoResponder { .. }) => {
             bail!(usage!(
