@@ -121,10 +121,10 @@ fn strangers_at_a_replay_server() {
         assert!(opened.is_err(), "a certificate that is {name}");
     });
     server.wait_for_stderr("QUIC acceptor failed: ");
-    // All five together get one line in ten seconds.
+    // All five together get one line in ten seconds, without the place in zenoh's sources and the false hint after it.
     let log = server.stderr();
     let lines = log.matches("QUIC acceptor failed: ").count();
-    assert!(lines < 5 && !log.contains("Hint: "), "{log}");
+    assert!(lines < 5 && !log.contains(".rs:"), "{log}");
     // An endpoint without QUIC: nothing listens at this TCP port.
     let plain = system.endpoint().replace("quic/", "tcp/");
     let why = "One with --tls-dir is reached with quic/HOST:PORT";

@@ -214,12 +214,12 @@ pub fn log_to_stderr() {
         .init();
 }
 
-/// Removes the hint that zenoh adds to each rejected QUIC connection: it is false, as all connections share the endpoint's socket.
-fn without_false_hint(text: &str) -> String {
-    match text.contains("QUIC acceptor failed") {
-        true => text.replace(" Hint: increase the system open file limit.", ""),
-        false => text.to_owned(),
-    }
+/// Cuts off what zenoh adds to a rejected QUIC connection: the place in its sources, and a hint that is false, as all share one socket.
+fn without_place(text: &str) -> String {
+    let said = text.split(" at /").next();
+    let said = said.filter(|it| it.contains("QUIC acceptor failed"));
+    let cut = |it: &str| it.trim_end().to_owned() + &text[text.trim_end().len()..];
+    said.map_or_else(|| text.to_owned(), cut)
 }
 
 /// Writes the log to stderr, a line per call.
@@ -227,7 +227,7 @@ struct LogWriter;
 
 impl Write for LogWriter {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        let text = without_false_hint(&String::from_utf8_lossy(line));
+        let text = without_place(&String::from_utf8_lossy(line));
         stderr().write_all(text.as_bytes()).map(|()| line.len())
     }
 
@@ -245,7 +245,7 @@ impl<S: Subscriber> Layer<S> for LastWarning {
             let mut text = String::new();
             event.record(&mut |field: &Field, value: &dyn fmt::Debug| {
                 if field.name() == "message" {
-                    text = without_false_hint(&format!("{value:?}"));
+                    text = without_place(&format!("{value:?}"));
                 }
             });
             last_warning::set(text);
