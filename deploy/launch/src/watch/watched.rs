@@ -71,9 +71,7 @@ impl WatchedRun {
         });
         let begun_anew = find_begun_anew(&mut self.answers, answers);
         // Its rows would contradict those before.
-        if self.recorder.is_some()
-            && let Some(number) = begun_anew
-        {
+        if let Some(number) = begun_anew.filter(|_| self.recorder.is_some()) {
             bail!(
                 "{} was started again with an empty replay: start `driml watch` again",
                 poller.view.servers[number].endpoint
@@ -112,9 +110,7 @@ impl WatchedRun {
         let (view, silent) = (&poller.view, poller.view.replay_silence.length());
         let mut servers = view.servers.iter().zip(&self.answers);
         let lost = servers.find(|(it, last)| it.is_gone && matches!(last, Some((_, false))));
-        if let Some((server, _)) = lost
-            && silent > EXIT_SILENCE_MAX
-        {
+        if let Some((server, _)) = lost.filter(|_| silent > EXIT_SILENCE_MAX) {
             bail!(
                 "the replay server on {} has exited, and its replay was in memory: the run has ended, and the output of its processes tells how",
                 server.endpoint
