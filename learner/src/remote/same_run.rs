@@ -39,7 +39,7 @@ pub(super) fn single_run<'a>(
     let count = first.shard.1 as usize;
     ensure!(
         run_infos.len() == count,
-        "the run's replay has {count} shards, and --connect was given {} times: give it once for each shard",
+        "the run's replay has {count} shards, and --connect names {}: give it once for each shard",
         run_infos.len()
     );
     Ok(first)
