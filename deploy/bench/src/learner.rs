@@ -16,7 +16,7 @@ use crate::{
     settings::{self, AGENT, WORLD},
 };
 
-/// The cases: name, agent, preset and further settings.
+/// The cases, as [`settings::case`] reads them.
 const CASES: &str = "\
 C51, 64x64x3|c51|paper
 C51 + global-global DIM, 64x64x3|driml-ada|paper
@@ -79,9 +79,7 @@ fn paper(
     let meter = bench.meter;
     let mut record = |what: &str, rate| bench.record(what, precision, rate, "updates/s");
     for case in CASES.lines() {
-        let words: Vec<&str> = case.split('|').collect();
-        let (name, sets) = (words[0], &words[3..]);
-        let config = settings::run_config(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
+        let (name, config) = settings::case(case)?;
         let rate = meter.rate_by_median(updates(&config, compute, 0.0)?)?;
         record(name, rate);
         if name == GLOBAL_DIM_CASE && on_cpu && precision == Precision::F32 {

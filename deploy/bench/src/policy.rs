@@ -9,23 +9,18 @@ use rand_chacha::ChaCha8Rng;
 use crate::{report::Bench, settings};
 
 const BATCHES: [usize; 2] = [32, 256];
-/// The name of each network in figures, its preset, and further settings.
-const NETWORKS: [(&str, &str, &[&str]); 4] = [
-    ("64x64x3", "paper", &[]),
-    ("104x80x3", "paper-observation", &[]),
-    ("64x64x3, impala", "paper", &["model.torso=impala"]),
-    (
-        "64x64x3, impala, half width",
-        "paper",
-        &["model.torso=impala", "model.channels=[8,16,16]"],
-    ),
-];
+/// The networks, as [`settings::case`] reads them.
+const NETWORKS: &str = "\
+64x64x3|c51|paper
+104x80x3|c51|paper-observation
+64x64x3, impala|c51|paper|model.torso=impala
+64x64x3, impala, half width|c51|paper|model.torso=impala|model.channels=[8,16,16]";
 
 pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
     for precision in bench.flags.precisions(DeviceName::Cpu) {
-        for (network, preset, sets) in NETWORKS {
-            let config = settings::run_config(settings::WORLD, "c51", preset, sets)?;
-            let model = config.with_whole_frames()?.model;
+        for case in NETWORKS.lines() {
+            let (network, config) = settings::case(case)?;
+            let model = config.model;
             let mut rng = ChaCha8Rng::seed_from_u64(1);
             let parameters = Parameters::init(&model, &mut rng, &candle_core::Device::Cpu)?;
             let weights = parameters.to_safetensors(|_| true)?;

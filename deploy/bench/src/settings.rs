@@ -29,3 +29,10 @@ pub(super) fn run_config(
 ) -> Result<RunConfig, Usage> {
     flags::resolve_names(preset, world, agent, sets, &Machine::detect())
 }
+
+/// Returns the name and the settings of a case "name|agent|preset|setting|..", with whole frames.
+pub(super) fn case(line: &str) -> anyhow::Result<(&str, RunConfig)> {
+    let words: Vec<_> = line.split('|').collect();
+    let config = run_config(WORLD, words[1], words[2], &words[3..])?;
+    Ok((words[0], config.with_whole_frames()?))
+}
