@@ -156,7 +156,7 @@ mod tests {
             .collect()
     }
 
-    /// The same by definition: the first of the largest pixels of each window, or the first NaN.
+    /// The same by definition: the first of the largest pixels of each window, or the last NaN.
     fn wanted(maps: &[f32], size: Size) -> (Vec<f32>, Vec<f32>) {
         let ((height, width, channels), (rows, cols, _)) = (size, pooled_size(size));
         let (mut largest, mut grads) = (Vec::new(), vec![0.0; maps.len()]);
@@ -167,7 +167,8 @@ mod tests {
                     for row in (2 * y).saturating_sub(1)..(2 * y + 2).min(height) {
                         for col in (2 * x).saturating_sub(1)..(2 * x + 2).min(width) {
                             let at = (row * width + col) * channels + channel;
-                            if best.is_none_or(|best| maps[at] > maps[best]) {
+                            let value = maps[at];
+                            if best.is_none_or(|best| value > maps[best] || value.is_nan()) {
                                 best = Some(at);
                             }
                         }
@@ -182,34 +183,22 @@ mod tests {
     }
 
     #[test]
-    fn the_first_of_the_largest_is_taken_whatever_the_size() {
+    fn the_first_of_the_largest_or_the_last_nan_is_taken_whatever_the_size() {
+        let bits = |values: &[f32]| -> Vec<u32> { values.iter().map(|it| it.to_bits()).collect() };
         for size in [(1, 1, 1), (2, 3, 5), (7, 4, 16), (6, 6, 33), (3, 5, 24)] {
             let len = size.0 * size.1 * size.2;
-            // All different, a few values with ties everywhere, all the same. All are below 0, where zero padding would win.
-            for values in [1009, 3, 1] {
-                let maps: Vec<f32> = (0..len)
-                    .map(|at| (at * 383 % 1009 % values) as f32 - 2000.0)
-                    .collect();
-                for got in pooled_and_back(&maps, size) {
-                    assert_eq!(got, wanted(&maps, size), "{size:?}, {values} values");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn a_nan_shows() {
-        for at in 0..9 {
-            let mut maps = [1.0; 9];
-            maps[at] = f32::NAN;
-            for (largest, _) in pooled_and_back(&maps, (3, 3, 1)) {
-                let touched = |window: usize| {
-                    let is_near =
-                        |window: usize, at: usize| window == 0 && at < 2 || window == 1 && at > 0;
-                    is_near(window / 2, at / 3) && is_near(window % 2, at % 3)
+            // All different, ties everywhere, all the same, and every 7th a NaN. All are below 0, where zero padding would win.
+            for (values, nan_period) in [(1009, None), (3, None), (1, None), (3, Some(7))] {
+                let value = |at: usize| match nan_period {
+                    Some(period) if at % period == 3 => f32::NAN,
+                    _ => (at * 383 % 1009 % values) as f32 - 2000.0,
                 };
-                for (window, value) in largest.iter().enumerate() {
-                    assert_eq!(value.is_nan(), touched(window), "{at}, window {window}");
+                let maps: Vec<f32> = (0..len).map(value).collect();
+                let (largest, grads) = wanted(&maps, size);
+                for got in pooled_and_back(&maps, size) {
+                    let case = format!("{size:?}, {values} values, NaN {nan_period:?}");
+                    assert_eq!(bits(&got.0), bits(&largest), "{case}");
+                    assert_eq!(got.1, grads, "{case}");
                 }
             }
         }
