@@ -49,32 +49,26 @@ fn is_step_finite(settings: AdamSettings, elements: usize, parameter: f32, gradi
 }
 
 #[test]
-fn the_largest_step_size_is_finite() {
-    let settings = AdamSettings {
+fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
+    // The largest step size.
+    let far = AdamSettings {
         lr: *LR_RANGE.end(),
         beta1: *BETA_RANGE.end(),
         ..SETTINGS
     };
-    let first = StepCoefficients::new(settings, 1, 1.0);
-    assert!(first.step_size.is_finite());
-}
-
-#[test]
-fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
-    for elements in [1, 2, 7, 16, 33] {
-        assert!(is_step_finite(SETTINGS, elements, 3e38, 1.0));
-        let far = AdamSettings {
-            lr: *LR_RANGE.end(),
-            ..SETTINGS
-        };
-        assert!(is_step_finite(far, elements, 3e38, 1.0), "towards 0");
-        assert!(
-            !is_step_finite(far, elements, f32::MAX, -1.0),
-            "past the largest number"
-        );
-        assert!(!is_step_finite(SETTINGS, elements, f32::NAN, 1.0));
-        assert!(!is_step_finite(SETTINGS, elements, f32::NEG_INFINITY, 1.0));
+    for (settings, parameter, gradient, is_finite) in [
+        (SETTINGS, 3e38, 1.0, true),
+        (far, 3e38, 1.0, true),
+        (far, f32::MAX, -1.0, false),
+        (SETTINGS, f32::NAN, 1.0, false),
+        (SETTINGS, f32::NEG_INFINITY, 1.0, false),
         // The square of the gradient is not finite: the parameter would stand still for good.
-        assert!(!is_step_finite(SETTINGS, elements, 0.0, 1e30));
+        (SETTINGS, 0.0, 1e30, false),
+    ] {
+        for elements in [1, 2, 7, 16, 33] {
+            let found = is_step_finite(settings, elements, parameter, gradient);
+            let case = format!("{elements} elements, {parameter:e}, {gradient:e}");
+            assert_eq!(found, is_finite, "{case}, {settings:?}");
+        }
     }
 }
