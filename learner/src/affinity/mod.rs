@@ -79,6 +79,7 @@ impl AffinityEstimator {
 
 #[cfg(test)]
 mod tests {
+    use rand::distr::{Distribution, weighted::WeightedIndex};
     use rand::{Rng, SeedableRng};
 
     use super::*;
@@ -132,21 +133,13 @@ mod tests {
             matrix
         }
 
-        fn draw(&self, rng: &mut ChaCha8Rng) -> usize {
-            let mut left = rng.random::<f64>();
-            let drawn = self.marginal.iter().position(|p| {
-                left -= p;
-                left < 0.0
-            });
-            drawn.unwrap_or(ACTIONS - 1)
-        }
-
         /// Pairs as in a batch, each from another position in the replay.
         fn pairs(&self, count: usize, rng: &mut ChaCha8Rng) -> Vec<(u8, u8)> {
+            let law = WeightedIndex::new(&self.marginal).unwrap();
             let mut pair = || {
-                let from = self.draw(rng);
+                let from = law.sample(rng);
                 let repeats = rng.random_bool(Self::REPEATS);
-                let to = if repeats { from } else { self.draw(rng) };
+                let to = if repeats { from } else { law.sample(rng) };
                 (from as u8, to as u8)
             };
             (0..count).map(|_| pair()).collect()
