@@ -1,9 +1,11 @@
 //! Both estimators of the action affinity.
 
+use anyhow::Context;
 use driml_learner::{
-    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
-    affinity::exact::ENTRY_ERROR,
+    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, affinity::exact::ENTRY_ERROR,
 };
+use driml_machine::resources::Machine;
+use driml_settings::flags::resolve_names;
 
 use crate::stability::property::*;
 
@@ -33,15 +35,6 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
             .check(&updates, Listed, learned),
     ]
 }
-
-const LEARNED: LearnedSettings = LearnedSettings {
-    hidden: 32,
-    lr: 2e-3,
-    beta1: 0.9,
-    beta2: 0.999,
-    eps: 1e-8,
-    keep: 0.9,
-};
 
 /// A way in which actions are used: its name, the number of pairs in a batch, and a function that draws a pair.
 type ActionUse = (&'static str, usize, fn(u8, &mut ChaCha8Rng) -> (u8, u8));
@@ -125,9 +118,10 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let updates = cases.settings.affinity_updates;
     let (actions, updates) = cases.one_of(&[(2u8, updates), (15, updates), (255, updates / 100)]);
-    let alphabet = Alphabet::raw(actions.into())?;
-    let learned = LearnedAffinity::new(alphabet, LEARNED, &mut cases.rng)?;
-    let mut estimate = AffinityEstimator::Learned(learned);
+    let preset = resolve_names("paper", "chain", "driml-ada", &[], &Machine::detect())?;
+    let affinity = preset.learner.affinity;
+    let estimate = affinity.make_estimator(actions.into(), &mut cases.rng)?;
+    let mut estimate = estimate.context("driml-ada estimates it")?;
     let (use_name, count, draw_pair) = cases.one_of(&USES);
     for update in 1..=updates {
         let pairs = (0..count).map(|_| draw_pair(actions, &mut cases.rng));
