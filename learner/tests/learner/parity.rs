@@ -89,7 +89,4 @@ fn a_broken_file_is_a_clear_error() {
         let error = error_of(&broken);
         assert!(error.contains(said), "{line}: {error}");
     }
-    let none = check_file("none.safetensors", &Compute::CPU).unwrap_err();
-    let said = "cannot read none.safetensors: No such file or directory";
-    assert!(format!("{none:#}").contains(said), "{none:#}");
 }
