@@ -3,11 +3,9 @@
 
 use std::time::{Duration, Instant};
 
-use driml_actor::DeliveryLimits;
-use driml_protocol::Shutdown;
 use driml_tests::{Outcome, wait_until};
 
-use crate::{LONG, PATIENT, chain, synthetic::SyntheticActor, system, tiny_replay};
+use crate::{LONG, PATIENT, chain, system};
 
 /// A replay ratio of 64 makes the learner so slow that every actor waits nearly all of the time.
 #[test]
@@ -30,68 +28,32 @@ fn twenty_four_actors_wait_for_one_learner() {
     assert_eq!(ended.stderr.lines().find(is_of_actors), None);
 }
 
-/// After Ctrl-C while all actors wait, the replay server stores what they still have.
+/// The limiter stays closed for twice the time-out for an unreachable server, and no actor times out. After Ctrl-C the replay server
+/// stores what all actors still have.
 #[test]
-fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
+fn actors_wait_for_as_long_as_they_must_and_then_deliver_what_they_have() {
+    const UNREACHABLE_MAX: Duration = Duration::from_millis(3_000);
     let system = system();
-    let waiting = "--set replay.replay_ratio=512 --set replay.warmup_transitions=2000";
+    let waiting = "--set replay.replay_ratio=65536 --set actor.unreachable_max_ms=3000";
     let flags = format!("--agent c51 {LONG} {PATIENT} --actors 32 {waiting}");
     let process = system.start(&system.local_args(&flags));
-    system
-        .connect()
-        .wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
+    let client = system.connect();
+    let before = client.wait_for_replay("32 that wait", |replay| replay.actors_waiting == 32);
+    // The warm-up, the slack by which actors may run ahead of the learner, and the chunk that overshoots.
+    assert!(before.transitions_inserted <= 200 + 256 + 32, "{before:#?}");
+    let started = Instant::now();
+    wait_until("twice the time that an actor bears silence", || {
+        started.elapsed() > 2 * UNREACHABLE_MAX
+    });
+    let after = client.replay_status().unwrap();
+    assert_eq!(after.actors_waiting, 32, "{after:#?}");
+    assert_eq!(after.transitions_inserted, before.transitions_inserted);
+    drop(client);
     process.interrupt().expect_code(130);
     let summary = system.run_folder("run").check(Outcome::Interrupted);
+    assert!(summary.frames > after.transitions_inserted, "{summary:#?}");
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
     assert_eq!(system.running_processes(), []);
-}
-
-/// The limiter never opens, as without a learner, for longer than the time-out for an unreachable server. Waiting actors do not time out.
-#[test]
-fn an_actor_waits_for_as_long_as_it_must() {
-    let system = system();
-    let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let client = system.connect();
-    let (unreachable_max, stop) = (Duration::from_secs(3), Shutdown::default());
-    let limits = DeliveryLimits {
-        chunks_in_flight_max: 4,
-        ack_timeout: Duration::from_secs(60),
-        unreachable_max,
-    };
-    let synthetic = |actor| {
-        client.join_as_actor(actor, 1);
-        let first = tiny_replay::header(&client.spec, actor, 4, 8);
-        SyntheticActor::start(system.run_client(&client.spec), first, limits, &stop)
-    };
-    let actors: Vec<_> = (0..16).map(synthetic).collect();
-    let produced: u64 = std::thread::scope(|scope| {
-        // Each actor sends as fast as it may, then delivers the rest, although nothing makes room.
-        let run = |mut actor: SyntheticActor| {
-            while !stop.is_set() {
-                actor.send(0);
-            }
-            actor.finish()
-        };
-        let runs = actors
-            .into_iter()
-            .map(|actor| scope.spawn(move || run(actor)));
-        let runs: Vec<_> = runs.collect();
-        let before = client.wait_for_replay("16 that wait", |replay| replay.actors_waiting == 16);
-        // The warm-up, the slack by which actors may run ahead of the learner, and the chunk that overshoots.
-        assert!(before.transitions_inserted <= 200 + 256 + 32, "{before:#?}");
-        let started = Instant::now();
-        wait_until("twice the time that an actor bears silence", || {
-            started.elapsed() > 2 * unreachable_max
-        });
-        let after = client.replay_status().unwrap();
-        assert_eq!((after.actors_waiting, after.chunks_retried), (16, 0));
-        assert_eq!(after.transitions_inserted, before.transitions_inserted);
-        stop.set();
-        runs.into_iter().map(|run| run.join().unwrap()).sum()
-    });
-    let status = client.replay_status().unwrap();
-    assert_eq!(status.transitions_inserted, produced, "{status:#?}");
-    assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
 }
 
 #[test]
