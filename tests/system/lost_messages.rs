@@ -26,7 +26,7 @@ use zenoh::{
 };
 
 use crate::{
-    synthetic::{SyntheticActor, SyntheticLearner},
+    synthetic::{SyntheticLearner, deliver_numbered},
     system, tiny_replay,
 };
 
@@ -195,17 +195,8 @@ fn deliver_all(arrival_rule: ArrivalRule, ack_timeout: Duration, leaving: bool) 
     std::thread::scope(|scope| {
         for actor in 0..ACTORS {
             let run = endpoint.system.run_client(&spec());
-            scope.spawn(move || {
-                let stop = Shutdown::default();
-                let first = tiny_replay::header(&spec(), actor, 1, STEPS);
-                let mut synthetic = SyntheticActor::start(run, first, limits, &stop);
-                if leaving {
-                    stop.set();
-                }
-                let number = u64::from(actor) * CHUNKS * u64::from(STEPS);
-                (0..CHUNKS).for_each(|_| synthetic.send(number));
-                synthetic.finish();
-            });
+            let first = tiny_replay::header(&spec(), actor, 1, STEPS);
+            scope.spawn(move || deliver_numbered(run, first, CHUNKS, limits, leaving));
         }
     });
     server.check_numbers();

@@ -4,13 +4,13 @@
 use std::{collections::BTreeSet, time::Duration};
 
 use driml_actor::DeliveryLimits;
-use driml_protocol::{ChunkHeader, RunClient, RunSpec, Shutdown, config::Settings};
+use driml_protocol::{RunSpec, config::Settings};
 use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, TestSystem, check_nothing_lost};
 
 use crate::{
     ROWS, WARMUP,
-    synthetic::{SyntheticActor, SyntheticLearner},
+    synthetic::{SyntheticLearner, deliver_numbered},
     system, tiny_replay,
 };
 
@@ -19,27 +19,13 @@ const ACTORS: u32 = 3;
 const CHUNKS: u64 = 40;
 const STREAMS: u32 = 4;
 const STEPS: u32 = 8;
-const TRANSITIONS_PER_ACTOR: u64 = CHUNKS * (STREAMS * STEPS) as u64;
-const TRANSITIONS: u64 = ACTORS as u64 * TRANSITIONS_PER_ACTOR;
+const TRANSITIONS: u64 = CHUNKS * (ACTORS * STREAMS * STEPS) as u64;
 /// The replay ratio: rows per transition.
 const RATIO: u64 = 16;
 /// How often each transition is drawn at the end, on average. The probability that a given one is never drawn is exp(-64).
 const DRAWS_PER_TRANSITION: u64 = 64;
 /// How often the server is killed.
 pub(crate) const KILLS: u64 = 6;
-
-/// Delivers all of one actor's chunks; each transition is one episode whose return is its number.
-fn deliver_chunks(run: RunClient, first: ChunkHeader) {
-    let limits = DeliveryLimits {
-        chunks_in_flight_max: 4,
-        ack_timeout: Duration::from_secs(2),
-        unreachable_max: Duration::from_secs(60),
-    };
-    let number = u64::from(first.actor) * TRANSITIONS_PER_ACTOR;
-    let mut synthetic = SyntheticActor::start(run, first, limits, &Shutdown::default());
-    (0..CHUNKS).for_each(|_| synthetic.send(number));
-    synthetic.finish();
-}
 
 /// Returns the numbers of all transitions in the replay of a server that has ended. Draws rows until each number was seen.
 fn stored_numbers(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
@@ -75,11 +61,16 @@ pub(crate) fn kill_after_rows(kill_points: impl IntoIterator<Item = u64>) {
     }
     client.join_as_learner(7);
     let run = || system.run_client(&client.spec);
+    let limits = DeliveryLimits {
+        chunks_in_flight_max: 4,
+        ack_timeout: Duration::from_secs(2),
+        unreachable_max: Duration::from_secs(60),
+    };
     let batches = std::thread::scope(|scope| {
         for actor in 0..ACTORS {
             let first = tiny_replay::header(&client.spec, actor, STREAMS, STEPS);
             let run = run();
-            scope.spawn(move || deliver_chunks(run, first));
+            scope.spawn(move || deliver_numbered(run, first, CHUNKS, limits, false));
         }
         let mut learner = SyntheticLearner::start(&[run()], 7, ROWS, 1);
         let learning = scope.spawn(move || {

@@ -45,42 +45,35 @@ impl SyntheticLearner {
     }
 }
 
-pub(crate) struct SyntheticActor {
-    delivery: Delivery,
-    next: ChunkHeader,
-}
-
-impl SyntheticActor {
-    /// Starts an actor whose chunks all look like `first`.
-    pub(crate) fn start(
-        run: RunClient,
-        first: ChunkHeader,
-        limits: DeliveryLimits,
-        stop: &Shutdown,
-    ) -> Self {
-        let actor = ActorJoin::new(first.actor, first.incarnation);
-        let delivery = Delivery::start(run, actor, 0, limits, BufferPool::new(8), stop.clone());
-        Self {
-            delivery: delivery.unwrap(),
-            next: first,
+/// Delivers `chunks` chunks of an actor, which all look like `first`. If `leaving`, the actor is told to stop before it sends the first.
+///
+/// The transitions of actor 0 have the numbers from 0, those of the next actor continue, and so on.
+pub(crate) fn deliver_numbered(
+    run: RunClient,
+    first: ChunkHeader,
+    chunks: u64,
+    limits: DeliveryLimits,
+    leaving: bool,
+) {
+    let actor = ActorJoin::new(first.actor, first.incarnation);
+    let stop = Shutdown::default();
+    let delivery = Delivery::start(run, actor, 0, limits, BufferPool::new(8), stop.clone());
+    let delivery = delivery.unwrap();
+    if leaving {
+        stop.set();
+    }
+    let length = first.transitions() as u64;
+    for sequence in 0..chunks {
+        let mut chunk = Chunk::zeroed(ChunkHeader {
+            sequence,
+            first_transition: sequence * length,
+            ..first
+        });
+        let number = (u64::from(first.actor) * chunks + sequence) * length;
+        for row in 0..length {
+            chunk.set(row as usize, 0, (number + row) as f32, End::Terminal);
         }
+        assert!(delivery.send(chunk));
     }
-
-    /// Sends the next chunk. `number` is the number of the very first transition of the actor.
-    pub(crate) fn send(&mut self, number: u64) {
-        let mut chunk = Chunk::zeroed(self.next);
-        for row in 0..self.next.transitions() {
-            let number = number + self.next.first_transition + row as u64;
-            chunk.set(row, 0, number as f32, End::Terminal);
-        }
-        self.next.sequence += 1;
-        self.next.first_transition += self.next.transitions() as u64;
-        assert!(self.delivery.send(chunk));
-    }
-
-    /// Delivers the remaining chunks, and returns the number of transitions sent.
-    pub(crate) fn finish(self) -> u64 {
-        assert_eq!(self.delivery.finish(false).unwrap(), 0);
-        self.next.first_transition
-    }
+    assert_eq!(delivery.finish(false).unwrap(), 0);
 }
