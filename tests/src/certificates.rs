@@ -37,11 +37,6 @@ impl Certificates {
         Self { folder }
     }
 
-    /// Returns the folder's path.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
     /// Returns the path of a file in the folder.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.join(name)
