@@ -26,10 +26,11 @@ impl Run {
     /// Starts a run. If the network cannot be made, returns `None` and reports the test as skipped.
     fn start(system: TestSystem, actors: usize, frames: u64, ratio: u64) -> Option<Self> {
         let network = Network::new(&MACHINES[..2 + actors])?;
+        let system = system.with_endpoint(format!("tcp/{}:7447", network.address("server")));
         // Without shared memory, which namespaces share, everything goes through the links.
         let flags = format!(
             "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio} \
-             --set transport.shared_memory=false"
+             --set transport.shared_memory=false --allow-insecure --replay-dir replay"
         );
         let mut run = Self {
             system,
@@ -44,29 +45,22 @@ impl Run {
         Some(run)
     }
 
-    fn endpoint(&self) -> String {
-        format!("tcp/{}:7447", self.network.address("server"))
-    }
-
     fn start_process_on(&self, machine: usize) -> Process {
-        let endpoint = self.endpoint();
+        let system = &self.system;
         let args = match machine {
-            0 => format!(
-                "replay-server --keep-alive --listen {endpoint} --allow-insecure --replay-dir replay {}",
-                self.flags
-            ),
-            1 => format!("learner --keep-alive --connect {endpoint} --run-dir run"),
-            _ => format!("actor --connect {endpoint} --id {}", machine - 2),
+            0 => system.replay_server_args(&self.flags),
+            1 => system.connect_args("learner --keep-alive --run-dir run"),
+            _ => system.connect_args(&format!("actor --id {}", machine - 2)),
         };
         let on = self.network.exec_prefix(MACHINES[machine]);
-        self.system.start_process(&format!("{on} DRIML {args}"))
+        system.start_process(&format!("{on} DRIML {args}"))
     }
 
     /// Requests the status of the run from the router; `None` while no process answers.
     fn status(&self) -> Option<Value> {
-        let (on, endpoint) = (self.network.exec_prefix("router"), self.endpoint());
-        let status = format!("{on} DRIML status --json --connect {endpoint}");
-        let ended = self.system.run(&status);
+        let on = self.network.exec_prefix("router");
+        let status = format!("{on} DRIML status --json");
+        let ended = self.system.run(&self.system.connect_args(&status));
         let status: Value = serde_json::from_str(ended.stdout.lines().next()?).unwrap();
         status["servers"][0]["replay"].is_object().then_some(status)
     }
