@@ -21,10 +21,13 @@ fn repo_file(name: &str) -> String {
 
 /// Returns the command of a world whose frames contain their own number. Needs only `python3`.
 fn numbered_world(fault: &str) -> String {
-    format!(
-        "exec:exec python3 {} {fault}",
-        repo_file("tests/worlds/numbered.py")
-    )
+    let script = repo_file("tests/worlds/numbered.py");
+    format!("exec:exec python3 {script} {fault}")
+}
+
+/// Returns the flags of a run of `c51` in this world.
+fn c51_in(env: &str, frames: u32) -> String {
+    format!("{SMALL_WORLD} --agent c51 --frames {frames} --env '{env}'")
 }
 
 #[test]
@@ -87,18 +90,13 @@ fn a_process_that_saves_its_state_continues_exactly_in_lockstep() {
 #[test]
 fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
     let run = |fault| {
-        let flags = format!(
-            "{SMALL_WORLD} --agent c51 --frames 640 --env '{}'",
-            numbered_world(fault)
-        );
+        let flags = c51_in(&numbered_world(fault), 640);
         format!("local --lockstep {flags} --run-dir run")
     };
+    let never = "cannot save its state: the dragon sits on it";
     for (fault, sentence) in [
         ("", "this world's state cannot be saved"),
-        (
-            "saves never",
-            "cannot save its state: the dragon sits on it",
-        ),
+        ("saves never", never),
     ] {
         let system = system();
         let ended = system.run_ok(&run(fault));
@@ -123,10 +121,9 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
 #[test]
 fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored() {
     let system = system();
-    let env = numbered_world("raise 25");
+    let flags = c51_in(&numbered_world("raise 25"), 100_000);
     let slow_learner = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
-    let flags = format!("{SMALL_WORLD} {slow_learner} --agent c51 --frames 100000 --env '{env}'");
-    let run = format!("local {flags} --run-dir run");
+    let run = format!("local {flags} {slow_learner} --run-dir run");
     system.fails(&run, "the dragon got out");
     assert_eq!(system.running_processes(), []);
     // On a slow machine the actor is restarted, and plays the same number of frames again.
@@ -138,8 +135,7 @@ fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored
 fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let system = system();
     let env = numbered_world("");
-    let flags = format!("{SMALL_WORLD} --agent c51 --frames 1280 --env '{env}'");
-    let server = system.start_replay_server(&flags);
+    let server = system.start_replay_server(&c51_in(&env, 1280));
     let learner = system.start_learner("run");
     system
         .start_actor(0)
@@ -183,8 +179,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
 #[test]
 fn an_actor_that_is_unknown_when_its_world_starts_exits() {
     let system = system();
-    let env = numbered_world("");
-    let flags = format!("{SMALL_WORLD} --agent c51 --frames 1280 --env '{env}'");
+    let flags = c51_in(&numbered_world(""), 1280);
     let server = system.start_replay_server(&flags);
     let _learner = system.start_learner("run");
     let slow = "actor --env 'exec:echo starts >&2; exec sleep 1000'";
@@ -201,10 +196,9 @@ fn a_replay_server_that_is_started_again_starts_its_world_once() {
     let system = system();
     let env = numbered_world("").replace("exec:", "exec:echo >>starts; ");
     let kept = "--replay-dir replay --set replay.compression=lz4";
-    let fast = SMALL_WORLD.replace("smoke", "fast");
-    let flags = format!("{fast} --agent c51 --frames 1280 {kept} --env '{env}'");
+    let flags = c51_in(&env, 1280).replace("smoke", "fast");
     for (starts, limit) in [(1, "--set replay.compressed_bytes_max=50000"), (2, "")] {
-        let server = system.start_replay_server(&format!("{flags} {limit}"));
+        let server = system.start_replay_server(&format!("{flags} {kept} {limit}"));
         let config = &system.connect().config_toml;
         check_has(config, &["compressed_bytes_max = 50000\n"]);
         check_has(&server.stderr(), &["WARN fast: "]);
