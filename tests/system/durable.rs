@@ -3,16 +3,13 @@
 
 use std::{collections::BTreeSet, fs};
 
-use driml_tests::{
-    Exit, Outcome, Process, RunningProcess, TestSystem, check_has, check_nothing_lost, print_line,
-    wait_until,
-};
+use driml_tests::{Exit, Outcome, RunningProcess, TestSystem, check_has, print_line, wait_until};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    PRIORITISED, ROWS, WARMUP, chain,
+    PRIORITISED, chain,
     numbered::{KILLS, ROWS_SAMPLED, kill_after_rows},
     prioritised::{ROWS_WERE_SET, logged_counts},
     start_run_with, system,
@@ -59,22 +56,13 @@ fn ends_as_planned(frames: u64, flags: &str, pause_at: u64, ends: &[Fault]) -> (
     }
     system.release_learners();
     let ended = process.wait_ok();
-    let summary = system.check_outcome(Outcome::Finished);
-    let text = format!("{summary:#?}");
-    let replay = &summary.replay;
-    check_nothing_lost(replay);
-    let updates = planned_updates(replay.transitions_inserted);
-    assert_eq!(summary.updates, updates, "{text}");
-    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{text}");
+    assert_eq!(system.running_processes(), []);
+    let summary = run.check_finished();
     let servers = ends.iter().filter(|it| it.1 == "replay-server").count() as u32;
     let restarted = (summary.replay_servers_restarted, summary.actors_restarted);
-    assert_eq!(restarted, (servers, ends.len() as u32 - servers), "{text}");
+    let planned = (servers, ends.len() as u32 - servers);
+    assert_eq!(restarted, planned, "{summary:#?}");
     (system, ended)
-}
-
-/// Returns the number of updates that the settings of `SHORT` and `LONG` plan for `frames` frames.
-const fn planned_updates(frames: u64) -> u64 {
-    (frames - WARMUP) * 8 / ROWS as u64
 }
 
 /// Kills a server of numbered transitions, and the servers of two shards in a launched run, at points drawn from the seed.
@@ -103,7 +91,7 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
         .expect_stderr("restarting replay-server with its replay (restart 3 of at most 8)")
         .expect_stdout("of disk, in the run folder");
     let run = system.run_folder("run");
-    let replay = run.check_finished().replay;
+    let replay = run.summary().replay;
     // Each checkpoint begins with a snapshot of the counts, so that three kills lose few.
     let known: u64 = replay.k_histogram.iter().sum();
     assert!(4 * known > 3 * replay.rows_sampled, "{replay:#?}");
@@ -125,10 +113,8 @@ fn a_dead_actor_is_started_again() {
         .expect_stderr("was killed by signal 9 SIGKILL (log: ")
         .expect_stderr("(restart 1 of at most 16)")
         .expect_stderr("(restart 2 of at most 16)");
-    let run = system.run_folder("run");
-    run.check_finished();
     system.run_ok("local --resume run --frames 3000");
-    let summary = run.summary();
+    let summary = system.run_folder("run").summary();
     assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }
 
@@ -177,35 +163,6 @@ fn a_replay_server_that_rejects_its_log_is_not_started_again() {
     system.find_process("replay-server").signal(Signal::SIGKILL);
     let ended = process.fails("error: replay-server exited with code 64 (log: ");
     assert!(!ended.stderr.contains("(restart 2 of"), "{}", ended.stderr);
-}
-
-/// Processes started by hand continue when the server restarts with the same flags. New actors get weights before the learner's next ones.
-#[test]
-fn processes_by_hand_go_on_when_the_server_is_started_again() {
-    let system = system();
-    let longer = chain(3_200);
-    let flags = format!("--agent driml-ada {longer} --replay-dir replay");
-    system.pause_learners_at(1_000);
-    let server = system.start_replay_server(&flags);
-    let learner = system.start_learner("run");
-    let actors = || [0, 1].map(|id| system.start_actor(id));
-    let first = actors();
-    let client = system.connect();
-    client.wait_for_updates(500);
-    server.kill();
-    first.into_iter().for_each(Process::kill);
-    system.release_learners();
-    let server = system.start_replay_server(&flags);
-    for actor in actors() {
-        actor.wait_ok();
-    }
-    let status = client.wait_for_the_last_update();
-    let replay = client.check_nothing_lost();
-    assert_eq!(status.updates, planned_updates(replay.transitions_inserted));
-    learner.stop(0);
-    drop(client);
-    let exit = server.stop(0);
-    exit.expect_stderr("continues with the replay in replay");
 }
 
 #[test]

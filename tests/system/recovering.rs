@@ -170,7 +170,8 @@ fn a_long_log_is_read_back() {
     a_server_with_an_unreadable_log_ends(&system, &serve);
 }
 
-/// Processes wait beyond the time-out for an unreachable server: some were there when the server died, others start while it reads.
+/// Processes wait beyond the time-out for an unreachable server: some were there when the server died, others start while it reads. One of
+/// these takes the place of an actor that died with the server.
 fn all_processes_wait_for_a_server_that_reads_its_replay_back(
     system: &TestSystem,
     spec: &RunSpec,
@@ -179,8 +180,13 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back(
 ) {
     let mut learner = system.start_learner("run");
     let mut actors = vec![system.start_actor(0)];
-    system.connect().wait_for_updates(50);
+    let dies_too = system.start_actor(1);
+    let client = system.connect();
+    client.wait_for_replay("both actors", |replay| replay.actors == 2);
+    client.wait_for_updates(50);
+    drop(client);
     server.kill();
+    dies_too.kill();
 
     let mut server = start_stopped(system, serve);
     let slow = slow_down(&mut server);
