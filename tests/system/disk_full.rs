@@ -17,7 +17,7 @@ use nix::sys::signal::Signal;
 use crate::{
     LONG, SHORT,
     refusals::{Row, check_replies},
-    status::status_text,
+    status::{status_text, wait_for_status},
     system,
 };
 
@@ -54,13 +54,9 @@ pub(crate) fn fill_disk(file: impl AsRef<Path>) {
 /// A checkpoint period that no run reaches, in updates.
 pub(crate) const PERIOD_NEVER: u32 = 100_000_000;
 
-/// Calls `test` with a run that has made updates and has logged `words` because its disk is full; the path is that of the file that fills
-/// the disk. The run saves a checkpoint every `checkpoint_period` updates. Then checks that no process and no temporary file is left.
-fn with_full_disk(
-    checkpoint_period: u32,
-    words: &str,
-    test: impl FnOnce(&TestSystem, Process, PathBuf),
-) {
+/// Calls `test` with a run that has made updates and has logged that its disk is full; the path is that of the file that fills the disk.
+/// The run saves a checkpoint every `checkpoint_period` updates. Then checks that no process and no temporary file is left.
+fn with_full_disk(checkpoint_period: u32, test: impl FnOnce(&TestSystem, Process, PathBuf)) {
     let system = system();
     let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
@@ -71,7 +67,7 @@ fn with_full_disk(
     system.connect().wait_for_updates(100);
     let filler = system.path("disk/filler");
     fill_disk(&filler);
-    process.wait_for_stderr(words);
+    process.wait_for_stderr("No space left");
     test(&system, process, filler);
     assert_eq!(system.running_processes(), []);
     for folder in ["disk/run", "disk/run/checkpoints"] {
@@ -84,7 +80,7 @@ fn with_full_disk(
 /// Rows of metrics wait until there is room, and a checkpoint that finds none is tried again.
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
-    with_full_disk(200, "No space left", |system, process, filler| {
+    with_full_disk(200, |system, process, filler| {
         let client = system.connect();
         let then = client.learner_status().unwrap().updates;
         client.wait_for_updates(then + 600);
@@ -111,7 +107,7 @@ fn a_run_continues_while_the_disk_is_full() {
 /// The launcher waits for the learner, which retries its last save.
 #[test]
 fn the_last_checkpoint_is_saved_once_there_is_room() {
-    with_full_disk(PERIOD_NEVER, "No space left", |system, mut run, filler| {
+    with_full_disk(PERIOD_NEVER, |system, mut run, filler| {
         run.signal(Signal::SIGINT);
         run.wait_for_stderr("(no storage space): make room or make it writable");
         wait_until("a save", || status_text(system).contains("saves its last"));
@@ -123,7 +119,7 @@ fn the_last_checkpoint_is_saved_once_there_is_room() {
 
 #[test]
 fn the_first_error_is_the_one_shown() {
-    with_full_disk(PERIOD_NEVER, "No space left", |system, mut run, _| {
+    with_full_disk(PERIOD_NEVER, |system, mut run, _| {
         run.signal(Signal::SIGINT);
         run.wait_for_stderr("(no storage space): make room or make it writable");
         system.find_process("learner").signal(Signal::SIGKILL);
@@ -168,10 +164,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         "If the replay server dies now",
         "to do: the replay server on",
     ];
-    wait_until("a status that says it", || {
-        let text = status_text(&system);
-        words.iter().all(|it| text.contains(it))
-    });
+    wait_for_status(&system, &words);
     // The last page of the log has room for some joins; each further one has to wait, and none of them is kept to be written later.
     let joins = (1_000..1_200).map(|it| Row::of(&client, &ActorJoin::new(it, 1), "W"));
     check_replies(&client, joins);

@@ -29,9 +29,13 @@ fn count_rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
     String::from_utf8_lossy(&files[name]).lines().count() - 1
 }
 
+fn read_page(folder: &Path) -> String {
+    fs::read_to_string(folder.join("README.md")).unwrap()
+}
+
 /// Checks the sections of a page and the files beside it. Returns the page.
 fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
-    let page = fs::read_to_string(folder.join("README.md")).unwrap();
+    let page = read_page(folder);
     let of_all = [
         "smoke length",
         "**Claim.**",
@@ -119,11 +123,8 @@ fn procgen_without_the_engine() {
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
     let first = data_files(&folder);
-    let table = || {
-        system
-            .run_folder("experiments/procgen-smoke")
-            .table("table.csv")
-    };
+    let results = system.run_folder("experiments/procgen-smoke");
+    let table = || results.table("table.csv");
     let before = table();
     let header = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
     assert_eq!(before.header.join(","), header);
@@ -179,8 +180,7 @@ fn procgen_without_the_engine() {
     system
         .run_ok(&format!("{call} --agents c51,cpc --report"))
         .expect_stderr(others);
-    let page = fs::read_to_string(folder.join("README.md")).unwrap();
-    assert!(page.contains("Not finished: chain-cpc-seed1"), "{page}");
+    check_has(&read_page(&folder), &["Not finished: chain-cpc-seed1"]);
     system.run(&format!("{call} --frames 900")).expect_code(64);
 
     // Without the pieces, a report is made from the runs alone.

@@ -19,7 +19,7 @@ pub(crate) fn status_text(system: &TestSystem) -> String {
 }
 
 /// Requests the status until it contains all of `words`.
-fn wait_for_status(system: &TestSystem, words: &[&str]) -> String {
+pub(crate) fn wait_for_status(system: &TestSystem, words: &[&str]) -> String {
     wait_for(&format!("{words:?} in the status"), || {
         let text = status_text(system);
         words.iter().all(|it| text.contains(it)).then_some(text)

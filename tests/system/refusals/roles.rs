@@ -23,21 +23,19 @@ use crate::{LONG, tls_system};
 struct TlsRun {
     system: TestSystem,
     observer: Client,
-    _server: Process,
-    _processes: [Process; 2],
+    _processes: [Process; 3],
 }
 
 impl TlsRun {
     fn new() -> Option<Self> {
         let system = tls_system()?;
         let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-        let processes = [system.start_learner("run"), system.start_actor(0)];
+        let processes = [server, system.start_learner("run"), system.start_actor(0)];
         let observer = system.connect();
         observer.wait_for_updates(10);
         Some(Self {
             system,
             observer,
-            _server: server,
             _processes: processes,
         })
     }
