@@ -22,7 +22,7 @@ pub use certificates::{Certificates, EXPIRED, FUTURE};
 pub use client::{Client, check_nothing_lost, connect, listen, new_learner, quic_endpoint};
 pub use network::Network;
 pub use process::{Exit, Process, check_has};
-pub use run_folder::{Outcome, RunFolder, Summary, Table, checkpoint_updates};
+pub use run_folder::{Outcome, RunFolder, Summary, Table};
 pub use skipped::{print_line, skip, skipped_offline, succeeds};
 pub use system::{RunningProcess, TestSystem};
 pub use waiting::{in_parallel, wait_for, wait_until};

@@ -3,12 +3,12 @@
 
 use std::{
     fs,
-    io::ErrorKind,
     path::{Path, PathBuf},
     str::FromStr,
 };
 
 pub use driml_launch::run_folder::{Outcome, Summary, Table};
+use driml_learner::checkpoint;
 use safetensors::SafeTensors;
 use sha2::{Digest, Sha256};
 
@@ -18,12 +18,6 @@ use crate::{client::check_nothing_lost, waiting::wait_until};
 #[derive(Clone, Debug)]
 pub struct RunFolder {
     path: PathBuf,
-}
-
-/// Returns the number of updates in the name of a checkpoint's folder.
-pub fn checkpoint_updates(checkpoint: &Path) -> u64 {
-    let name = checkpoint.file_name().unwrap().to_str().unwrap();
-    name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
 }
 
 impl RunFolder {
@@ -72,13 +66,19 @@ impl RunFolder {
         });
     }
 
-    /// The cells of one column of `metrics.csv`.
+    /// The cells of one column of a table.
     #[track_caller]
-    pub fn column(&self, name: &str) -> Vec<String> {
-        let table = self.table("metrics.csv");
+    fn cells(&self, table: &str, name: &str) -> Vec<String> {
+        let table = self.table(table);
         let at = table.column_index(name);
         let at = at.unwrap_or_else(|| panic!("{name} is not in {:?}", table.header));
         table.rows.iter().map(|row| row[at].to_owned()).collect()
+    }
+
+    /// The cells of one column of `metrics.csv`.
+    #[track_caller]
+    pub fn column(&self, name: &str) -> Vec<String> {
+        self.cells("metrics.csv", name)
     }
 
     /// Returns one column of `metrics.csv` as numbers; no cell may be empty.
@@ -91,18 +91,15 @@ impl RunFolder {
     /// Returns one column of `episodes.csv` so far, nothing before its header is written; `None` where a cell is empty.
     #[track_caller]
     pub fn episode_column<T: FromStr>(&self, name: &str) -> Vec<Option<T>> {
-        let table = self.table("episodes.csv");
-        if table.header.is_empty() {
+        if self.table("episodes.csv").header.is_empty() {
             return Vec::new();
         }
-        let at = table.column_index(name);
-        let at = at.unwrap_or_else(|| panic!("{name} is not in {:?}", table.header));
-        let parse = |cell: &str| {
+        let parse = |cell: &String| {
             let value = cell.parse();
             value.unwrap_or_else(|_| panic!("{name} = {cell:?}"))
         };
-        let cells = table.rows.iter().map(|row| &row[at]);
-        let values = cells.map(|cell| (!cell.is_empty()).then(|| parse(cell)));
+        let cells = self.cells("episodes.csv", name).into_iter();
+        let values = cells.map(|cell| (!cell.is_empty()).then(|| parse(&cell)));
         values.collect()
     }
 
@@ -132,28 +129,23 @@ impl RunFolder {
         self.text(&format!("logs/{process}.log"))
     }
 
-    /// The complete checkpoints, oldest first; none if the folder does not exist.
-    pub fn checkpoints(&self) -> Vec<PathBuf> {
-        let entries = match fs::read_dir(self.path.join("checkpoints")) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Vec::new(),
-            entries => entries.unwrap(),
-        };
-        let paths = entries.map(|it| it.unwrap().path());
-        // Beside them are a lock file, and perhaps the remains of an unfinished save, whose names have an extension.
-        let is_complete = |path: &PathBuf| !path.ends_with(".lock") && path.extension().is_none();
-        let mut complete: Vec<_> = paths.filter(is_complete).collect();
-        complete.sort();
-        complete
+    /// The complete checkpoints, oldest first, as (updates, path); none if the folder does not exist.
+    pub fn checkpoints(&self) -> Vec<(u64, PathBuf)> {
+        checkpoint::list(&self.path.join("checkpoints")).unwrap()
+    }
+
+    fn newest(&self) -> (u64, PathBuf) {
+        self.checkpoints().pop().expect("there is a checkpoint")
     }
 
     /// The newest checkpoint.
     pub fn newest_checkpoint(&self) -> PathBuf {
-        self.checkpoints().pop().expect("there is a checkpoint")
+        self.newest().1
     }
 
     /// Returns the number of updates in the newest checkpoint.
     pub fn saved_updates(&self) -> u64 {
-        checkpoint_updates(&self.newest_checkpoint())
+        self.newest().0
     }
 
     /// Returns the SHA-256 of the newest checkpoint's weights as actors receive them: only torso and head, as a safetensors file.

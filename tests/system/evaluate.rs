@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
-use driml_tests::{Outcome, TestSystem, check_has, checkpoint_updates, wait_until};
+use driml_tests::{Outcome, TestSystem, check_has, wait_until};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
@@ -60,8 +60,7 @@ fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(syste
     assert_eq!(system.read("returns.csv"), table);
 
     // Any existing checkpoint can be played.
-    let kept = system.run_folder("run").checkpoints();
-    let oldest = checkpoint_updates(&kept[0]);
+    let (oldest, _) = system.run_folder("run").checkpoints()[0];
     assert!(oldest < 540);
     system
         .run_ok(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
@@ -230,8 +229,7 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &
     let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
     keep("--episodes 3").expect_stdout("over 3 episodes, the best so far\n");
     system.run_ok("evaluate run --checkpoint best --episodes 1");
-    let oldest = system.run_folder("run").checkpoints().remove(0);
-    let updates = checkpoint_updates(&oldest);
+    let (updates, _) = system.run_folder("run").checkpoints()[0];
     keep(&format!("--episodes 1 --checkpoint {updates}"))
         .expect_stdout("; the best checkpoint stays, as its mean is over 3 episodes\n");
     // For a comparison over more episodes, the best checkpoint is played again.

@@ -134,7 +134,7 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
             assert!(off < VALUE_ERROR_MAX, "{flags}: {off}");
         }
         // A checkpoint of an earlier version has no metadata; `config.toml` contains the same facts.
-        let newest = system.run_folder("run").checkpoints().pop().unwrap();
+        let newest = system.run_folder("run").newest_checkpoint();
         let bare = agent.online().to_safetensors(|_| true).unwrap();
         fs::write(newest.join("online.safetensors"), bare).unwrap();
         assert_eq!(torch_outputs(), theirs);

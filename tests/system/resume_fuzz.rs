@@ -49,7 +49,7 @@ struct SavedCounts {
 
 /// Reads the newest checkpoint; `None` before the first.
 fn saved_counts(run: &RunFolder) -> Option<SavedCounts> {
-    let newest = run.checkpoints().pop()?;
+    let (_, newest) = run.checkpoints().pop()?;
     let state: Value =
         serde_json::from_slice(&fs::read(newest.join("state.json")).unwrap()).unwrap();
     let shards = state["progress"]["shards"].as_array().unwrap().clone();
