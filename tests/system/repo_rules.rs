@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// The most lines of Rust in each top-level folder, with tests. A change that adds code removes as much, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_540),
+    ("protocol", 7_420),
     ("actor", 10_490),
-    ("replay-server", 11_175),
-    ("learner", 21_750),
-    ("deploy", 31_240),
-    ("tests", 10_415),
+    ("replay-server", 11_130),
+    ("learner", 21_700),
+    ("deploy", 31_245),
+    ("tests", 10_265),
 ];
 const FILE_LINES_MAX: usize = 450;
 

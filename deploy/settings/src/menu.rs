@@ -204,11 +204,8 @@ mod tests {
         assert!(text.contains("augment = "), "{text}");
         let set = "run.horizon={ rule = \"fixed\", k = 3 }".to_owned();
         let text = settings_with_sources(choice, &[set]).unwrap();
-        assert!(
-            text.lines()
-                .any(|line| line.contains("k = 3") && line.ends_with("# --set")),
-            "{text}"
-        );
+        let mut lines = text.lines();
+        assert!(lines.any(|line| line.contains("k = 3") && line.ends_with("# --set")));
     }
 
     #[test]

@@ -88,8 +88,7 @@ impl Group<'_> {
         let replays = ends.map(|(least, most)| {
             format!("the replays of its runs hold {least} to {most} transitions (replay.capacity_transitions)")
         });
-        let mut seeds = BTreeSet::new();
-        let mut each = self.runs.iter().filter_map(|run| run.seed);
+        let (mut seeds, mut each) = (BTreeSet::new(), self.runs.iter().filter_map(|run| run.seed));
         let repeated = each.find(|&seed| !seeds.insert(seed));
         let repeated = repeated.map(|seed| format!("several of its runs have the seed {seed}"));
         let found = [replays, repeated].into_iter().flatten();

@@ -236,9 +236,8 @@ fn fetch_settings(
             ));
         }
         Err(other) => {
-            let what = format!(
-                "the replay server on {endpoint} does not answer: its process may be suspended, or its machine unreachable"
-            );
+            let why = "its process may be suspended, or its machine unreachable";
+            let what = format!("the replay server on {endpoint} does not answer: {why}");
             return Err(anyhow::Error::new(other).context(what));
         }
     };
