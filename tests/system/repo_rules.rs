@@ -15,7 +15,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 10_490),
     ("replay-server", 11_130),
     ("learner", 21_700),
-    ("deploy", 31_245),
+    ("deploy", 31_250),
     ("tests", 10_265),
 ];
 const FILE_LINES_MAX: usize = 450;

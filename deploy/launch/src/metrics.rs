@@ -146,7 +146,9 @@ columns! {
 }
 
 fn updates(it: &RunView) -> Option<f64> {
-    let last_known = it.replay.learner_finished.then_some(it.replay.updates);
+    // A recorded row needs a number, even if the learner is down since before the first one.
+    let is_needed = it.replay.learner_finished || it.recorded_s.is_some();
+    let last_known = is_needed.then_some(it.replay.updates);
     let updates = it.learner_shown().map(|it| it.updates).or(last_known);
     updates.map(|it| it as f64)
 }
@@ -271,10 +273,13 @@ mod tests {
             (it.updates, it.c51_kl) = (3, 0.5);
         });
         let plan = make(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
-        let unknown = json(&view(plan.clone(), replay.clone(), None));
+        let mut unknown = view(plan.clone(), replay.clone(), None);
         for name in ["updates", "c51_kl", "frames_per_second"] {
-            assert_eq!(unknown[name], serde_json::Value::Null, "{name}");
+            assert_eq!(json(&unknown)[name], serde_json::Value::Null, "{name}");
         }
+        (unknown.recorded_s, unknown.replay.updates) = (Some(1.0), 5);
+        assert_eq!(json(&unknown)["updates"], 5);
+        assert!(json(&unknown)["c51_kl"].is_null());
         let mut known = view(plan, replay, Some(learner));
         known.rss_mib = vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)];
         let text = serde_json::to_string(&json(&known)).unwrap();

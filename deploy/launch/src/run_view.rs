@@ -303,10 +303,10 @@ impl RunView {
         is_known.then_some(&self.learner)
     }
 
-    /// The learner's status for the metrics. In a recorded run this is its last status, even if it does not answer.
+    /// The learner's status for the metrics. In a recorded run this is its last status, even if it does not answer any more.
     pub(crate) fn learner_shown(&self) -> Option<&LearnerStatus> {
         match self.recorded_s {
-            Some(_) => Some(&self.learner),
+            Some(_) => self.is_learner_known.then_some(&self.learner),
             None => self.learner_status(),
         }
     }
