@@ -72,7 +72,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let system = system();
     // The number of figures, and how many of them measure arithmetic.
     for (bench, count, of_arithmetic) in [
-        ("policy", 12, 0),
+        ("policy", 16, 0),
         ("learner --growth --precision bf16", 26, 13),
         ("learner --kernels --precision bf16", 6, 6),
         ("replay", 17, 0),
@@ -89,7 +89,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let table = system.run_ok(peers).stdout;
     const SKIPPED: &str = "skipped: no-such-python cannot be started (No such file or directory (os error 2)): name a Python that has PyTorch with --torch-python";
     let lines = |is: fn(&str) -> bool| table.lines().filter(|line| is(line)).count();
-    assert_eq!(lines(|line| line.ends_with("  skipped")), 12, "{table}");
+    assert_eq!(lines(|line| line.ends_with("  skipped")), 16, "{table}");
     assert_eq!(lines(|line| line == SKIPPED), 1, "{table}");
 }
 

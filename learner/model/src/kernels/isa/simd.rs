@@ -123,7 +123,7 @@ pub(crate) use vectorized;
 /// Calls `function::<N>(first, ..)` for blocks of `N` channels: whole registers, then half a register, then single channels.
 macro_rules! each_block {
     ($channels:expr, $function:ident($($argument:expr),*)) => {{
-        const HALF: usize = $crate::kernels::isa::LANES / 2;
+        const HALF: usize = $crate::kernels::isa::simd::LANES / 2;
         let channels: usize = $channels;
         let [whole, half] = [2 * HALF, HALF].map(|len| channels - channels % len);
         for first in (0..whole).step_by(2 * HALF) {
