@@ -66,22 +66,32 @@ pub(super) unsafe fn round_pairs(first: &[f32], second: &[f32], pairs: &mut [bf1
         let words = unsafe { transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(second, first)) };
         _mm512_permutexvar_epi16(order, words)
     };
-    for (at, pairs) in (0..).step_by(LANES).zip(pairs.chunks_mut(2 * LANES)) {
-        let rest = |row: &[f32]| {
-            let rest = row.get(at..).unwrap_or_default();
-            // SAFETY: the mask excludes what lies beyond the row.
-            unsafe { _mm512_maskz_loadu_ps(first_lanes(rest.len().min(LANES)), rest.as_ptr()) }
-        };
-        let words = interleaved(rest(first), rest(second));
-        // SAFETY: a whole block is a register, and the mask excludes what lies beyond a shorter one.
+    let columns = first.len().min(second.len());
+    let (first, second) = (&first[..columns], &second[..columns]);
+    let pairs = &mut pairs[..2 * columns];
+    let (first_blocks, first_tail) = first.as_chunks::<LANES>();
+    let (second_blocks, second_tail) = second.as_chunks::<LANES>();
+    let (pair_blocks, pair_tail) = pairs.as_chunks_mut::<{ 2 * LANES }>();
+    for ((pairs, first), second) in pair_blocks.iter_mut().zip(first_blocks).zip(second_blocks) {
+        // SAFETY: a block of either row is a register of f32, and its pairs one of bf16.
         unsafe {
-            match pairs.len() {
-                len if len == 2 * LANES => _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words),
-                len => {
-                    let mask = ((1u64 << len) - 1) as u32;
-                    _mm512_mask_storeu_epi16(pairs.as_mut_ptr().cast(), mask, words);
-                }
-            }
+            let words = interleaved(
+                _mm512_loadu_ps(first.as_ptr()),
+                _mm512_loadu_ps(second.as_ptr()),
+            );
+            _mm512_storeu_si512(pairs.as_mut_ptr().cast(), words);
+        }
+    }
+    if !first_tail.is_empty() {
+        let mask = first_lanes(first_tail.len());
+        let words_mask = ((1u64 << (2 * first_tail.len())) - 1) as u32;
+        // SAFETY: the masks exclude what lies beyond the slices. Each row has fewer than `LANES` columns left.
+        unsafe {
+            let words = interleaved(
+                _mm512_maskz_loadu_ps(mask, first_tail.as_ptr()),
+                _mm512_maskz_loadu_ps(mask, second_tail.as_ptr()),
+            );
+            _mm512_mask_storeu_epi16(pair_tail.as_mut_ptr().cast(), words_mask, words);
         }
     }
 }

@@ -19,20 +19,12 @@ pub(crate) trait Rounding: Copy {
         }
     }
 
-    /// Rounds two rows as [`Rounding::round`] and interleaves them: `pairs` [columns, 2], with 0 where the rows end. `second`
-    /// is as long as `first` or empty.
+    /// Rounds two rows as [`Rounding::round`] and interleaves them: `pairs` [columns, 2].
     #[inline(always)]
     fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-        let (begin, end) = pairs.split_at_mut(first.len() * 2);
-        if second.is_empty() {
-            for (pair, &first) in begin.chunks_exact_mut(2).zip(first) {
-                (pair[0], pair[1]) = (bf16::rounded(first), bf16::default());
-            }
-        }
-        for ((pair, &first), &second) in begin.chunks_exact_mut(2).zip(first).zip(second) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
             (pair[0], pair[1]) = (bf16::rounded(first), bf16::rounded(second));
         }
-        end.fill(bf16::default());
     }
 
     /// Interleaves two rows of bf16 of equal length: `pairs` [columns, 2].
@@ -192,7 +184,15 @@ impl Element for bf16 {
 
     #[inline(always)]
     fn interleave<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]) {
-        rounding.round_pairs(first, second, step);
+        let (begin, end) = step.split_at_mut(first.len() * 2);
+        if second.is_empty() {
+            for (pair, &first) in begin.chunks_exact_mut(2).zip(first) {
+                (pair[0], pair[1]) = (Self::rounded(first), Self::default());
+            }
+        } else {
+            rounding.round_pairs(first, second, begin);
+        }
+        end.fill(Self::default());
     }
 
     #[inline(always)]
