@@ -429,7 +429,7 @@ fn a_run_may_go_on_with_another_capacity() {
     replay.check_valid();
     let status = replay.status();
     assert_eq!(status.transitions_inserted, kept.history.inserted);
-    // A ring without room for a chunk of the log leaves the log as it is.
+    // A ring without room for a chunk of the log does not change the log.
     let kept = SavedLog::new(10_000);
     let too_small = open(&kept.args, &Config::unlimited(7)).map(drop);
     let error = too_small.unwrap_err().to_string();

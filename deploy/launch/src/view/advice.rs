@@ -15,6 +15,8 @@ const UNRESPONSIVE_S: f64 = 30.0;
 /// How long a replay server or the learner may leave requests unanswered before a note says so.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
+/// Why a replay server may listen without an answer.
+pub(super) const SILENT_SERVER: &str = "its process may be suspended, or its machine unreachable";
 
 fn server_statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
@@ -70,9 +72,7 @@ fn server_action(server: &ServerAnswer) -> Option<String> {
         format!("the replay server on {endpoint} has exited: restart it unless the run is complete")
     } else {
         let error = server.error.as_ref()?;
-        format!(
-            "the replay server on {endpoint} does not answer ({error}): its process may be suspended, or its machine unreachable"
-        )
+        format!("the replay server on {endpoint} does not answer ({error}): {SILENT_SERVER}")
     })
 }
 

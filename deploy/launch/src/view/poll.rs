@@ -19,6 +19,7 @@ use zenoh::{Session, Wait};
 use crate::{
     endpoint::DEFAULT_NAMESPACE,
     run_view::{PAUSE_MIN, Plan, RunView, ServerAnswer},
+    view::advice::SILENT_SERVER,
 };
 
 /// How long an answer may take; a process that is busy may answer the next poll.
@@ -236,8 +237,7 @@ fn fetch_settings(
             ));
         }
         Err(other) => {
-            let why = "its process may be suspended, or its machine unreachable";
-            let what = format!("the replay server on {endpoint} does not answer: {why}");
+            let what = format!("the replay server on {endpoint} does not answer: {SILENT_SERVER}");
             return Err(anyhow::Error::new(other).context(what));
         }
     };
